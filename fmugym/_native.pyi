@@ -298,26 +298,23 @@ class Pool:
         states: Array,
         episodes: Episodes,
         kept: Array,
-        keeps_always: bool,
+        reads_kept: bool,
         copies: tuple[tuple[Array, Array], ...],
         variable_starts: tuple[tuple[Array, bytes], ...],
         drawn_variables: tuple[tuple[Array, int], ...],
         input_starts: tuple[tuple[int, float], ...],
+        results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(
         self,
         actions: Array,
-        observations: Array | tuple[Array, ...],
-        rewards: Array,
-        terminated: Array,
-        truncated: Array,
         drawn: Array,
         last_observations: Array | None,
         started: Array | None,
         /,
-    ) -> tuple[int, int, int]:
+    ) -> tuple[Any, int, int, int]:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:

@@ -12,6 +12,7 @@
     case size: {                                                                                   \
         type *restrict into = to;                                                                  \
         const type *restrict out = (const type *)from;                                             \
+        UNROLLED                                                                                   \
         for (size_t j = 0; j < count; j++) {                                                       \
             into[j * to_step] = out[j * from_step];                                                \
         }                                                                                          \
@@ -155,15 +156,22 @@ WIDE static void convert(const double *restrict values, size_t count, float *res
     }
 }
 
+WIDE static void convert_lines(const double *restrict values, size_t step, size_t lines,
+                               size_t number, float *restrict to, size_t to_step) {
+    for (size_t j = 0; j < lines; j++, values += step, to += to_step) {
+        UNROLLED
+        for (size_t k = 0; k < number; k++) {
+            to[k] = (float)values[k];
+        }
+    }
+}
+
 /* Stores outputs of which each environment's follow each other. All of them are finite as floats. */
 static void store_fresh(const Evaluation *e, const Slot *slot, size_t output, size_t number) {
     const Fresh *fresh = e->source->fresh;
-    const double *values = fresh->lines + output;
-    float *to = (float *)(void *)place_of(e, slot);
 
-    for (size_t j = 0; j < e->count; j++, values += fresh->width, to += slot->elements) {
-        convert(values, number, to);
-    }
+    convert_lines(fresh->lines + output, fresh->width, e->count, number,
+                  (float *)(void *)place_of(e, slot), slot->elements);
 }
 
 /* Whether rows are those of outputs that follow each other. */

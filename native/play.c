@@ -123,7 +123,7 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     }
     const Source source = source_of(turn);
     program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
-    if (play->keeps_always) {
+    if (play->reads_kept) {
         play_keep_outputs(play, begin, count);
     }
     count_steps(play, begin, count);
@@ -157,7 +157,7 @@ void play_start_episode(const Turn *turn, size_t index) {
         const double *value = turn->drawn + variable->draw * play->count + index;
         memcpy(variable->row.data + index * sizeof *value, value, sizeof *value);
     }
-    for (size_t i = 0; play->keeps_always && i < play->number_of_outputs; i++) {
+    for (size_t i = 0; i < play->number_of_outputs; i++) {
         const size_t place = i * play->count + index;
         play->kept_rows[place] = play->output_rows[place];
     }

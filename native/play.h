@@ -64,7 +64,7 @@ typedef struct {
     const double *output_rows;
     double *kept_rows; /* the outputs before the step */
     size_t number_of_outputs;
-    bool keeps_always; /* whether they are kept in each step; otherwise only where needed */
+    bool reads_kept; /* whether the judgement reads them */
     const RowCopy *copies;
     size_t number_of_copies;
     const VariableStart *variable_starts;

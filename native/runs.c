@@ -53,10 +53,45 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
 
 /* Steps of neighbours */
 
-static void gather_inputs(const Task *task, size_t begin, size_t count, double *inputs) {
-    const Matrix *matrix = &task->call->inputs;
-    const size_t width = task->pool->settings.inputs->count;
+/* Writes columns as rows. Takes squares of four by four, which compilers load at once. */
+WIDE static void transpose(const double *restrict from, size_t from_step, size_t rows,
+                           size_t columns, double *restrict to, size_t to_step) {
+    size_t column = 0;
 
+    if (rows == 1) { /* a single environment, whose step takes little more than its calls */
+        for (; column < columns; column++) {
+            to[column * to_step] = from[column];
+        }
+    }
+    for (; column + 4 <= columns; column += 4, to += 4 * to_step) {
+        const double *next = from + column;
+        size_t row = 0;
+        for (; row + 4 <= rows; row += 4, next += 4 * from_step) {
+            for (size_t k = 0; k < 4; k++) {
+                double *place = to + k * to_step + row;
+                place[0] = next[k];
+                place[1] = next[k + from_step];
+                place[2] = next[k + 2 * from_step];
+                place[3] = next[k + 3 * from_step];
+            }
+        }
+        for (; row < rows; row++, next += from_step) {
+            for (size_t k = 0; k < 4; k++) {
+                to[k * to_step + row] = next[k];
+            }
+        }
+    }
+    for (; column < columns; column++, to += to_step) {
+        const double *next = from + column;
+        UNROLLED
+        for (size_t row = 0; row < rows; row++, next += from_step) {
+            to[row] = *next;
+        }
+    }
+}
+
+static void gather_unaligned(const Matrix *matrix, size_t begin, size_t count, size_t width,
+                             double *inputs) {
     for (size_t i = 0; i < width; i++) {
         const char *place = matrix->data + (ptrdiff_t)i * matrix->row_stride +
                             (ptrdiff_t)begin * matrix->column_stride;
@@ -64,6 +99,20 @@ static void gather_inputs(const Task *task, size_t begin, size_t count, double *
         for (size_t j = 0; j < count; j++, place += matrix->column_stride, to += width) {
             memcpy(to, place, sizeof *to);
         }
+    }
+}
+
+static void gather_inputs(const Task *task, size_t begin, size_t count, double *inputs) {
+    const Matrix *matrix = &task->call->inputs;
+    const size_t width = task->pool->settings.inputs->count;
+    const ptrdiff_t size = sizeof *inputs;
+
+    if (matrix->column_stride == size && matrix->row_stride % size == 0 &&
+        matrix->row_stride >= 0 && (uintptr_t)matrix->data % sizeof *inputs == 0) {
+        const double *rows = (const double *)(const void *)matrix->data + begin;
+        transpose(rows, (size_t)(matrix->row_stride / size), width, count, inputs, width);
+    } else {
+        gather_unaligned(matrix, begin, count, width, inputs);
     }
 }
 
@@ -86,32 +135,11 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
     return troubled;
 }
 
-/* Takes one value from each of count rows. Takes four at a time for speed. */
-static void take_column(const double *rows, size_t width, size_t count, double *column) {
-    size_t j = 0;
-
-    if (count == 1) { /* a single environment, whose step takes little more than its calls */
-        *column = *rows;
-        return;
-    }
-    for (; j + 4 <= count; j += 4, rows += 4 * width) {
-        column[j] = rows[0];
-        column[j + 1] = rows[width];
-        column[j + 2] = rows[2 * width];
-        column[j + 3] = rows[3 * width];
-    }
-    for (; j < count; j++, rows += width) {
-        column[j] = *rows;
-    }
-}
-
 static void keep_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
     const Settings *s = &task->pool->settings;
     const size_t width = s->outputs->count;
 
-    for (size_t i = 0; i < width; i++) {
-        take_column(outputs + i, width, count, s->output_values + i * s->count + begin);
-    }
+    transpose(outputs, width, count, width, s->output_values + begin, s->count);
 }
 
 WIDE static void convert(const double *values, size_t count, float *converted) {
@@ -360,10 +388,9 @@ static void make_columns(const Pool *pool, size_t count, Scratch scratch) {
     const size_t width = pool->settings.outputs->count;
     const size_t rest = (PROGRAM_WIDTH - count) % PROGRAM_BLOCK;
 
-    for (size_t i = 0; i < width; i++) {
-        double *column = scratch.columns + i * PROGRAM_WIDTH;
-        take_column(scratch.outputs + i, width, count, column);
-        memset(column + count, 0, rest * sizeof *column);
+    transpose(scratch.outputs, width, count, width, scratch.columns, PROGRAM_WIDTH);
+    for (size_t i = 0; i < width && rest > 0; i++) {
+        memset(scratch.columns + i * PROGRAM_WIDTH + count, 0, rest * sizeof *scratch.columns);
     }
 }
 
@@ -377,18 +404,17 @@ static void keep_columns(const Pool *pool, size_t begin, size_t count, const dou
 }
 
 /* The programs read the outputs where they are in the cache. Their rows keep the old ones for so
- * long: the owner needs them if there is trouble. */
+ * long, and these are kept just before the new ones replace them, unless a program reads them. */
 size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
     const Pool *pool = task->pool;
     const Turn *turn = task->call->turn;
-    const size_t before = run.verdict->troubled;
     Fresh fresh = {scratch.columns, scratch.outputs, pool->settings.outputs->count, true};
 
     play_prepare(turn, run.begin, run.count, run.registers);
     const size_t troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
     make_columns(pool, run.count, scratch);
     play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
-    if (!turn->play->keeps_always && (troubled > 0 || run.verdict->troubled > before)) {
+    if (!turn->play->reads_kept) {
         play_keep_outputs(turn->play, run.begin, run.count);
     }
     keep_columns(pool, run.begin, run.count, scratch.columns);

@@ -156,6 +156,7 @@ static Status advance_sampled(Pool *pool, Instance *me, Scratch scratch) {
 WIDE bool all_within(const double *values, size_t count, double limit) {
     int64_t bad = 0; /* as wide as the values, so that the compiler can vectorize */
 
+    UNROLLED
     for (size_t i = 0; i < count; i++) {
         bad |= !(fabs(values[i]) <= limit);
     }

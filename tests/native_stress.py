@@ -177,13 +177,19 @@ class Subject:
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
             {
                 "kept": np.zeros_like(self.pool.outputs),
-                "keeps_always": True,
+                "reads_kept": bool(self.rng.random() < 0.5),
                 "copies": ((variables[0], before[0]),),
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
+                "results": (np.empty, tuple, None, self.results()),
             },
         )
+
+    def results(self):
+        """The shapes and types of what a step returns."""
+        flags = (self.n,), bool
+        return ((self.n, len(self.outputs)), np.float32), ((self.n,), float), flags, flags
 
     def draw(self):
         """Seed streams and draw from them while other threads play."""
@@ -193,16 +199,13 @@ class Subject:
         DRAWS.take(states, indices, np.empty((1, self.n)))
 
     def play(self):
-        flags = np.empty(self.n, np.bool_), np.empty(self.n, np.bool_)
-        observations = np.empty((self.n, len(self.outputs)), np.float32)
         actions = self.rng.integers(0, 2, self.n)
         ends = [None, None]
         if self.rng.random() < 0.5:  # episodes start in the step that ends others
-            ends = np.empty_like(observations), np.empty(self.n, np.bool_)
+            last = np.empty((self.n, len(self.outputs)), np.float32)
+            ends = last, np.empty(self.n, np.bool_)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool._pool.play(
-                actions, observations, np.empty(self.n), *flags, np.empty((1, self.n)), *ends
-            )
+            self.pool._pool.play(actions, np.empty((1, self.n)), *ends)
             counts["played"] += 1
 
     def start_episodes(self):

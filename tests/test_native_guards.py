@@ -169,11 +169,12 @@ def actions_of(n):
 def surroundings(pool):
     return {
         "kept": np.zeros_like(pool.outputs),
-        "keeps_always": False,
+        "reads_kept": False,
         "copies": (),
         "drawn_variables": (),
         "variable_starts": (),
         "input_starts": ((-1, 0.0),) * len(pool.inputs),
+        "results": None,
     }
 
 

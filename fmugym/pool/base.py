@@ -268,7 +268,7 @@ class Pool(ABC):
         draws: Any,
         episodes: Any,
         surroundings: Any,
-    ) -> Callable[..., tuple[int, int, int]]:
+    ) -> Callable[..., tuple[Any, int, int, int]]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 
         Raises:

@@ -495,7 +495,7 @@ class NativePool(SavingPool):
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
-    ) -> Callable[..., tuple[int, int, int]]:
+    ) -> Callable[..., tuple[Any, int, int, int]]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
 
         This replaces what was prepared before. Every step uses the given arrays in place.
@@ -514,22 +514,25 @@ class NativePool(SavingPool):
                 ``EpisodeStreams``.
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
-            surroundings: ``kept``, for the outputs before the step; ``keeps_always``, whether
-                they are kept in each step, or only before outputs that no float32 can hold;
-                ``copies``, pairs of rows: episode variables and what they were before the step;
-                ``drawn_variables``, rows and the numbers of their draws; ``variable_starts``,
-                rows and the bytes of their constants; ``input_starts``, for each input the number
-                of a start value, or -1 and a constant.
+            surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
+                the second program reads them; ``copies``, pairs of rows: episode variables and what
+                they were before the step; ``drawn_variables``, rows and the numbers of their draws;
+                ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
+                each input the number of a start value, or -1 and a constant. ``results``, None if
+                only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
+                tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
+                empty one); and the shape and type of each array: float32 observations, or those
+                that the second program stores, then rewards, terminated and truncated.
 
         Returns:
-            A function of actions, observations (float32, or the array that the second program
-            stores, or a tuple of several), rewards, terminated, truncated, drawn values (draws,
-            N), last observations and started (Booleans). It does a step and fills all but the
-            actions; of the drawn values, only those of episodes that start; ``given`` ones are
-            read. If the last two are arrays, an episode that ends without a fault is followed by
-            the next in the same step; if they are None, in the next step. It returns how many
+            A function of actions, drawn values (draws, N), last observations and started
+            (Booleans). It does a step and fills all but the actions; of the drawn values, only
+            those of episodes that start; ``given`` ones are read. If the last two are arrays, an
+            episode that ends without a fault is followed by the next in the same step; if they are
+            None, in the next step. It returns the result with an empty dict of infos, how many
             instances had trouble (a status worse than a warning, or numbers that are not finite),
-            how many episodes have ended, and how many of these were followed.
+            how many episodes have ended, and how many of these were followed. The arrays of the
+            result are new, or those of an earlier step that nobody holds any more.
         """
         count, ended, limit = episodes
         self._pool.prepare_play(

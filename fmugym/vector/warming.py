@@ -195,11 +195,12 @@ class CompiledWarmUp:
                 (self._counts, self._ended, sys.maxsize),
                 {
                     "kept": self._kept,
-                    "keeps_always": True,
+                    "reads_kept": True,
                     "copies": tuple(pairs),
                     "input_starts": ((-1, 0.0),) * len(pool.inputs),
                     "drawn_variables": (),
                     "variable_starts": (),
+                    "results": None,
                 },
             )
         finally:

@@ -5,6 +5,7 @@
 #include <string.h>
 
 #include "programs.h"
+#include "results.h"
 
 enum {
     STARTS,
@@ -37,6 +38,7 @@ typedef struct {
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */
     PyObject *draws;
+    Results *results; /* NULL if only rollouts follow */
 } Playing;
 
 static void playing_free(Playing *playing) {
@@ -55,6 +57,7 @@ static void playing_free(Playing *playing) {
     release_program(&playing->judgement);
     Py_XDECREF(playing->start);
     Py_XDECREF(playing->draws);
+    results_free(playing->results);
     free(playing);
 }
 
@@ -356,23 +359,23 @@ static bool is_sound(const PyPool *self, const Play *play) {
 /* The arguments of prepare_play. */
 typedef struct {
     PyObject *start, *start_values, *inputs, *judgement, *actions, *draws, *states, *episodes;
-    PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts;
-    int keeps_always;
+    PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts, *results;
+    int reads_kept;
 } Parts;
 
 static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
     static char *names[] = {"start",         "start_values", "inputs",
                             "judgement",     "actions",      "draws",
                             "states",        "episodes",     "kept",
-                            "keeps_always",  "copies",       "variable_starts",
-                            "drawn_variables", "input_starts", NULL};
+                            "reads_kept",  "copies",       "variable_starts",
+                            "drawn_variables", "input_starts", "results", NULL};
 
     return PyArg_ParseTupleAndKeywords(
-        args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!:prepare_play", names, &p->start, &p->start_values,
+        args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!O:prepare_play", names, &p->start, &p->start_values,
         &PyTuple_Type, &p->inputs, &PyTuple_Type, &p->judgement, &PyDict_Type, &p->actions,
-        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->keeps_always,
+        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->reads_kept,
         &PyTuple_Type, &p->copies, &PyTuple_Type, &p->variable_starts, &PyTuple_Type,
-        &p->drawn_variables, &PyTuple_Type, &p->input_starts);
+        &p->drawn_variables, &PyTuple_Type, &p->input_starts, &p->results);
 }
 
 static bool take_programs(PyPool *self, Playing *playing, const Parts *p) {
@@ -383,15 +386,51 @@ static bool take_programs(PyPool *self, Playing *playing, const Parts *p) {
            take_program(p->judgement, n, elements, &playing->judgement);
 }
 
+/* Whether the pool itself fills the observations, instead of the program. */
+static bool pool_observes(const Playing *playing) {
+    return playing->judgement.program.number_of_seen == 0 && playing->results != NULL &&
+           results_number_of_seen(playing->results) == 1;
+}
+
+static bool results_fit(const PyPool *self, const Playing *playing) {
+    const Settings *s = &self->pool.settings;
+    const Results *r = playing->results;
+    const size_t seen = playing->judgement.program.number_of_seen;
+    bool fit = results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
+               results_size(r, TERMINATED_ARRAY) == s->count &&
+               results_size(r, TRUNCATED_ARRAY) == s->count;
+
+    if (pool_observes(playing)) {
+        return fit && results_size(r, 0) == s->count * s->num_observed * sizeof(float);
+    }
+    for (size_t i = 0; i < seen && fit; i++) {
+        fit = results_size(r, i) == (size_t)playing->judgement.seen_bytes[i];
+    }
+    return fit && results_number_of_seen(r) == seen;
+}
+
+static bool take_results(PyPool *self, Playing *playing, PyObject *parts) {
+    if (parts == Py_None) {
+        return true;
+    }
+    playing->results = results_take(parts);
+    if (playing->results != NULL && !results_fit(self, playing)) {
+        PyErr_SetString(PyExc_ValueError, "the arrays of results do not fit the pool");
+        return false;
+    }
+    return playing->results != NULL;
+}
+
 /* What comes later refers to what comes first. */
 static bool take_parts(PyPool *self, Playing *playing, const Parts *p) {
-    playing->play.keeps_always = p->keeps_always != 0;
+    playing->play.reads_kept = p->reads_kept != 0;
     return take_starts(self, playing, p->start, p->start_values) &&
            take_actions(self, playing, p->actions) && take_programs(self, playing, p) &&
            take_draws(self, playing, p->draws, p->states) &&
            take_episodes(self, playing, p->episodes) && take_kept(self, playing, p->kept) &&
            take_variables(self, playing, p->copies, p->variable_starts, p->drawn_variables) &&
-           take_input_starts(self, playing, p->input_starts);
+           take_input_starts(self, playing, p->input_starts) &&
+           take_results(self, playing, p->results);
 }
 
 static bool fill(PyPool *self, Playing *playing, PyObject *args, PyObject *kwargs) {
@@ -450,10 +489,11 @@ enum {
     DRAWN,
     LAST,
     STARTED,
-    PLAY_ARGUMENTS,
-    MASK = PLAY_ARGUMENTS,
+    MASK,
     TURN_BUFFERS
 };
+
+enum { STEP_ACTIONS, STEP_DRAWN, STEP_LAST, STEP_STARTED, STEP_ARGUMENTS };
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
@@ -479,10 +519,10 @@ static bool take_starts_at_ends(PyPool *self, const Playing *playing, PyObject *
     for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
         t->seen_sizes[i] = (size_t)(playing->judgement.seen_bytes[i] / n);
     }
-    return (t->buffers[SEEN].obj == NULL
-                ? take_seen(&playing->judgement, last, t->last_buffers, t->last_seen)
-                : take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations",
-                              ITEM_FLOAT32, n, (Py_ssize_t)s->num_observed)) &&
+    return (pool_observes(playing)
+                ? take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations",
+                              ITEM_FLOAT32, n, (Py_ssize_t)s->num_observed)
+                : take_seen(&playing->judgement, last, t->last_buffers, t->last_seen)) &&
            take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n);
 }
 
@@ -545,17 +585,10 @@ static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn
 }
 
 static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
-    const size_t n = self->pool.settings.count;
-    Py_buffer *b = t->buffers;
-
-    return take_given_actions(playing, args[ACTIONS], t) &&
-           take_observations(self, playing, args[SEEN], t) &&
-           take_bytes(args[REWARDS], &b[REWARDS], PyBUF_WRITABLE, n * sizeof(double)) &&
-           take_bytes(args[TERMINATED], &b[TERMINATED], PyBUF_WRITABLE, n) &&
-           take_bytes(args[TRUNCATED], &b[TRUNCATED], PyBUF_WRITABLE, n) &&
-           take_bytes(args[DRAWN], &b[DRAWN], PyBUF_WRITABLE,
-                      playing->play.draws->count * n * sizeof(double)) &&
-           take_starts_at_ends(self, playing, args[LAST], args[STARTED], t);
+    return take_given_actions(playing, args[STEP_ACTIONS], t) &&
+           take_bytes(args[STEP_DRAWN], &t->buffers[DRAWN], PyBUF_WRITABLE,
+                      playing->play.draws->count * self->pool.settings.count * sizeof(double)) &&
+           take_starts_at_ends(self, playing, args[STEP_LAST], args[STEP_STARTED], t);
 }
 
 static void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
@@ -602,21 +635,43 @@ static bool is_outside(const PyTurn *t) {
     return t->ends.outside;
 }
 
-static PyObject *play_turn(PyPool *self, PyTurn *t) {
-    if (!perform(self, PLAY, do_play, t)) {
+/* Lets the step fill the arrays that it returns. */
+static void settle_results(const Playing *playing, const StepArrays *arrays, PyTurn *t) {
+    t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
+    t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
+    t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];
+    t->turn.seen = arrays->memory;
+    if (pool_observes(playing)) {
+        t->call.observations = (float *)(void *)arrays->memory[0];
+    }
+}
+
+/* The result, how many instances had trouble, how many episodes have ended, and how many of these
+ * were followed. */
+static PyObject *turn_result(const Playing *playing, const StepArrays *arrays, const PyTurn *t) {
+    PyObject *tuple = PyTuple_New(4), *result = results_make(playing->results, arrays);
+
+    if (tuple == NULL || result == NULL) {
+        Py_XDECREF(tuple);
+        Py_XDECREF(result);
         return NULL;
+    }
+    PyTuple_SetItem(tuple, 0, result);
+    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
+    PyTuple_SetItem(tuple, 2, PyLong_FromSize_t(t->ends.ended));
+    PyTuple_SetItem(tuple, 3, PyLong_FromSize_t(t->ends.started));
+    return tuple;
+}
+
+static bool play_turn(PyPool *self, PyTurn *t) {
+    if (!perform(self, PLAY, do_play, t)) {
+        return false;
     }
     if (t->bad_action) {
         PyErr_SetString(PyExc_ValueError, "an action is out of range");
-        return NULL;
+        return false;
     }
-    if (is_outside(t)) {
-        return NULL;
-    }
-    return report_messages(self)
-               ? Py_BuildValue("(nnn)", (Py_ssize_t)t->troubled, (Py_ssize_t)t->ends.ended,
-                               (Py_ssize_t)t->ends.started)
-               : NULL;
+    return !is_outside(t) && report_messages(self);
 }
 
 /* Clears what is used of the many buffers. */
@@ -641,14 +696,17 @@ static void release_turn(const Playing *playing, PyTurn *t) {
 
 static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
+    StepArrays arrays;
     PyTurn t;
     PyObject *result = NULL;
 
     clear_turn(playing, &t);
-    if (take_arrays(self, playing, args, &t)) {
+    if (results_provide(playing->results, &arrays) && take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
-        result = play_turn(self, &t);
+        settle_results(playing, &arrays, &t);
+        result = play_turn(self, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
+    results_drop(playing->results, &arrays);
     release_turn(playing, &t);
     return result;
 }
@@ -660,10 +718,19 @@ static bool is_prepared(const PyPool *self) {
     return self->playing != NULL;
 }
 
+static bool has_results(const PyPool *self) {
+    const Playing *playing = PyCapsule_GetPointer(self->playing, PLAYING);
+
+    if (playing->results == NULL) {
+        PyErr_SetString(PyExc_ValueError, "play was prepared without results");
+    }
+    return playing->results != NULL;
+}
+
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, PLAY_ARGUMENTS) || !is_prepared(self)) {
+    if (!has_arguments(nargs, STEP_ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);

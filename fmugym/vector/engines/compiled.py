@@ -45,7 +45,6 @@ __all__ = ["CompiledEngine", "find_programs"]
 logger = logging.getLogger(__name__)
 
 _BOOL = np.dtype(np.bool_)
-_empty = np.empty  # in each step, so the look-ups count
 
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
@@ -142,6 +141,8 @@ class CompiledEngine(BatchEngine):
         self._make_rows(task)
         layout = _Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
+        n, flags = self._n, ((self._n,), _BOOL)
+        arrays = (*layout.shapes, ((n,), np.dtype(np.float64)), flags, flags)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -149,7 +150,7 @@ class CompiledEngine(BatchEngine):
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            self._surroundings(task),
+            {**self._surroundings(task), "results": (np.empty, StepResult, layout.names, arrays)},
         )
         self._play_with_resets = self._pool.watched(self._play)
         self._start = self._pool.start_of_play()
@@ -233,7 +234,7 @@ class CompiledEngine(BatchEngine):
         constants = plan.constant_variables
         return {
             "kept": self._kept,
-            "keeps_always": True,  # methods and snapshots read them, and they cost little
+            "reads_kept": task.judgement.loads("kept"),
             "copies": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
             ),
@@ -380,23 +381,26 @@ class CompiledEngine(BatchEngine):
             return self._step_on_arrays(actions, resetting)
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
+        result: StepResult
         drawn, last, started = self._spare or self._make_spare()
         drawn = drawn if resetting is None else self._draw_ahead(resetting)
-        seen, n = self._new_arrays(), self._n
-        rewards, done, cut = _empty(n), _empty(n, _BOOL), _empty(n, _BOOL)
         play = self._play if resetting is started is None else self._play_with_resets
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            counts = play(actions, seen, rewards, done, cut, drawn, last, started)
+            result, troubled, ended, begun = play(actions, drawn, last, started)
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
-        troubled, ended, begun = counts
         self.any_ended = ended > begun
-        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        if begun or resetting is not None:
-            infos = self._with_starts(infos, resetting, drawn, last, started)
-        out = _make_result((observations, rewards, done, cut, infos))
-        return self._completed(out, troubled, resetting, started) if troubled or self._left else out
+        if self._divided is not None:
+            observations, infos = self._divided(result.observations)
+            result = _make_result((observations, *result[1:4], infos))
+        if resetting is not None:
+            result.infos.update(_start_infos(self.env._plan, drawn, resetting))
+        elif begun:
+            result = self._with_ends(result, drawn, last, started)
+        if troubled or self._left:
+            return self._completed(result, troubled, resetting, started)
+        return result
 
     def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
         """Check actions before Python draws or calls a hook: a refused step changes nothing."""
@@ -415,22 +419,14 @@ class CompiledEngine(BatchEngine):
             raise error
         return converted
 
-    def _with_starts(
-        self,
-        infos: dict[str, Any],
-        resetting: MaskArray | None,
-        drawn: FloatArray,
-        last: Any,
-        started: Any,
-    ) -> dict[str, Any]:
-        """Add the infos on the episodes that have started in this step."""
-        if resetting is not None:
-            infos["drawn"] = LateDict.of(_told, self.env._plan, drawn, resetting)
-            infos["_drawn"] = resetting
-            return infos
+    def _with_ends(
+        self, result: StepResult, drawn: FloatArray, last: Any, started: Any
+    ) -> StepResult:
+        """Add the infos on the episodes that have ended and on those that have followed them."""
         self._spare = None
         late = LateDict.of(self._infos_at_ends, drawn, last, started)
-        return infos | late if infos else late
+        infos = result.infos | late if result.infos else late
+        return _make_result((*result[:4], infos))
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -587,10 +583,6 @@ class CompiledEngine(BatchEngine):
         self._require_finite_inputs(resetting)
 
 
-def _named_arrays(shapes: Sequence[tuple[str, Any, Any]]) -> dict[str, npt.NDArray[Any]]:
-    return {name: _empty(shape, dtype) for name, shape, dtype in shapes}
-
-
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
 
@@ -609,8 +601,9 @@ class _Layout:
         env: The environment, with the arrays of N.
 
     Attributes:
-        new_arrays: Makes the arrays of a step: one, or a tuple or dict of those that the program
-            stores in.
+        shapes: The shape and type of each array.
+        names: None if the observations are the only array; the keys if they are a dict; otherwise
+            empty.
         divided: Returns the observations and a new dict of infos that such arrays hold. None if
             what ``new_arrays`` makes are the observations.
     """
@@ -618,21 +611,23 @@ class _Layout:
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
         self._n = len(env.step_count)
         self._paths = [array.path for array in task.seen]
-        self._shapes = [((self._n, *array.shape), array.dtype) for array in task.seen]
-        paths = zip(self._paths, self._shapes, strict=True)
-        self._named_shapes = [(path[-1], *shape) for path, shape in paths]
-        self.new_arrays: Callable[[], Any] = self._stored
+        self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
+        self.names: tuple[str, ...] | None = ()
         self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
         if not task.seen and env._pool_observes:
-            self.new_arrays = partial(np.empty, (self._n, env._output_count), np.float32)
-            self.divided = None
+            self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
+            self.names, self.divided = None, None
         elif self._paths == [("observation",)]:
-            self.new_arrays, self.divided = partial(np.empty, *self._shapes[0]), None
+            self.names, self.divided = None, None
         elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
-            self.new_arrays, self.divided = partial(_named_arrays, self._named_shapes), None
+            self.names, self.divided = tuple(path[-1] for path in self._paths), None
 
-    def _stored(self) -> tuple[npt.NDArray[Any], ...]:
-        return tuple([np.empty(shape, dtype) for shape, dtype in self._shapes])
+    def new_arrays(self) -> Any:
+        """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
+        arrays = tuple(np.empty(shape, dtype) for shape, dtype in self.shapes)
+        if self.names is None:
+            return arrays[0]
+        return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""

@@ -1,0 +1,362 @@
+#include "results.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+/* The beginning of an array of numpy, as its C interface publishes it. knows_arrays compares it with
+ * what numpy says of an array; where it differs, all arrays are new ones. */
+typedef struct {
+    char *data;
+    int dimensions;
+    Py_ssize_t *shape, *strides;
+    PyObject *base, *type;
+    int flags;
+    PyObject *weak_references;
+} Fields;
+
+typedef struct {
+    PyObject_HEAD Fields fields;
+} Array;
+
+/* An array that was made for a step, and what it was like then. Its holder may have changed its
+ * shape, type or flags in place. */
+typedef struct {
+    PyObject *array;
+    char *memory;
+    Fields fields;
+} Made;
+
+enum {
+    MOST_DIMENSIONS = 8,
+    ROUNDS = 2 /* callers often hold the arrays of one step while they take the next */
+};
+
+typedef struct {
+    PyObject *arguments; /* of numpy.empty */
+    size_t size;         /* in bytes */
+    int dimensions;
+    Py_ssize_t shape[MOST_DIMENSIONS], strides[MOST_DIMENSIONS];
+    Made made[ROUNDS];
+    unsigned oldest;
+} Maker;
+
+struct Results {
+    PyObject *parts, *empty, *names;
+    PyTypeObject *class;
+    allocfunc allocate;
+    bool looks_inside;
+    size_t number_of_seen;
+    Maker makers[RESULT_ARRAYS];
+};
+
+static const Fields *fields_of(PyObject *array) {
+    return &((Array *)array)->fields;
+}
+
+/* Looking inside of arrays */
+
+static bool has_room_for_fields(PyObject *array) {
+    PyObject *size = PyObject_GetAttrString((PyObject *)Py_TYPE(array), "__basicsize__");
+    const bool has = size != NULL && PyLong_AsSsize_t(size) >= (Py_ssize_t)sizeof(Array);
+
+    Py_XDECREF(size);
+    return has;
+}
+
+static bool equals_buffer(PyObject *array) {
+    const Fields *f = fields_of(array);
+    PyObject *type = PyObject_GetAttrString(array, "dtype");
+    Py_buffer b;
+
+    if (type == NULL || PyObject_GetBuffer(array, &b, PyBUF_STRIDES) < 0) {
+        Py_XDECREF(type);
+        return false;
+    }
+    const size_t lengths = (size_t)b.ndim * sizeof *b.shape;
+    const bool equal = f->data == b.buf && f->dimensions == b.ndim && f->base == NULL &&
+                       f->type == type && f->weak_references == NULL &&
+                       memcmp(f->shape, b.shape, lengths) == 0 &&
+                       memcmp(f->strides, b.strides, lengths) == 0;
+    PyBuffer_Release(&b);
+    Py_DECREF(type);
+    return equal;
+}
+
+/* Whether the fields for flags and weak references show it when these change. */
+static bool shows_changes(PyObject *array) {
+    const int flags = fields_of(array)->flags;
+    PyObject *reference = PyWeakref_NewRef(array, NULL);
+    const bool shows_reference = reference != NULL && fields_of(array)->weak_references != NULL;
+    PyObject *nothing = PyObject_CallMethod(array, "setflags", "i", 0);
+    const bool shows_flags = nothing != NULL && fields_of(array)->flags != flags;
+
+    Py_XDECREF(reference);
+    Py_XDECREF(nothing);
+    return shows_reference && shows_flags;
+}
+
+static bool knows_arrays(PyObject *empty) {
+    PyObject *array = PyObject_CallFunction(empty, "((ii))", 2, 3);
+    const bool knows = array != NULL && has_room_for_fields(array) && equals_buffer(array) &&
+                       shows_changes(array);
+
+    Py_XDECREF(array);
+    PyErr_Clear();
+    return knows;
+}
+
+/* Whether an array is what it was when it was made, and nobody else holds it. */
+static bool is_free(const Maker *maker, const Made *made) {
+    const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
+
+    if (made->array == NULL || Py_REFCNT(made->array) != 1) {
+        return false;
+    }
+    const Fields *now = fields_of(made->array), *then = &made->fields;
+    return now->data == then->data && now->dimensions == then->dimensions &&
+           now->base == NULL && now->type == then->type && now->flags == then->flags &&
+           now->weak_references == NULL && memcmp(now->shape, maker->shape, lengths) == 0 &&
+           memcmp(now->strides, maker->strides, lengths) == 0;
+}
+
+/* Taking over */
+
+static bool take_buffer_of(Maker *maker, const Py_buffer *b) {
+    if (b->ndim > MOST_DIMENSIONS) {
+        return false;
+    }
+    maker->size = (size_t)b->len;
+    maker->dimensions = b->ndim;
+    memcpy(maker->shape, b->shape, (size_t)b->ndim * sizeof *b->shape);
+    memcpy(maker->strides, b->strides, (size_t)b->ndim * sizeof *b->strides);
+    return true;
+}
+
+static bool measure(Results *r, Maker *maker) {
+    PyObject *array = PyObject_CallObject(r->empty, maker->arguments);
+    Py_buffer buffer;
+
+    if (array == NULL || PyObject_GetBuffer(array, &buffer, PyBUF_STRIDES) < 0) {
+        Py_XDECREF(array);
+        return false;
+    }
+    const bool taken = take_buffer_of(maker, &buffer);
+    PyBuffer_Release(&buffer);
+    Py_DECREF(array);
+    if (!taken) {
+        PyErr_SetString(PyExc_ValueError, "an array of results has too many dimensions");
+    }
+    return taken;
+}
+
+static bool take_makers(Results *r, PyObject *shapes) {
+    const Py_ssize_t count = PyTuple_Size(shapes), judged = RESULT_ARRAYS - MOST_SEEN;
+
+    if (count < judged || count > RESULT_ARRAYS) {
+        PyErr_SetString(PyExc_ValueError, "results have too few or too many arrays");
+        return false;
+    }
+    r->number_of_seen = (size_t)(count - judged);
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const Py_ssize_t later = i - (count - judged);
+        Maker *maker = &r->makers[later < 0 ? i : MOST_SEEN + later];
+        maker->arguments = PyTuple_GetItem(shapes, i);
+        if (!PyTuple_Check(maker->arguments)) {
+            PyErr_SetString(PyExc_TypeError, "expected a tuple of shape and type");
+            return false;
+        }
+        if (!measure(r, maker)) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static bool take_names(Results *r, PyObject *names) {
+    const bool fits = names == Py_None ? r->number_of_seen == 1
+                                       : PyTuple_Check(names) &&
+                                             (PyTuple_Size(names) == 0 ||
+                                              (size_t)PyTuple_Size(names) == r->number_of_seen);
+    r->names = names;
+    if (!fits) {
+        PyErr_SetString(PyExc_ValueError, "the names do not fit the arrays of observations");
+    }
+    return fits;
+}
+
+static bool take_class(Results *r) {
+    r->allocate = (allocfunc)PyType_GetSlot(r->class, Py_tp_alloc);
+    if (r->allocate == NULL || !PyType_IsSubtype(r->class, &PyTuple_Type)) {
+        PyErr_SetString(PyExc_TypeError, "results must be tuples");
+        return false;
+    }
+    return true;
+}
+
+static bool take_parts(Results *r, PyObject *parts) {
+    PyObject *names, *shapes;
+
+    if (!PyArg_ParseTuple(parts, "OO!OO!;results", &r->empty, &PyType_Type, &r->class, &names,
+                          &PyTuple_Type, &shapes) ||
+        !take_class(r) || !take_makers(r, shapes) || !take_names(r, names)) {
+        return false;
+    }
+    r->looks_inside = knows_arrays(r->empty);
+    return true;
+}
+
+Results *results_take(PyObject *parts) {
+    Results *r = calloc(1, sizeof *r);
+
+    if (r == NULL) {
+        PyErr_NoMemory();
+        return NULL;
+    }
+    r->parts = Py_NewRef(parts); /* keeps the rest alive */
+    if (!PyTuple_Check(parts)) {
+        PyErr_SetString(PyExc_TypeError, "expected a tuple of results");
+    } else if (take_parts(r, parts)) {
+        return r;
+    }
+    results_free(r);
+    return NULL;
+}
+
+void results_free(Results *r) {
+    if (r == NULL) {
+        return;
+    }
+    for (size_t i = 0; i < RESULT_ARRAYS; i++) {
+        for (size_t k = 0; k < ROUNDS; k++) {
+            Py_XDECREF(r->makers[i].made[k].array);
+        }
+    }
+    Py_XDECREF(r->parts);
+    free(r);
+}
+
+size_t results_number_of_seen(const Results *r) {
+    return r->number_of_seen;
+}
+
+size_t results_size(const Results *r, size_t array) {
+    return r->makers[array].size;
+}
+
+/* Providing */
+
+static bool make(const Results *r, const Maker *maker, Made *made) {
+    Py_buffer buffer;
+    PyObject *array = PyObject_CallObject(r->empty, maker->arguments);
+
+    if (array == NULL || PyObject_GetBuffer(array, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
+        Py_XDECREF(array);
+        return false;
+    }
+    *made = (Made){.array = array, .memory = buffer.buf};
+    if (r->looks_inside) {
+        made->fields = *fields_of(array);
+    }
+    PyBuffer_Release(&buffer);
+    return true;
+}
+
+/* Returns an array that the caller drops, or NULL with an exception. */
+static PyObject *provide(const Results *r, Maker *maker, char **memory) {
+    Made new;
+
+    for (size_t k = 0; k < ROUNDS && r->looks_inside; k++) {
+        if (is_free(maker, &maker->made[k])) {
+            *memory = maker->made[k].memory;
+            return Py_NewRef(maker->made[k].array);
+        }
+    }
+    if (!make(r, maker, &new)) {
+        return NULL;
+    }
+    *memory = new.memory;
+    if (!r->looks_inside) {
+        return new.array;
+    }
+    Made *place = &maker->made[maker->oldest];
+    PyObject *before = place->array;
+    maker->oldest = (maker->oldest + 1) % ROUNDS;
+    *place = new;
+    Py_XDECREF(before);
+    return Py_NewRef(new.array);
+}
+
+bool results_provide(Results *r, StepArrays *a) {
+    for (size_t i = 0; i < RESULT_ARRAYS; i++) {
+        a->arrays[i] = NULL; /* whatever fails, these can be dropped */
+    }
+    for (size_t i = 0; i < r->number_of_seen; i++) {
+        a->arrays[i] = provide(r, &r->makers[i], &a->memory[i]);
+        if (a->arrays[i] == NULL) {
+            return false;
+        }
+    }
+    for (size_t i = REWARDS_ARRAY; i < RESULT_ARRAYS; i++) {
+        a->arrays[i] = provide(r, &r->makers[i], &a->memory[i]);
+        if (a->arrays[i] == NULL) {
+            return false;
+        }
+    }
+    return true;
+}
+
+void results_drop(const Results *r, StepArrays *a) {
+    for (size_t i = 0; i < r->number_of_seen; i++) {
+        Py_XDECREF(a->arrays[i]);
+    }
+    for (size_t i = REWARDS_ARRAY; i < RESULT_ARRAYS; i++) {
+        Py_XDECREF(a->arrays[i]);
+    }
+}
+
+/* Returning */
+
+static PyObject *dict_of(const Results *r, const StepArrays *a) {
+    PyObject *dict = PyDict_New();
+
+    for (size_t i = 0; i < r->number_of_seen && dict != NULL; i++) {
+        if (PyDict_SetItem(dict, PyTuple_GetItem(r->names, (Py_ssize_t)i), a->arrays[i]) < 0) {
+            Py_CLEAR(dict);
+        }
+    }
+    return dict;
+}
+
+static PyObject *tuple_of(const Results *r, const StepArrays *a) {
+    PyObject *tuple = PyTuple_New((Py_ssize_t)r->number_of_seen);
+
+    for (size_t i = 0; i < r->number_of_seen && tuple != NULL; i++) {
+        PyTuple_SetItem(tuple, (Py_ssize_t)i, Py_NewRef(a->arrays[i]));
+    }
+    return tuple;
+}
+
+static PyObject *observations_of(const Results *r, const StepArrays *a) {
+    if (r->names == Py_None) {
+        return Py_NewRef(a->arrays[0]);
+    }
+    return PyTuple_Size(r->names) == 0 ? tuple_of(r, a) : dict_of(r, a);
+}
+
+/* Makes the tuple without the constructor of its class, which takes several times as long. */
+PyObject *results_make(const Results *r, const StepArrays *a) {
+    PyObject *observations = observations_of(r, a), *infos = PyDict_New();
+    PyObject *result = observations == NULL || infos == NULL ? NULL : r->allocate(r->class, 5);
+
+    if (result == NULL) {
+        Py_XDECREF(observations);
+        Py_XDECREF(infos);
+        return NULL;
+    }
+    PyTuple_SetItem(result, 0, observations);
+    for (Py_ssize_t i = 0; i < 3; i++) {
+        PyTuple_SetItem(result, 1 + i, Py_NewRef(a->arrays[REWARDS_ARRAY + i]));
+    }
+    PyTuple_SetItem(result, 4, infos);
+    return result;
+}
