@@ -9,6 +9,10 @@ import os
 import pickle
 import shutil
 import signal
+import subprocess
+import sys
+import textwrap
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -293,6 +297,14 @@ def children():
     return found
 
 
+def is_running(process):
+    """Whether there is such a process, and it is more than a note that it has ended."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return False
+
+
 on_linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="/proc lists processes")
 
 
@@ -394,6 +406,36 @@ class TestFaults:
         assert len(set(children()) - self.others) == 2
         pool.close()
         assert not set(children()) - self.others
+
+    @on_linux
+    @pytest.mark.parametrize("stage", ["nowhere", "step"])
+    def test_workers_end_with_a_process_that_is_killed(self, fmus, faulty, stage):
+        """Also if the FMU hangs."""
+        script = f"""
+            import numpy as np
+            from test_systems_apart import *
+            plan = with_fault({dict(fmus)!r}, {str(faulty)!r})
+            fmu = SystemFMU(plan)
+            spec = PoolSpec((), (fmu.variable("bad.y"),), 0.5)
+            pool = local_pool(fmu, spec, 1, LOG, native=True)
+            names = tuple(map(fmu.variable, NAMES))
+            pool.reset(names, asking_for("hang", stage={stage!r}))
+            print(*children(), flush=True)
+            for _ in range(10**9):
+                pool.step()
+        """
+        script = textwrap.dedent(script).replace("PosixPath", "Path")
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+        with subprocess.Popen(
+            [sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment
+        ) as parent:
+            worker = int(parent.stdout.readline())
+            time.sleep(0.3)
+            parent.kill()
+        deadline = time.monotonic() + 20
+        while is_running(worker):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
 
     @on_linux
     @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
