@@ -93,6 +93,9 @@ def claim_initialization(last: Array, interval: float, /) -> float:
         The seconds until then.
     """
 
+def text_with(number: float, /) -> str | None:
+    """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
+
 @final
 class Access:
     """A list of variables of one FMI version.

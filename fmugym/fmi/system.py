@@ -312,6 +312,13 @@ class SystemInstance(Instance, Repeatable):
         ends = self._description.ends[variable.value_reference]
         self._pending += [(end, value) for end in ends]
 
+    def get_string(self, variable: Variable) -> tuple[int, str]:
+        """See ``Instance.get_string``."""
+        end = self._description.ends[variable.value_reference][0]
+        part = self._parts[end.part]
+        status, text = part.instance.get_string(end.variable)
+        return int(self._trying(lambda: part.judge(status))), text
+
     # Initialization: the components are initialized one inside of the other.
 
     def initialize(

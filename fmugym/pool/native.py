@@ -26,6 +26,7 @@ import numpy.typing as npt
 from fmugym import _native
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.texts import ask_for_texts
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
@@ -66,6 +67,8 @@ from fmugym.systems.description import SystemDescription
 __all__ = ["NativePool"]
 
 _MOST_CACHED: Final = 64
+
+ask_for_texts(_native.text_with)
 
 FloatArray32 = npt.NDArray[np.float32]
 

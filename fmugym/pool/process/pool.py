@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.texts import ask_for_texts
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
@@ -102,6 +103,8 @@ class ProcessPool(SavingPool):
             fmu.close()
             raise
         self._prepare_saving(fmu.description, spec)
+        self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
+        ask_for_texts(self._find_text, self)
         arrays = make_arrays(memory, spec, num_instances)
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
@@ -388,8 +391,18 @@ class ProcessPool(SavingPool):
             growth[supervisor.block] = supervisor.growth
         return growth
 
+    def _find_text(self, number: float) -> str | None:
+        """Ask the workers for a text that an FMU of theirs has given."""
+        with self._lock:
+            if self._crew.refusal or not self._gives_texts:
+                return None
+            crew = self._crew
+            answers = crew.run("a question", crew.able, lambda s: s.tell("text_of", number))
+            return next(filter(None, answers.values()), None)
+
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
+        self._gives_texts |= any(variable.kind == "string" for variable in variables)
         return np.concatenate(self._asked("reading variables", "read", variables), axis=1)
 
     def differentiate(

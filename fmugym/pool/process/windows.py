@@ -55,6 +55,7 @@ REQUESTS: Final = (
     "read",
     "replace_record",
     "differentiate",
+    "text_of",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
@@ -340,6 +341,12 @@ class ProgramCoding:
         block = self._setup.block
         shape = len(variables), block.stop - block.start
         return np.frombuffer(reader.rest(), np.float64).reshape(shape)
+
+    def _ask_text_of(self, writer: _Writer, number: float) -> None:
+        writer.numbers(number)
+
+    def _answer_text_of(self, reader: _Reader, _: float) -> str:
+        return reader.text()
 
     @property
     def _is_adjoint(self) -> bool:
