@@ -48,6 +48,7 @@ SLOW_MODULES = {
     "test_systems",
     "test_systems_apart",
     "test_systems_arrays",
+    "test_systems_clocks",
     "test_systems_control",
     "test_systems_description",
     "test_systems_faces",

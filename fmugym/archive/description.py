@@ -456,7 +456,7 @@ class ModelDescription:
             return ()
         return tuple(v for v in self.variables.values() if v.ticking and not v.shape)
 
-    @cached_property
+    @property
     def clocked_inputs(self) -> tuple[Variable, ...]:
         """The inputs that may be set only while one of their clocks ticks."""
         known = {clock.value_reference for clock in self.clocks}
