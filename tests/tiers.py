@@ -11,6 +11,7 @@ SLOW_MODULES = {
     "test_cli_advice",
     "test_cli_docs",
     "test_cli_tuning",
+    "test_clock_fractions",
     "test_compile",
     "test_copies",
     "test_events",
