@@ -29,6 +29,7 @@ SLOW_MODULES = {
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
+    "test_fuzz_systems",
     "test_fuzz_tasks",
     "test_input_interpolation",
     "test_lab_fuzz",
