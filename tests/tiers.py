@@ -96,6 +96,7 @@ EVERY_IN_CI = {
     "test_string_outputs": 5,
     "test_strings": 5,
     "test_systems": 5,
+    "test_systems_apart": 3,
     "test_systems_control": 3,
     "test_systems_resets": 5,
     "test_value_types": 3,
