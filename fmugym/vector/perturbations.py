@@ -100,6 +100,7 @@ class _Perturbation:
         self._x = tuple(map(env.fmu.variable, states))
         self._count_of_y = env._output_count
         self._start = start
+        self._times: FloatArray = np.empty(0)
         self._everywhere = np.arange(envs.num_envs)
         given = {
             name: column[0]
@@ -175,7 +176,7 @@ class _Perturbation:
         self._columns: Columns = stacked(columns)
         spec = self._envs._prototype._spec
         pairs = zip(self._bundle.steps.tolist(), self._bundle.start_times.tolist(), strict=True)
-        self._times: FloatArray = np.array([spec.communication_point(*pair) for pair in pairs])
+        self._times = np.array([spec.communication_point(*pair) for pair in pairs])
         return np.array(x), np.array(y)
 
     def _scales(self, x: FloatArray) -> FloatArray:
