@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Final, Never
 import numpy as np
 from gymnasium import logger as gymnasium_logger
 
+from fmugym.archive.texts import text_of
 from fmugym.checks import check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown, unknown_argument
@@ -24,7 +25,7 @@ from fmugym.systems import FMUSystem
 from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode, EpisodePlan
-from fmugym.task.interface import outputs_named
+from fmugym.task.interface import readable_named
 from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
@@ -236,7 +237,7 @@ class FMUEnv(Constructed):
         obstacle = None
         if self._own.step or self._own.reset:
             obstacle = f"{'step' if self._own.step else 'reset'} is overridden"
-        elif not pool.can_play or pool.num_instances > 1:
+        elif not pool.plays_alone or pool.num_instances > 1:
             obstacle = "the pool is not a native one of its own"
         if obstacle is None and self._way != "python":
             self._play, self._width, self._tells = None, 0, False
@@ -616,21 +617,25 @@ class FMUEnv(Constructed):
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
         return lambda achieved, desired, info: self._goal_reward(achieved, desired)
 
-    def read_variables(self, *names: str) -> dict[str, float]:
-        """Read any numeric variables of the FMU now, for inspection outside of an episode's loop.
+    def read_variables(self, *names: str) -> dict[str, Any]:
+        """Read any variables of the FMU now, for inspection outside of an episode's loop.
 
-        The name of an array stands for its elements, which come by their own names.
+        The name of an array stands for its elements, which come by their own names. The values are
+        numbers, those of Strings texts.
 
         Raises:
-            ConfigError: If a name is unknown or its variable is not numeric.
+            ConfigError: If a name is unknown or its variable is neither numeric nor a String.
             SimulationError: If the environment is closed or was never reset.
         """
         pool = self._open_pool("read_variables")
         if not self._was_reset:
             raise SimulationError("read_variables was called before the first reset")
-        variables = outputs_named(self.fmu.description, names)
+        variables = readable_named(self.fmu.description, names)
         values = pool.read(variables)[:, 0].tolist()
-        return {variable.name: value for variable, value in zip(variables, values, strict=True)}
+        return {
+            variable.name: text_of(value) if variable.kind == "string" else value
+            for variable, value in zip(variables, values, strict=True)
+        }
 
     @property
     def np_random(self) -> np.random.Generator:

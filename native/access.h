@@ -101,7 +101,8 @@ Status variable_set(const Fmi *fmi, const Library *library, void *component, Typ
 
 /* Both functions use typed as scratch memory for width doubles and return the worst
  * status. They stop after the first type whose status is worse than a warning. They restore the
- * floating-point environment after each call into the FMU. access_set leaves Strings out. */
+ * floating-point environment after each call into the FMU. A String is the number of
+ * its text, see texts.h; access_set leaves Strings out. */
 Status access_get(const Access *access, const Library *library, void *component, double *values,
                   void *typed, const Floats *floats);
 Status access_set(const Access *access, const Library *library, void *component,

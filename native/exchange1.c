@@ -54,6 +54,7 @@ static const Binding bindings[] = {
     ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
     ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
     {"SetString", offsetof(Functions, older.set_string), false},
+    {"GetString", offsetof(Functions, older.get_string), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {
@@ -109,6 +110,7 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
+    .get_string = older_get_string,
     SHARED_FUNCTIONS,
 };
 

@@ -61,6 +61,7 @@ static const Fmi fmu = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
+    .get_string = older_get_string,
     .derive = derive,
     SHARED_FUNCTIONS,
     SHARED_STATES,

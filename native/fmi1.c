@@ -38,6 +38,7 @@ static const Binding bindings[] = {
     ELEMENT("SetInteger", Functions, older.set, TYPE_INT32),
     ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
     {"SetString", offsetof(Functions, older.set_string), false},
+    {"GetString", offsetof(Functions, older.get_string), false},
     {"SetRealInputDerivatives", offsetof(Functions, older.set_derivatives), false},
 };
 
@@ -92,5 +93,6 @@ const Fmi fmi1 = {
     .get = older_get,
     .set = older_set,
     .set_string = older_set_string,
+    .get_string = older_get_string,
     SHARED_FUNCTIONS,
 };

@@ -3,6 +3,8 @@
 #include <stdio.h>
 #include <string.h>
 
+#include "texts.h"
+
 #include "far.h"
 #include "served.h"
 
@@ -187,6 +189,25 @@ static Status set_string(const Library *library, void *component, uint32_t refer
     return status;
 }
 
+static Status get_string(const Library *library, void *component, uint32_t reference,
+                         const char **text) {
+    Far *me = component;
+    Status status = far_set_waiting(me);
+
+    (void)library;
+    if (status > STATUS_WARNING) {
+        return status;
+    }
+    far_begin(me);
+    packet_put_size(&me->host->out, reference);
+    status = far_ask(me, ASK_GET_STRING);
+    if (status <= STATUS_WARNING) {
+        *text = text_with(text_number(packet_take_text(&me->host->in))); /* the packet changes */
+    }
+    far_end(me);
+    return status;
+}
+
 /* Steps */
 
 static void take_outputs(Far *me) {
@@ -262,6 +283,7 @@ static bool bind(Library *library, char *error, size_t size) {
 #define REMOTE_FUNCTIONS                                                                           \
     .bind = bind, .instantiate = far_instantiate, .initialize = initialize, .do_step = do_step,        \
     .exchange = exchange_one_by_one, .get = get, .set = set, .set_string = set_string,             \
+    .get_string = get_string,                                                                      \
     .reset = far_reset, .terminate = far_terminate, .free_instance = far_free, .blamed = far_blamed,      \
     .drop = far_drop
 #define REMOTE_STATES                                                                              \

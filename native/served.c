@@ -252,6 +252,14 @@ static void answer_set(Instance *me) {
     serving_answer(status);
 }
 
+static void answer_get_string(Instance *me) {
+    const uint32_t reference = (uint32_t)serving_take_size();
+    const char *text = NULL;
+
+    serving_answer(served.fmi->get_string(&served.library, me->component, reference, &text));
+    packet_put_text(&served.out, text);
+}
+
 static void answer_set_string(Instance *me) {
     const uint32_t reference = (uint32_t)serving_take_size();
     char *text = serving_copy(packet_take_text(&served.in));
@@ -327,6 +335,7 @@ static bool answer_one(char code, Instance *me) {
     case ASK_GET: answer_get(me); return true;
     case ASK_SET: answer_set(me); return true;
     case ASK_SET_STRING: answer_set_string(me); return true;
+    case ASK_GET_STRING: answer_get_string(me); return true;
     case ASK_RESET: serving_answer(served.fmi->reset(&served.library, me->component)); return true;
     case ASK_TERMINATE:
         serving_answer(served.fmi->terminate(&served.library, me->component));

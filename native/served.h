@@ -17,6 +17,7 @@ enum {
     ASK_GET = 'g',
     ASK_SET = 'p',
     ASK_SET_STRING = 't',
+    ASK_GET_STRING = 'T',
     ASK_RESET = 'r',
     ASK_TERMINATE = 'e',
     ASK_FREE = 'f',

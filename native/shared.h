@@ -29,6 +29,8 @@ typedef struct {
     Set *set[NUMBER_OF_TYPES];
     int (*set_string)(void *component, const uint32_t *references, size_t count,
                       const char *const *values);
+    int (*get_string)(void *component, const uint32_t *references, size_t count,
+                      const char **values);
     int (*set_derivatives)(void *component, const uint32_t *references, size_t count,
                            const int *orders, const double *values);
 } Older;
@@ -120,6 +122,13 @@ static inline Status older_set_string(const Library *library, void *component,
     const Older *f = older_of(library);
     return f->set_string == NULL ? STATUS_ERROR
                                  : sane(f->set_string(component, &reference, 1, &text));
+}
+
+static inline Status older_get_string(const Library *library, void *component,
+                                      uint32_t reference, const char **text) {
+    const Older *f = older_of(library);
+    return f->get_string == NULL ? STATUS_ERROR
+                                 : sane(f->get_string(component, &reference, 1, text));
 }
 
 /* The entries of these functions in a table, and of those for FMU states. */

@@ -164,16 +164,12 @@ static Status step_group(Composite *me, const PartGroup *group, Span span) {
     return status;
 }
 
-Status system_do_step(const Library *library, void *component, double time, double step,
-                      bool no_return) {
-    Composite *me = component;
+Status system_step_once(Composite *me, double time, double step, bool no_return) {
     const System *s = me->system;
     const Span span = {time, step, no_return};
 
-    (void)library;
     me->blamed = NULL;
     me->terminated = false;
-    me->kept.stepped = true;
     Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
     me->is_fresh = false;
     if (goes_on(status) && s->jacobi) {
@@ -184,6 +180,16 @@ Status system_do_step(const Library *library, void *component, double time, doub
     }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
+}
+
+Status system_do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
+    Composite *me = component;
+
+    (void)library;
+    me->kept.stepped = true;
+    return me->system->control.tolerance > 0.0 ? system_step_controlled(me, time, step)
+                                               : system_step_once(me, time, step, no_return);
 }
 
 static bool exchange(const Library *library, const Exchange *e) {
@@ -214,6 +220,7 @@ const Fmi composite = {
     .get = system_get,
     .set = system_set,
     .set_string = system_set_string,
+    .get_string = system_get_string,
     .reset = system_reset,
     .terminate = system_terminate,
     .free_instance = system_free,

@@ -162,7 +162,8 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
     if (end == NULL) {
         return STATUS_ERROR;
     }
-    if (end->output >= 0 && me->is_fresh) {
+    const bool is_own = end->output >= (int64_t)me->system->first_statistic;
+    if (end->output >= 0 && (me->is_fresh || is_own)) {
         *value = me->outputs[end->output];
     } else if (end->input >= 0) {
         *value = me->inputs[end->input];
@@ -257,4 +258,21 @@ Status system_set_string(const Library *library, void *component, uint32_t refer
         good = note(me, &s->ends[i], 0.0, text) == STATUS_OK;
     }
     return good ? STATUS_OK : STATUS_ERROR;
+}
+
+Status system_get_string(const Library *library, void *component, uint32_t reference,
+                         const char **text) {
+    Composite *me = component;
+
+    (void)library;
+    me->blamed = NULL;
+    const End *end = first_end(me, reference);
+    if (end == NULL) {
+        return STATUS_ERROR;
+    }
+    const Fmi *fmi = me->system->parts[end->part].fmi;
+    const Status status = fmi->get_string(&me->libraries[end->part], me->components[end->part],
+                                          end->element.reference, text);
+    floats_restore_if_seen(me->floats);
+    return part_judge(me, end->part, status);
 }

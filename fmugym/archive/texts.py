@@ -8,7 +8,8 @@ an Enumeration does, so that each process which knows the variable can find them
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Sequence
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -18,7 +19,15 @@ import numpy.typing as npt
 from fmugym.archive.description import Variable
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["number_of", "numbers_of", "text_among", "text_of", "texts_of", "with_texts"]
+__all__ = [
+    "ask_for_texts",
+    "number_of",
+    "numbers_of",
+    "text_among",
+    "text_of",
+    "texts_of",
+    "with_texts",
+]
 
 _BITS: Final = 53
 """All integers of so many bits are exact in float64."""
@@ -30,6 +39,8 @@ _PRIME: Final = 0x100000001B3
 _numbers: Final[dict[str, float]] = {}
 _texts: Final[dict[float, str]] = {}
 """The texts that this process has met, and their numbers."""
+
+_finders: Final[dict[Callable[[float], str | None], None]] = {}
 
 
 def number_of(text: str) -> float:
@@ -60,8 +71,34 @@ def _hash(data: bytes) -> int:
 
 
 def text_of(number: float) -> str:
-    """The text that a number stands for; "" if this process has not met it."""
-    return _texts.get(number, "")
+    """The text that a number stands for; "" if nobody knows it any more."""
+    known = _texts.get(number)
+    if known is not None:
+        return known
+    found = next(filter(None, (find(number) for find in list(_finders))), None)
+    if found is not None:
+        _texts[number] = found
+    return found or ""
+
+
+def ask_for_texts(find: Callable[[float], str | None], owner: object | None = None) -> None:
+    """Let ``text_of`` ask for texts that FMUs have given elsewhere.
+
+    Args:
+        find: Returns a text, or None. A method of the owner if there is one.
+        owner: When it is gone, it is not asked any more.
+    """
+    if owner is None:
+        _finders[find] = None
+        return
+    method = weakref.WeakMethod(find)
+
+    def find_if_alive(number: float) -> str | None:
+        alive = method()
+        return None if alive is None else alive(number)
+
+    _finders[find_if_alive] = None
+    weakref.finalize(owner, _finders.pop, find_if_alive, None)
 
 
 def text_among(variable: Variable, number: float) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import Variable, unlisted
-from fmugym.archive.texts import text_among
+from fmugym.archive.texts import number_of, text_among
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status, sane
 
@@ -51,8 +51,8 @@ class Access:
 
     Args:
         instance: The instance.
-        variables: The variables: numeric ones, and Strings that ``set_texts`` sets; ``set`` leaves
-            these out.
+        variables: The variables: numeric ones, and Strings, whose values are the numbers of their
+            texts. ``set_texts`` sets them; ``set`` leaves them out.
         values: The memory to use, contiguous float64; by default new memory.
 
     Attributes:
@@ -110,6 +110,16 @@ class Access:
                 break
             if buffer is not self.values:
                 self.values[indices] = buffer[places]
+        return max(worst, self._get_texts()) if self._strings and worst <= Status.WARNING else worst
+
+    def _get_texts(self) -> int:
+        """Read the Strings: the values are the numbers of their texts."""
+        worst = 0
+        for index, variable in self._strings:
+            status, text = self._instance.get_string(variable)
+            worst = max(worst, status)
+            if status <= Status.WARNING:
+                self.values[index] = number_of(text)
         return worst
 
     def set(self) -> int:

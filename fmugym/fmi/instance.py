@@ -248,6 +248,19 @@ class Instance(ABC):
         )
         self.check(f"setting {variable.name!r}", status)
 
+    def get_string(self, variable: Variable) -> tuple[int, str]:
+        """Get the status and the text of a String variable."""
+        reference = ctypes.c_uint32(variable.value_reference)
+        text = ctypes.c_char_p()
+        status = self._function("GetString")(
+            self._component,
+            ctypes.byref(reference),
+            ctypes.c_size_t(1),
+            ctypes.byref(text),
+            *self._trailing_arguments(1),
+        )
+        return sane(status), (text.value or b"").decode(errors="replace")
+
     def initialize(
         self,
         start_time: float,

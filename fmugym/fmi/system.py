@@ -22,6 +22,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
+from fmugym.fmi.control import Repeatable, StepControl
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
 from fmugym.fmi.kept import KeptStart
 from fmugym.fmi.library import Library
@@ -29,7 +30,7 @@ from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.status import Phase, Status, failed_call, sane
-from fmugym.systems.description import PartVariable, SystemDescription
+from fmugym.systems.description import MASTER, PartVariable, SystemDescription
 from fmugym.systems.layout import Layout, PartLayout, Route, array_key
 from fmugym.systems.plan import Evaluation, Group
 
@@ -142,7 +143,7 @@ class _Memory:
     states: tuple[SavedState, ...]
 
 
-class SystemInstance(Instance):
+class SystemInstance(Instance, Repeatable):
     """One instance of a system; made by ``Library.instantiate``.
 
     Args:
@@ -174,6 +175,9 @@ class SystemInstance(Instance):
         self._hearing, self.hears_all = Hearing(), True
         self.phase = Phase.INSTANTIATED
         self._saved_states: weakref.WeakSet[SavedState] = weakref.WeakSet()
+        nominals = [nominal for _, nominal in layout.compared]
+        control = layout.plan.control
+        self._control = None if control is None else StepControl(control, nominals)
         self._fresh = False
         self._terminated = False
         self._pending: list[tuple[PartVariable, float | str]] | None = None
@@ -269,6 +273,8 @@ class SystemInstance(Instance):
             buffer[index] = _scaled(end.gain, end.offset, self._get(end))
 
     def _get(self, end: PartVariable) -> float:
+        if self._control is not None and end.part == MASTER:
+            return float(self._control.statistics[end.variable.value_reference])
         part = self._parts[end.part]
         output, given = self._layout.output_slot(end), self._layout.input_slot(end)
         if output >= 0 and self._fresh:
@@ -305,6 +311,13 @@ class SystemInstance(Instance):
         assert self._pending is not None
         ends = self._description.ends[variable.value_reference]
         self._pending += [(end, value) for end in ends]
+
+    def get_string(self, variable: Variable) -> tuple[int, str]:
+        """See ``Instance.get_string``."""
+        end = self._description.ends[variable.value_reference][0]
+        part = self._parts[end.part]
+        status, text = part.instance.get_string(end.variable)
+        return int(self._trying(lambda: part.judge(status))), text
 
     # Initialization: the components are initialized one inside of the other.
 
@@ -351,6 +364,8 @@ class SystemInstance(Instance):
             self._begin_all(span, self._collected(set_start_values))
 
     def _collected(self, set_start_values: Callable[[], None]) -> list[Any]:
+        if self._control is not None:
+            self._control.statistics[:] = 0.0
         for part in self._parts:
             part.forget()
         self._fresh = False
@@ -568,11 +583,44 @@ class SystemInstance(Instance):
 
     def _step(self, time: float, step_size: float) -> int:
         self._who, self._terminated = "", False
+        self._kept.stepped = True
         try:
+            if self._control is not None:
+                status = self._control.step(self, time, step_size)
+                return self.judge_step(status) if status else status
             self._step_all(time, step_size)
         except _FailedError as failure:
             return self.judge_step(self._tell(failure))
         return self.judge_step(Status.TERMINATED) if self._terminated else Status.OK
+
+    # What the estimate of errors needs
+
+    def keep(self) -> SavedState:
+        """See ``Repeatable.keep``."""
+        states = tuple(self._save_part(index) for index in range(len(self._parts)))
+        return self._own(_Memory(*self._slots(), self._fresh, states))
+
+    def go_back(self, state: Any) -> None:
+        """See ``Repeatable.go_back``."""
+        for index, own in enumerate(state.memory.states):
+            self._restore_part(index, own)
+        self._put_slots(state.memory)
+
+    def try_step(self, time: float, size: float) -> int:
+        """See ``Repeatable.try_step``."""
+        self._terminated = False
+        try:
+            self._step_all(time, size)
+        except _FailedError as failure:
+            if failure.status not in (Status.DISCARD, Status.NOT_FINITE):
+                raise
+            return self._tell(failure)
+        return Status.TERMINATED if self._terminated else Status.OK
+
+    def sources(self) -> npt.NDArray[np.float64]:
+        """See ``Repeatable.sources``."""
+        outputs = np.frombuffer(self._slots()[1])
+        return outputs[[place for place, _ in self._layout.compared]]
 
     def judge_step(self, status: int) -> int:
         """See ``Instance.judge_step``; values for other components may be no numbers."""
@@ -582,7 +630,6 @@ class SystemInstance(Instance):
         return status
 
     def _step_all(self, time: float, step_size: float) -> None:
-        self._kept.stepped = True
         if not self._fresh:
             self._refresh()
         self._fresh = False
@@ -715,9 +762,10 @@ class SystemInstance(Instance):
         return self._own(memory)
 
     def _slots(self) -> tuple[bytes, bytes]:
+        statistics = b"" if self._control is None else self._control.statistics.tobytes()
         return (
             b"".join(part.inputs.values.tobytes() for part in self._parts),
-            b"".join(part.outputs.values.tobytes() for part in self._parts),
+            b"".join(part.outputs.values.tobytes() for part in self._parts) + statistics,
         )
 
     def _own(self, memory: _Memory) -> SavedState:
@@ -742,6 +790,8 @@ class SystemInstance(Instance):
         for part in self._parts:
             first = part.layout.first_output
             part.outputs.values[:] = outputs[first : first + len(part.layout.outputs)]
+        if self._control is not None:
+            self._control.statistics[:] = outputs[self._layout.first_statistic :]
         self._fresh = memory.fresh
 
     def _put_inputs(self, data: bytes) -> None:

@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import ModelDescription, Variable
-from fmugym.archive.texts import with_texts
+from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi.methods import METHODS
 from fmugym.fmi.solver import Solving
 
@@ -197,7 +197,10 @@ class PoolSpec:
     @property
     def start_outputs(self) -> tuple[float, ...]:
         """The start values of the outputs in the model description; 0 where it has none."""
-        return tuple(variable.start_number for variable in self.outputs)
+        return tuple(
+            number_of(variable.start or "") if variable.kind == "string" else variable.start_number
+            for variable in self.outputs
+        )
 
     def fitting(self, description: ModelDescription) -> PoolSpec:
         """The spec for this FMU: one that has no function for resets is instantiated anew.

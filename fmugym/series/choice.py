@@ -139,16 +139,17 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 def _of_config(env: FMUEnv) -> Quantities:
     find, interface = env.fmu.variable, env._interface
-    inputs, outputs = interface.input_names, tuple(env.out)
-    episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
     strings = env.fmu.description.strings
+    inputs, outputs = interface.input_names, tuple(n for n in env.out if n not in strings)
+    places = [place for place, name in enumerate(env.out) if name not in strings]
+    episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
     parameters = tuple(name for name in interface.parameters if name not in strings)
 
     def read(env: Any) -> Sequence[Any]:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *(env._values[index] for index in range(len(outputs))),
+            *(env._values[index] for index in places),
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )

@@ -16,7 +16,7 @@ from fmugym.single.purity import unchanged_globals
 from fmugym.single.watch import Watched, noting_reads, watched_in
 from fmugym.task.readings import Readings, reading
 from fmugym.task.results import FLOAT32_LIMIT
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
@@ -31,6 +31,7 @@ from fmugym.vector.hooks.trace import (
     SymbolicParameters,
     in_hook,
     require_unchanged,
+    symbolic_outputs,
     tables_of,
     to_integer,
 )
@@ -336,7 +337,7 @@ class _Tracer:
         state = values[: env._output_count]
         return Readings(
             values=values,
-            out=NamedValues("output", list(env.out), lambda: values),
+            out=symbolic_outputs(env, values),
             state=state,
             previous_state=numbers(env._output_count, "kept") if judging else state,
             inputs=numbers(len(env._interface.inputs), "input"),

@@ -166,8 +166,20 @@ def _require_solvable(layout: Layout) -> None:
     """Refuse loops that no master could solve.
 
     Raises:
-        ConfigError: If a component of a loop cannot repeat a step, or has no Initialization Mode.
+        ConfigError: If a component cannot repeat a step although a loop or the estimate of errors
+            needs it, or a component of a loop has no Initialization Mode.
     """
+    for part in layout.parts if layout.plan.control is not None else ():
+        able = part.description.capabilities
+        for flag, what in (
+            (able.can_get_and_set_fmu_state, "save its FMU state"),
+            (able.can_handle_variable_communication_step_size, "vary its step size"),
+        ):
+            if not flag:
+                raise ConfigError(
+                    "error_tolerance needs components that can repeat steps as smaller ones, and "
+                    f"{part.label} cannot {what}"
+                )
     repeated = [group for group in layout.plan.groups if group.loop is not None]
     for group in repeated if layout.plan.master == "gauss_seidel" else ():
         numbers = layout.parts_of(group)

@@ -32,7 +32,7 @@ from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
 from fmugym.task.results import finiteness_of
 from fmugym.task.step import NUMBERS
-from fmugym.task.values import EpisodeVariables, NamedValues
+from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Constructed"]
@@ -183,7 +183,10 @@ class Constructed(Pictured):
         self._output_count = len(interface.outputs)
         self._no_monitors = not interface.monitors
         self._values = (nan,) * len(names)
+        strings = frozenset(v.name for v in interface.monitors if v.kind == "string")
         self.out = NamedValues("output", names, lambda: self._values)
+        if strings:
+            self.out = NamedTexts(names, strings, lambda: self._values)
         self.state = self._values[: self._output_count]
         self.previous_state = self.state
         self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]

@@ -17,6 +17,7 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.interface import Interface
+from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
@@ -80,7 +81,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
     config: EnvConfig
     state: Any
     previous_state: Any
-    out: Mapping[str, Any]
+    out: NamedValues
     inputs: Any
     action: Any
     previous_action: Any

@@ -30,6 +30,7 @@ __all__ = [
     "input_variable",
     "output_variable",
     "outputs_named",
+    "readable_named",
     "resolve",
     "spread",
     "start_values",
@@ -208,6 +209,12 @@ class Interface:
         """One for each output; none if a step gives the last value of all."""
         read = self.outputs + self.monitors
         given = _by_scalar(self.description, self.config.samplings, read, "output in 'samplings'")
+        for variable in read:
+            if variable.kind == "string" and given.get(variable.name, "last") != "last":
+                raise ConfigError(
+                    f"config key 'samplings': {variable.name!r} is a String, expected 'last', got "
+                    f"{given[variable.name]!r}"
+                )
         if set(given.values()) <= {"last"}:
             return ()
         return tuple(given.get(v.name, "last") for v in read)
@@ -248,9 +255,9 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     given = start_values(description, starts)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     inputs = _resolved(description, config.model_input_names, _check_input)
-    read = outputs_named(description, config.model_output_names + config.monitor_names)
-    monitors = outputs_named(description, config.monitor_names)
-    outputs = read[: len(read) - len(monitors)]
+    outputs = outputs_named(description, config.model_output_names)
+    read = readable_named(description, config.model_output_names + config.monitor_names)
+    monitors = read[len(outputs) :]
     bounded = inputs + outputs
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     _check_rest_is_known(inputs)
@@ -273,6 +280,11 @@ def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[
             its value.
     """
     return _resolved(description, names, _check_output)
+
+
+def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
+    """Do what ``outputs_named`` does, but find Strings, too, which cannot be observed."""
+    return _resolved(description, names, _check_readable)
 
 
 def _resolved(
@@ -450,6 +462,11 @@ def _check_output(description: ModelDescription, variable: Variable) -> None:
     _require_known_clock(description, variable, "an output")
 
 
+def _check_readable(description: ModelDescription, variable: Variable) -> None:
+    if variable.kind != "string" or variable.shape or variable.array is not None:
+        _check_output(description, variable)
+
+
 def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:
     if not variable.ticking:
         return
@@ -482,8 +499,9 @@ def _require_numeric(variable: Variable, role: str) -> None:
 
 
 _CURES: Final = {
-    "String": ". A scalar String can be given a text in 'model_parameters'; to read one, let the "
-    "FMU tell the same by a number or an Enumeration",
+    "String": ". A scalar String can be given a text in 'model_parameters', and hooks can read it "
+    "if it is in 'monitor_names'; to observe one, let the FMU tell the same by a number or an "
+    "Enumeration",
     "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
     "numbers",
 }

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Final
 
-from fmugym.task.values import EpisodeVariables
+from fmugym.task.values import EpisodeVariables, NamedValues
 
 if TYPE_CHECKING:
     from fmugym.task.hooks import Hooks
@@ -32,7 +32,7 @@ class Readings:
     """
 
     values: Any
-    out: Mapping[str, Any]
+    out: NamedValues
     state: Any
     previous_state: Any
     inputs: Any

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
@@ -15,7 +17,7 @@ from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.snapshot import Columns
 
-__all__ = ["columns_of", "native_value", "place_columns", "require_saving"]
+__all__ = ["columns_of", "learn", "native_value", "place_columns", "require_saving"]
 
 
 def require_saving(pool: Pool) -> None:
@@ -47,6 +49,7 @@ def columns_of(env: Constructed) -> Columns:
         "after_end": np.array([env.after_end]),
         "ended": np.array([env._ended]),
         "parameters": {name: [value] for name, value in env.parameters.items()},
+        "texts": {name: [env.out[name]] for name in env.out.strings},
         "variables": {name: [copy.deepcopy(v)] for name, v in env.variables.items()},
         "streams": streams,
         "seeds": seeds,
@@ -69,6 +72,7 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
+    learn(columns.get("texts", {}))
     values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
     env._values = values
     env.state = values[: env._output_count]
@@ -89,6 +93,12 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
     env._was_reset, env._ended = True, bool(columns["ended"][place])
+
+
+def learn(texts: Mapping[str, Any]) -> None:
+    """Let this process know the texts of Strings that another one has met."""
+    for column in texts.values():
+        numbers_of(column)
 
 
 def native_value(column: Any, place: int) -> Any:

@@ -8,10 +8,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.texts import texts_of
+from fmugym.archive.texts import text_of, texts_of
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["EpisodeVariables", "LateDict", "NamedValues", "ParameterValues", "ShownParameters"]
+__all__ = [
+    "EpisodeVariables",
+    "LateDict",
+    "NamedTexts",
+    "NamedValues",
+    "ParameterValues",
+    "ShownParameters",
+]
 
 
 def array_places(names: Iterable[str]) -> dict[str, list[int]]:
@@ -42,6 +49,9 @@ class NamedValues(Mapping[str, Any]):
     Raises:
         ConfigError: If ``[]`` gets an unknown name; the text suggests the nearest one.
     """
+
+    strings: frozenset[str] = frozenset()
+    """Those of the names whose values are texts."""
 
     def __init__(
         self, kind: str, names: Sequence[str], get_values: Callable[[], Sequence[Any]]
@@ -97,6 +107,40 @@ class NamedValues(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({dict(self)})"
+
+    def over(self, get_values: Callable[[], Sequence[Any]]) -> NamedValues:
+        """The same names, in the same order, with other values."""
+        return NamedValues(self._kind, list(self._index), get_values)
+
+
+class NamedTexts(NamedValues):
+    """Outputs of which some are Strings.
+
+    Among the values, these are the numbers of their texts. ``[]`` returns the texts: a text for a
+    number, an array of texts for an array of numbers.
+
+    Args:
+        names: The names, in the order of the values.
+        strings: Those of the Strings.
+        get_values: Returns the current values.
+    """
+
+    def __init__(
+        self, names: Sequence[str], strings: frozenset[str], get_values: Callable[[], Sequence[Any]]
+    ) -> None:
+        super().__init__("output", names, get_values)
+        self.strings = strings
+
+    def __getitem__(self, name: str) -> Any:
+        value = super().__getitem__(name)
+        return self._shown(name, value) if name in self.strings else value
+
+    def _shown(self, name: str, value: Any) -> Any:
+        return texts_of(value) if isinstance(value, np.ndarray) else text_of(value)
+
+    def over(self, get_values: Callable[[], Sequence[Any]]) -> NamedTexts:
+        """See ``NamedValues.over``."""
+        return type(self)(list(self), self.strings, get_values)
 
 
 class ParameterValues(dict[str, Any]):

@@ -12,6 +12,7 @@ from fmugym.checks import integer_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
+from fmugym.task.saving import learn
 from fmugym.task.snapshot import Columns, Snapshot
 
 __all__ = [
@@ -98,6 +99,7 @@ def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) 
         "step_count": _rows(env.step_count, which),
         "parameters": {name: _rows(row, which) for name, row in parameters.items()},
         "variables": {name: _rows(row, which) for name, row in env.variables.items()},
+        "texts": {name: _rows(env.out[name], which) for name in env.out.strings},
         "pictured": None,
         "attributes": None,
     }
@@ -111,6 +113,7 @@ def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
 
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
+    learn(columns.get("texts", {}))
     env.done = env.done.copy()  # the caller holds this array
     for name in (*_FIRST, "step_count"):
         place_column(getattr(env, name), columns[name.lstrip("_")], sources, which)

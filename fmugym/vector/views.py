@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
+from fmugym.task.values import EpisodeVariables, ParameterValues
 
 __all__ = ["batched", "column", "copied", "parts", "take"]
 
@@ -34,7 +34,7 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     variables.update({name: np.zeros((*np.shape(starts[name]), count)) for name in variables})
     return Readings(
         values=outputs,
-        out=NamedValues("output", list(env.out), lambda: outputs),
+        out=env.out.over(lambda: outputs),
         state=outputs[: env._output_count],
         previous_state=np.zeros((env._output_count, count)),
         inputs=np.zeros((len(env._start_inputs), count)) if inputs is None else inputs,
@@ -55,7 +55,7 @@ def some(batch: Readings, indices: npt.NDArray[np.intp]) -> Readings:
     variables.update({name: np.asarray(row)[..., indices] for name, row in batch.variables.items()})
     return Readings(
         values=values,
-        out=NamedValues("output", list(batch.out), lambda: values),
+        out=batch.out.over(lambda: values),
         state=values[: len(batch.state)],
         previous_state=batch.previous_state[:, indices],
         inputs=batch.inputs[:, indices],
@@ -76,7 +76,7 @@ def column(batch: Readings, index: int) -> Readings:
     variables.update(_taken(batch.variables, index))
     return Readings(
         values=values,
-        out=NamedValues("output", list(batch.out), lambda: values),
+        out=batch.out.over(lambda: values),
         state=values[: len(batch.state)],
         previous_state=tuple(batch.previous_state[:, index].tolist()),
         inputs=tuple(batch.inputs[:, index].tolist()),
@@ -111,7 +111,7 @@ def parts(batch: Readings, indices: Any) -> Readings:
     return replace(
         batch,
         values=outputs,
-        out=NamedValues("output", list(batch.out), lambda: outputs),
+        out=batch.out.over(lambda: outputs),
         parameters=MappingProxyType(ParameterValues(parameters)),
         variables=variables,
         **rows,
@@ -128,7 +128,7 @@ def copied(batch: Readings) -> Readings:
     return replace(
         batch,
         values=outputs,
-        out=NamedValues("output", list(batch.out), lambda: outputs),
+        out=batch.out.over(lambda: outputs),
         variables=variables,
         **rows,
     )

@@ -1,8 +1,11 @@
 /* The extension module fmugym._native. See fmugym/_native.pyi. */
 
+#include <string.h>
+
 #include "programs.h"
 
 #include "served.h"
+#include "texts.h"
 #include "threads.h"
 
 PyObject *closed_error;
@@ -80,6 +83,20 @@ static PyObject *claim_initialization(PyObject *module, PyObject *args) {
     return PyFloat_FromDouble(next > now ? 1e-9 * (double)(next - now) : 0.0);
 }
 
+static PyObject *py_text_with(PyObject *module, PyObject *number) {
+    const double wanted = PyFloat_AsDouble(number);
+
+    (void)module;
+    if (wanted == -1.0 && PyErr_Occurred()) {
+        return NULL;
+    }
+    const char *text = text_with(wanted);
+    if (text == NULL) {
+        return Py_NewRef(Py_None);
+    }
+    return PyUnicode_DecodeUTF8(text, (Py_ssize_t)strlen(text), "replace");
+}
+
 static PyObject *py_serve_component(PyObject *module, PyObject *unused) {
     (void)module;
     (void)unused;
@@ -102,6 +119,7 @@ static PyMethodDef functions[] = {
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
+    {"text_with", py_text_with, METH_O, NULL},
     {"serve_component", py_serve_component, METH_NOARGS, NULL},
     {"claim_initialization", claim_initialization, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},

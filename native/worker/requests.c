@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "../records.h"
+#include "../texts.h"
 #include "answers.h"
 #include "derivatives.h"
 
@@ -32,6 +33,7 @@ enum {
     REQUEST_READ,
     REQUEST_REPLACE_RECORD,
     REQUEST_DIFFERENTIATE,
+    REQUEST_TEXT_OF,
     REQUEST_CLOSE,
     REQUESTS
 };
@@ -261,6 +263,14 @@ static void answer_failure(Worker *w, Reader *reader) {
     send_result(&writer);
 }
 
+static void answer_text_of(Worker *w, Reader *reader) {
+    Writer writer = {.bytes = NULL};
+
+    (void)w;
+    write_text(&writer, text_with(read_number(reader)));
+    send_result(&writer);
+}
+
 static void answer_close(Worker *w, Reader *reader) {
     (void)reader;
     pool_enter(&w->pool);
@@ -285,6 +295,7 @@ bool worker_answer(Worker *w, Reader *reader) {
         [REQUEST_READ] = answer_read,
         [REQUEST_REPLACE_RECORD] = answer_replace_record,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
+        [REQUEST_TEXT_OF] = answer_text_of,
         [REQUEST_CLOSE] = answer_close,
     };
     const uint8_t request = read_flag(reader);

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.texts import number_of
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
@@ -104,6 +105,7 @@ class Rig:
         self._hold: Callable[[], None] | None = getattr(backend, "hold", None)
         self._input_names = [variable.name for variable in spec.inputs]
         self._output_names = [variable.name for variable in spec.outputs]
+        self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         self._is_running = False
 
     @property
@@ -178,6 +180,8 @@ class Rig:
             if missing:
                 raise SimulationError(f"the outputs lack {', '.join(map(repr, missing))}")
             outputs = [outputs[name] for name in names]
+        if self._gives_texts:
+            outputs = [number_of(one) if isinstance(one, str) else one for one in outputs]
         values: list[float] = np.ravel(np.asarray(outputs, np.float64)).tolist()
         if len(values) != len(names):
             raise SimulationError(

@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.texts import ask_for_texts
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status
@@ -35,6 +36,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
+from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
@@ -102,12 +104,15 @@ class ProcessPool(SavingPool):
             fmu.close()
             raise
         self._prepare_saving(fmu.description, spec)
+        self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
+        ask_for_texts(self._find_text, self)
         arrays = make_arrays(memory, spec, num_instances)
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
         setup = replace(setup, native=native, threads=threads, own_files=own_files)
+        self._setup, self._arrays = setup, arrays
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
@@ -236,6 +241,32 @@ class ProcessPool(SavingPool):
             self._drop_recording()
         else:
             self._note_step(skip, seconds)
+
+    # Compiled hooks
+
+    @property
+    def can_play(self) -> bool:
+        """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
+        return has_native_pool() and self._setup.native and not self._spec.licence_wait
+
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
+        """See ``Pool.prepare_play``."""
+        if not self.can_play:
+            raise SimulationError("compiled hooks need the native pool")
+        from fmugym.pool.process.play import PlayAround
+
+        return PlayAround(self._setup, self._arrays, self._advance).prepare(*parts, **named)
+
+    def _advance(
+        self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray
+    ) -> None:
+        """Reset the instances that start an episode, and step the others."""
+        with self._lock:
+            skip = None
+            if np.count_nonzero(starting):
+                skip = starting
+                self.reset(variables, values, starting)
+            self._step(skip)
 
     @property
     def _one_by_one(self) -> int:
@@ -388,8 +419,18 @@ class ProcessPool(SavingPool):
             growth[supervisor.block] = supervisor.growth
         return growth
 
+    def _find_text(self, number: float) -> str | None:
+        """Ask the workers for a text that an FMU of theirs has given."""
+        with self._lock:
+            if self._crew.refusal or not self._gives_texts:
+                return None
+            crew = self._crew
+            answers = crew.run("a question", crew.able, lambda s: s.tell("text_of", number))
+            return next(filter(None, answers.values()), None)
+
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
+        self._gives_texts |= any(variable.kind == "string" for variable in variables)
         return np.concatenate(self._asked("reading variables", "read", variables), axis=1)
 
     def differentiate(

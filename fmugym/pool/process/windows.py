@@ -55,6 +55,7 @@ REQUESTS: Final = (
     "read",
     "replace_record",
     "differentiate",
+    "text_of",
     "close",
 )
 """In the order of ``native/worker/requests.c``. They are the methods of ``BlockWorker``."""
@@ -220,7 +221,8 @@ class ProgramCoding:
 
     def _ask_open(self, writer: _Writer, setup: Setup) -> None:
         self._setup = setup
-        description, spec = setup.description, setup.spec
+        description = setup.description
+        spec = setup.spec.fitting(description)
         place = PlaceOfFMU.in_wine(
             setup.folder, setup.folder / setup.library, description.fmi_major_version
         )
@@ -340,6 +342,12 @@ class ProgramCoding:
         block = self._setup.block
         shape = len(variables), block.stop - block.start
         return np.frombuffer(reader.rest(), np.float64).reshape(shape)
+
+    def _ask_text_of(self, writer: _Writer, number: float) -> None:
+        writer.numbers(number)
+
+    def _answer_text_of(self, reader: _Reader, _: float) -> str:
+        return reader.text()
 
     @property
     def _is_adjoint(self) -> bool:

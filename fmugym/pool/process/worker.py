@@ -25,6 +25,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import FMU, ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
+from fmugym.archive.texts import text_of
 from fmugym.errors import FMUGymError, FMULoadError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
@@ -328,6 +329,10 @@ class BlockWorker:
         """See ``Pool.differentiate``."""
         np.copyto(self._pool.inputs, self._block.inputs)
         return self._pool.differentiate(unknowns, knowns)
+
+    def text_of(self, number: float) -> str:
+        """See ``fmugym.archive.texts.text_of``."""
+        return text_of(number)
 
     def close(self) -> None:
         """Free the instances and leave ``serve``."""

@@ -193,9 +193,11 @@ def _master(own: Mapping[str, str]) -> dict[str, Any]:
     return {name: _own_value(own, name, kind) for name, kind in _OWN.items() if name in own}
 
 
+_NUMBERS: Final = ("step_size", "tolerance", "loop_tolerance", "error_tolerance", "min_step_size")
+
 _OWN: Final[dict[str, type]] = {
     **dict.fromkeys(("master", "loops"), str),
-    **dict.fromkeys(("step_size", "tolerance", "loop_tolerance"), float),
+    **dict.fromkeys(_NUMBERS, float),
     "loop_iterations": int,
 }
 

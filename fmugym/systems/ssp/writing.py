@@ -253,6 +253,8 @@ def _own_of_system(system: WiredSystem) -> dict[str, str]:
         "step_size": system.times["step_size"],
         "tolerance": system.times["tolerance"],
         "loop_tolerance": system.loop.tolerance,
+        "error_tolerance": None if system.control is None else system.control.tolerance,
+        "min_step_size": None if system.control is None else system.control.min_step_size,
     }
     own = {"master": system.master, "loops": system.loops}
     own |= {

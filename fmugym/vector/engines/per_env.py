@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import repeat
 from types import MappingProxyType
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,6 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
-from fmugym.task.values import NamedValues
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
@@ -278,6 +277,6 @@ def _share_constants(first: FMUEnv, env: FMUEnv) -> None:
     The objects of a thousand environments do not fit into the processor's caches.
     """
     env._is_finite, env._input_writer = first._is_finite, first._input_writer
-    cast(NamedValues, env.out).share_names(cast(NamedValues, first.out))
+    env.out.share_names(first.out)
     if env._own == first._own:
         env._own, env._observe, env._elements = first._own, first._observe, first._elements

@@ -21,7 +21,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
+from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues, ParameterValues
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Graph
@@ -464,7 +464,7 @@ def symbolic_readings(
     missing = np.array("it reads self.done before there is one", object)
     return Readings(
         values=values,
-        out=NamedValues("output", list(env.out), lambda: values),
+        out=symbolic_outputs(env, values),
         state=state,
         previous_state=rows((len(env.out),), "kept")[: env._output_count] if judging else state,
         inputs=rows((len(env._interface.inputs),), "input"),
@@ -481,6 +481,19 @@ def symbolic_readings(
         ),
         variables=names,
     )
+
+
+def symbolic_outputs(env: FMUEnv, values: Any) -> NamedValues:
+    """Symbols by the names of outputs; Strings have none."""
+    strings = env.fmu.description.strings.intersection(env.out)
+    return _SymbolicOutputs(list(env.out), strings, lambda: values)
+
+
+class _SymbolicOutputs(NamedTexts):
+    """The symbols of outputs; hooks that read a String cannot be traced."""
+
+    def _shown(self, name: str, value: Any) -> Any:
+        raise UntraceableError(f"it reads the String {name!r}")
 
 
 class SymbolicParameters(ParameterValues):

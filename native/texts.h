@@ -1,0 +1,14 @@
+/* The texts of Strings that FMUs have given. Values are doubles on their way, so a number stands for
+ * each text: the same as in fmugym/archive/texts.py. */
+
+#ifndef FMUGYM_TEXTS_H
+#define FMUGYM_TEXTS_H
+
+/* Keeps a text of this process for good, and returns its number; -1 if there is no memory, if there
+ * are too many texts, or if another text has this number. NULL counts as empty. */
+double text_number(const char *text);
+
+/* The text with this number, or NULL if text_number has not returned it. */
+const char *text_with(double number);
+
+#endif
