@@ -36,8 +36,9 @@ from fmugym.vector.arguments import (
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.compiled import CompiledEngine, find_programs
+from fmugym.vector.engines.compiled import CompiledEngine
 from fmugym.vector.engines.per_env import PerEnvEngine
+from fmugym.vector.engines.programs import find_programs
 from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
