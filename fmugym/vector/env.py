@@ -242,8 +242,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 environments that this step resets, unless the class has its own ``step``.
 
         Returns:
-            Observations, rewards (float64), terminated, truncated, infos; all are new arrays. A
-            reward that is not finite is a fault, as an FMU that fails.
+            Observations, rewards (float64), terminated, truncated, infos. The arrays belong to the
+            caller; the memory of arrays that nobody holds any more may be used again. A reward that
+            is not finite is a fault, as an FMU that fails.
 
         Raises:
             ConfigError: If the actions do not fit, or a hook returns what cannot be used.
