@@ -121,7 +121,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         fixed_internal_step_size=None,
         capabilities=_capabilities(plan, parts),
         variables=variables,
-        state_derivatives={},
+        derivatives={},
         findings=plan.findings,
         error_categories=tuple(sorted({c for part in parts for c in part.error_categories})),
         units=_units(parts),
