@@ -185,6 +185,8 @@ class Library(TypedDict):
     mark: Mark | None
     solving: tuple[Any, ...] | None
     system: tuple[Any, ...] | None
+    structural_references: bytes
+    structural_values: bytes
 
 class Experiment(TypedDict):
     """The times of an episode."""
@@ -324,6 +326,24 @@ class Pool:
             TypeError: If the actions have another type or shape than was prepared.
             ValueError: If one of them is out of range or NaN.
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
+        """
+
+    def play_before(
+        self, actions: Array, drawn: Array, last_observations: None, started: None, /
+    ) -> None:
+        """Do what comes before the FMUs' part of ``play``, where they run in other processes.
+
+        Such a pool was made without paths of libraries. It draws the start values of the instances
+        to be reset. The arguments and errors are those of ``play``.
+        """
+
+    def play_after(
+        self, actions: Array, drawn: Array, last_observations: None, started: None, /
+    ) -> tuple[Any, int, int, int]:
+        """Do what comes after the FMUs' part of ``play``.
+
+        The outputs and statuses are those that the pool's arrays have. The arguments, results and
+        errors are those of ``play``.
         """
 
     def prepare_single(

@@ -51,13 +51,30 @@ size_t pool_step_or_reset(Pool *pool, const Call *call) {
     return run_with_starts(&task, pool->settings.count);
 }
 
+static void tell_ends(Task *task, Ends *ends) {
+    ends->ended = (size_t)atomic_get(&task->ended);
+    ends->started = (size_t)atomic_get(&task->started);
+    ends->outside = atomic_get(&task->outside) != 0;
+}
+
 size_t pool_play(Pool *pool, const Call *call, Ends *ends) {
     Task task = {.pool = pool, .call = call, .operation = PLAY};
     const size_t troubled = run_with_starts(&task, pool->settings.count);
 
-    ends->ended = (size_t)atomic_get(&task.ended);
-    ends->started = (size_t)atomic_get(&task.started);
-    ends->outside = atomic_get(&task.outside) != 0;
+    tell_ends(&task, ends);
+    return troubled;
+}
+
+size_t pool_play_before(Pool *pool, const Call *call) {
+    Task task = {.pool = pool, .call = call, .operation = BEFORE};
+    return schedule_run(&task, pool->settings.count);
+}
+
+size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
+    Task task = {.pool = pool, .call = call, .operation = AFTER};
+    const size_t troubled = schedule_run(&task, pool->settings.count);
+
+    tell_ends(&task, ends);
     return troubled;
 }
 

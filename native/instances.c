@@ -28,6 +28,9 @@ static bool build(Pool *pool, Instance *me, bool logging) {
                                log_environment(&pool->log, index), logging,
                                &s->solving, &pool->floats};
 
+    if (s->elsewhere) {
+        return false;
+    }
     pace_wait(&pool->settings.pace);
     mutex_lock(pool->making);
     begin_call(CALL_INSTANTIATE);

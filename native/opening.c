@@ -131,7 +131,8 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     for (size_t i = 0; i < settings->count; i++) {
         prepare_instance(pool, i);
     }
-    return load_libraries(pool, error, size) && build_all(pool, error, size);
+    return settings->elsewhere ||
+           (load_libraries(pool, error, size) && build_all(pool, error, size));
 }
 
 bool pool_open(Pool *pool, const Settings *settings, char *error, size_t size) {

@@ -33,6 +33,8 @@ typedef struct {
     const char *resources;
     const char *const *paths; /* path of the library, or of one private copy per instance; of a
                                * system, those of all parts each time */
+    bool elsewhere;           /* whether other processes make and step the instances; this one has
+                               * no library, and runs the programs around their steps only */
     bool private_libraries;   /* whether each instance has its own library */
     bool logging;             /* whether FMUs are asked to log everything */
     const char *const *categories; /* the log categories of errors and warnings */
@@ -165,7 +167,7 @@ typedef struct {
     uint32_t calls;
 } Cost;
 
-enum { STEP, RESET, MIXED, PLAY, RESTORE, ROLLOUT, OPERATIONS };
+enum { STEP, RESET, MIXED, PLAY, RESTORE, ROLLOUT, BEFORE, AFTER, OPERATIONS };
 
 typedef struct Pool {
     struct Pool *next; /* next in the list of all pools */
@@ -289,6 +291,12 @@ size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
  * turn before and after. Writes all observations. */
 size_t pool_play(Pool *pool, const Call *call, Ends *ends);
+/* The two parts of a play around steps that are done elsewhere. The first runs the programs that
+ * come before, and draws the start values of the instances in the mask, which are to be reset. The
+ * second takes the outputs and statuses for those of the step. The turn has no arrays for episodes
+ * that start in it, and reads_kept is set: the step overwrites the outputs. */
+size_t pool_play_before(Pool *pool, const Call *call);
+size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
 /* Starts the episodes of the turn in the mask, or all if there is no mask. Writes all observations,
  * and sets outside if a hook looked up an index outside of a table. */
 size_t pool_start(Pool *pool, const Call *call, bool *outside);

@@ -376,6 +376,30 @@ static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, b
     return troubled;
 }
 
+/* Takes over what other processes have left, as advance leaves it. Their outputs are finite. */
+static size_t take_over(const Task *task, size_t begin, size_t count, Scratch scratch,
+                        bool *fits_floats) {
+    const Settings *s = &task->pool->settings;
+    const size_t width = s->outputs->count;
+    size_t troubled = 0;
+
+    for (size_t i = 0; i < width; i++) {
+        const double *row = s->output_values + i * s->count + begin;
+        for (size_t j = 0; j < count; j++) {
+            scratch.outputs[j * width + i] = row[j];
+        }
+    }
+    for (size_t j = 0; j < count; j++) {
+        troubled += s->status[begin + j] > STATUS_WARNING;
+    }
+    *fits_floats = all_within(scratch.outputs, count * width, FLOAT32_LIMIT);
+    if (task->call->observations != NULL) {
+        troubled += !*fits_floats;
+        write_observations(task, begin, count, scratch.outputs);
+    }
+    return troubled;
+}
+
 static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) {
     bool fits_floats;
     const size_t troubled = advance(task, begin, count, scratch, &fits_floats);
@@ -410,8 +434,13 @@ size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
     const Turn *turn = task->call->turn;
     Fresh fresh = {scratch.columns, scratch.outputs, pool->settings.outputs->count, true};
 
-    play_prepare(turn, run.begin, run.count, run.registers);
-    const size_t troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
+    size_t troubled;
+    if (task->operation == AFTER) {
+        troubled = take_over(task, run.begin, run.count, scratch, &fresh.fits_floats);
+    } else {
+        play_prepare(turn, run.begin, run.count, run.registers);
+        troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
+    }
     make_columns(pool, run.count, scratch);
     play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
     if (!turn->play->reads_kept) {
@@ -449,4 +478,20 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
         atomic_add(&task->outside, 1);
     }
     return troubled + verdict.troubled;
+}
+
+size_t run_before(Task *task, size_t begin, size_t end) {
+    const Turn *turn = task->call->turn;
+    PlayScratch registers;
+
+    play_open(turn, &registers);
+    for (size_t first = begin; first < end; first += RUN) {
+        play_prepare(turn, first, length_of_run(first, end), &registers);
+    }
+    for (size_t index = begin; index < end; index++) {
+        if (is_in(task->call->mask, index)) {
+            play_draw(turn, index);
+        }
+    }
+    return 0;
 }

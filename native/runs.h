@@ -21,7 +21,10 @@ size_t run_turn(Task *task, PlayedRun run, Scratch scratch);
 size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch);
 /* This one steps or resets: */
 size_t run_steps(Task *task, size_t begin, size_t end, Scratch scratch);
-/* This one does the same and runs the programs before and after: */
+/* This one does the same and runs the programs before and after, or only the latter if the step was
+ * done elsewhere: */
 size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
+/* Runs what comes before a step that is done elsewhere. Returns 0. */
+size_t run_before(Task *task, size_t begin, size_t end);
 
 #endif

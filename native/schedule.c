@@ -22,7 +22,7 @@ enum {
 size_t task_give_up(Task *task, size_t begin, size_t end) {
     const Call *call = task->call;
 
-    if (task->operation == ROLLOUT) { /* the caller goes another way */
+    if (task->operation == ROLLOUT || task->operation == BEFORE) { /* the caller knows what to do */
         return end - begin;
     }
     for (size_t i = begin; i < end; i++) {
@@ -32,7 +32,7 @@ size_t task_give_up(Task *task, size_t begin, size_t end) {
         if (call->observations != NULL) {
             write_observation(task->pool, index, call->observations);
         }
-        if (task->operation == PLAY) {
+        if (task->operation == PLAY || task->operation == AFTER) {
             play_skip(call->turn, index);
         }
     }
@@ -54,8 +54,12 @@ static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
     if (task->operation == ROLLOUT) {
         return run_rollout(task, begin, end, scratch);
     }
-    return task->operation == PLAY ? run_play(task, begin, end, scratch)
-                                   : run_steps(task, begin, end, scratch);
+    if (task->operation == BEFORE) {
+        return run_before(task, begin, end);
+    }
+    return task->operation == PLAY || task->operation == AFTER
+               ? run_play(task, begin, end, scratch)
+               : run_steps(task, begin, end, scratch);
 }
 
 static size_t length_of_longest_run(const Task *task, size_t begin, size_t end) {

@@ -1,5 +1,6 @@
 """Event mode in co-simulation, clocks, early return: FMI 3.0."""
 
+import contextlib
 import logging
 from contextlib import closing
 
@@ -8,6 +9,7 @@ import exchange_tools
 import fmu_tools
 import numpy as np
 import pytest
+import wine_tools
 
 import fmugym
 from fmugym import FMU, ConfigError
@@ -25,7 +27,7 @@ OPTIONS = {
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
-all_kinds = pytest.mark.parametrize("kind", list(OPTIONS))
+all_kinds = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
 both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
@@ -33,30 +35,36 @@ both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelEx
 def fmu_path(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("clocks"), {}
 
-    def make(interface="CoSimulation", event_mode=True):
-        key = interface, event_mode
+    def make(interface="CoSimulation", event_mode=True, building=contextlib.nullcontext):
+        key = interface, event_mode, building
         if key not in made:
-            made[key] = clocks_tools.clocks_fmu(folder / f"clocks{len(made)}.fmu", *key)
+            path = folder / f"clocks{len(made)}.fmu"
+            with building():
+                made[key] = clocks_tools.clocks_fmu(path, interface, event_mode)
         return made[key]
 
     return make
 
 
 @pytest.fixture
-def make_pool(fmu_path):
+def make_pool(request, fmu_path):
     made = []
 
     def make(kind, interface="CoSimulation", n=1, inputs=(), outputs=COUNTS, step=0.1, **spec):
         if kind == "native" and not pools.has_native_pool():
             pytest.skip("the C extension was not built")
-        fmu = FMU(fmu_path(interface), probe_timeout=None)
+        building = contextlib.nullcontext
+        if kind == "wine":
+            request.getfixturevalue("wine")
+            building = wine_tools.building_for_windows
+        fmu = FMU(fmu_path(interface, building=building), probe_timeout=None)
         spec = PoolSpec(
             inputs=tuple(map(fmu.variable, inputs)),
             outputs=tuple(map(fmu.variable, outputs)),
             time_step=step,
             **spec,
         )
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS[kind])
+        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
         pool.variable = fmu.variable
         made.append(pool)
         return pool
@@ -167,7 +175,7 @@ class TestEarlyReturn:
             )
             fmu = FMU(path, probe_timeout=None)
             spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=size)
-            with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS[kind])) as pool:
+            with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS.get(kind, {}))) as pool:
                 pool.variable = fmu.variable
                 start(pool)
                 ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
@@ -182,7 +190,7 @@ class TestEarlyReturn:
         given = {"constant": ' intervalDecimal="0.1"', "fixed": ' intervalCounter="1"'}[name]
         fmu = FMU(fmu_tools.edited_fmu(fmu_path(), tmp_path, {given: ""}), probe_timeout=None)
         spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1)
-        with closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS[kind])) as pool:
+        with closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS.get(kind, {}))) as pool:
             pool.reset((), np.zeros((0, 1)))
             reference = list(clocks_tools.CLOCKS).index(name)
             assert f"value reference {reference} has an interval of nan" in pool.failure(0)

@@ -1,11 +1,13 @@
 """Inputs that change linearly within a step: FMI 1.0 and 2.0."""
 
+import contextlib
 import logging
 from contextlib import closing
 
 import exchange_tools
 import numpy as np
 import pytest
+import wine_tools
 
 import fmugym
 from fmugym import FMU, ConfigError
@@ -24,7 +26,7 @@ ABLE = 'canInterpolateInputs="true"'
 EULER = 1e-3  # the step of the FMUs
 H = 0.1
 both_versions = pytest.mark.parametrize("version", [1, 2])
-all_kinds = pytest.mark.parametrize("kind", list(OPTIONS))
+all_kinds = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
 
 
 class Env(fmugym.FMUEnv):
@@ -51,16 +53,22 @@ def fmu_path(tmp_path):
 
 
 @pytest.fixture
-def make_pool(fmu_path):
+def make_pool(request, fmu_path):
     made = []
 
     def make(kind, version, n=2, **spec):
         if kind == "native" and not pools.has_native_pool():
             pytest.skip("the C extension was not built")
-        fmu = FMU(fmu_path(version), probe_timeout=None)
+        building = contextlib.nullcontext
+        if kind == "wine":
+            request.getfixturevalue("wine")
+            building = wine_tools.building_for_windows
+        with building():
+            path = fmu_path(version)
+        fmu = FMU(path, probe_timeout=None)
         u = fmu.variable("u")
         spec = PoolSpec((u,), (fmu.variable("x"),), H, ramped=(u,), **spec)
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS[kind])
+        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
         pool.k = fmu.variable("k")
         made.append(pool)
         return pool

@@ -9,6 +9,7 @@ import fmpy
 import fmu_tools
 import numpy as np
 import pytest
+import wine_tools
 from scipy.integrate import solve_ivp
 
 import fmugym
@@ -39,25 +40,28 @@ def fmu_path(tmp_path_factory):
     """Write FMUs of the models, each once."""
     folder, made = tmp_path_factory.mktemp("exchange"), {}
 
-    def make(model, version=2, interfaces=("ModelExchange",), flags=""):
-        key = model, version, interfaces, flags
+    def make(model, version=2, interfaces=("ModelExchange",), flags="", tools=exchange_tools):
+        key = model, version, interfaces, flags, tools
         if key not in made:
             path = folder / f"{model}_{len(made)}.fmu"
-            made[key] = exchange_tools.exchange_fmu(path, model, version, interfaces, flags)
+            made[key] = tools.exchange_fmu(path, model, version, interfaces, flags)
         return made[key]
 
     return make
 
 
 @pytest.fixture
-def make_pool(fmu_path):
+def make_pool(request, fmu_path):
     """Make pools that are closed after the test."""
     made = []
 
     def make(model, step, kind="native", n=1, inputs=(), outputs=None, version=2, flags="", **spec):
         if kind == "native" and not pools.has_native_pool():
             pytest.skip("the C extension was not built")
-        fmu = FMU(fmu_path(model, version, flags=flags), probe_timeout=None)
+        if kind == "wine":
+            request.getfixturevalue("wine")
+        tools = wine_tools if kind == "wine" else exchange_tools
+        fmu = FMU(fmu_path(model, version, flags=flags, tools=tools), probe_timeout=None)
         outputs = exchange_tools.STATES[model] if outputs is None else outputs
         spec = PoolSpec(
             inputs=tuple(map(fmu.variable, inputs)),
@@ -65,7 +69,7 @@ def make_pool(fmu_path):
             time_step=step,
             **spec,
         )
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS[kind])
+        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
         pool.variable = fmu.variable
         made.append(pool)
         return pool
@@ -156,7 +160,7 @@ class TestSolvers:
             assert outputs[0, 0] == pytest.approx(x, abs=2e-4 if solver == "euler" else 1e-6)
 
     @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
-    @pytest.mark.parametrize("kind", ["native", "python"])
+    @pytest.mark.parametrize("kind", ["native", "python", "wine"])
     def test_adaptive_steps_get_shorter_where_the_fmu_discards(self, make_pool, solver, kind):
         outputs = ["x", "discards"]
         pool = make_pool("tank", 0.19, kind, outputs=outputs, solver=solver, tolerance=0.01)
@@ -201,7 +205,7 @@ class TestEvents:
 
     @all_solvers
     @all_versions
-    @pytest.mark.parametrize("kind", ["native", "python"])
+    @pytest.mark.parametrize("kind", ["native", "python", "wine"])
     def test_bounces_are_where_the_closed_form_has_them(self, make_pool, solver, version, kind):
         spec = {"solver": solver, "max_step": 1e-3}
         pool = make_pool("ball", 0.05, kind, outputs=["h"], version=version, **spec)
@@ -229,7 +233,7 @@ class TestEvents:
 
     @all_solvers
     @all_versions
-    @pytest.mark.parametrize("kind", ["native", "python"])
+    @pytest.mark.parametrize("kind", ["native", "python", "wine"])
     def test_time_events_and_the_wish_to_stop(self, make_pool, solver, version, kind):
         pool = make_pool("stair", 0.3, kind, outputs=["count"], solver=solver, version=version)
         start(pool)
@@ -252,7 +256,7 @@ class TestEvents:
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
     @with_states
-    @pytest.mark.parametrize("kind", ["native", "python"])
+    @pytest.mark.parametrize("kind", ["native", "python", "wine"])
     def test_the_wish_to_stop_after_a_step(self, make_pool, version, kind):
         pool = make_pool("relay", 0.5, kind, outputs=["x", "turns"], max_step=0.1, version=version)
         start(pool, {"last": 2})
@@ -407,7 +411,7 @@ def test_linear_models(fmu_path, version):
 class TestPools:
     """The contract of ``fmugym.pool.base`` for pools of model exchange."""
 
-    every_kind = pytest.mark.parametrize("kind", OPTIONS)
+    every_kind = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
     CASES = (
         ("ball", [], ["h", "v", "bounces"], "h", "dormand_prince"),
         ("circuit", ["duty"], ["voltage", "discharges"], "limit", "rk4"),
@@ -439,7 +443,7 @@ class TestPools:
 
     @every_case
     @all_versions
-    @pytest.mark.parametrize("kind", ["python", "process"])
+    @pytest.mark.parametrize("kind", ["python", "process", "wine"])
     def test_all_pools_give_the_same_bits(self, make_pool, case, version, kind):
         native = self.episode(self.pool_of(make_pool, case, "native", 3), 60)
         other = self.episode(self.pool_of(make_pool, case, kind, 3, version), 60)

@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fmu_tools import PlainEnv, edited_fmu, probe_config, read_fmu, write_fmu
+from gymnasium.vector import AutoresetMode
 from process_tools import FaultyEnv, faulty_fmu, start_values
+from vector_tools import run_side_by_side
 from wine_tools import exchange_fmu, for_windows
 
 import fmugym
@@ -352,6 +354,38 @@ class TestInWine:
         for _ in range(10):
             row = single.step(actions[0])[0]
         np.testing.assert_array_equal(rows[0], row)
+
+    @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
+    def test_compiled_hooks_give_the_results_of_hooks_on_arrays(self, cart_pole, opened, mode):
+        """To the last bit."""
+        compiled, array = (
+            opened(
+                fmugym.FMUVectorEnv(
+                    partial(ForcedCartPole, cart_pole),
+                    70,
+                    workers=2,
+                    hooks=hooks,
+                    autoreset_mode=mode,
+                    max_episode_steps=11,
+                )
+            )
+            for hooks in ("compiled", "array")
+        )
+        assert run_side_by_side(compiled, array, mode, 40)
+
+    def test_compiled_hooks_tell_of_a_death(self, faulty, opened):
+        envs = opened(
+            fmugym.FMUVectorEnv(
+                lambda: FaultyEnv(faulty, "crash", call_timeout=30.0), 2, hooks="compiled"
+            )
+        )
+        envs.reset(seed=0)
+        envs.step(np.ones((2, 1), np.float32))
+        *_, truncated, infos = envs.step(np.ones((2, 1), np.float32))
+        assert truncated.tolist() == [True, True]
+        assert "Windows error 0xc0000005" in infos["fault"][0]
+        observations, *_ = envs.step(np.ones((2, 1), np.float32))
+        assert observations.ravel().tolist() == [0.0, 0.0]
 
     def test_the_trial_runs_there_too(self, cart_pole, opened, monkeypatch, caplog):
         monkeypatch.setenv("FMUGYM_PROBE", "on")

@@ -1,5 +1,6 @@
 """FMUs that have only libraries for Windows."""
 
+import contextlib
 import functools
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import building
 import exchange_tools
 import fmu_tools
+import pytest
 
 from fmugym import FMU
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
@@ -49,12 +51,26 @@ def windows_library(*sources, flags=(), stubs=""):
     """The bytes of a library for Windows; the arguments are those of ``building.library``."""
     command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
     command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
+    stubs = stubs or ""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "stubs.h").write_text(stubs)
         target = Path(folder) / "made.dll"
         files = [building.HERE / source for source in sources]
         subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
         return target.read_bytes()
+
+
+@contextlib.contextmanager
+def building_for_windows():
+    """Let all tools that write FMUs give them a library for Windows only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "library", windows_library)
+        patch.setattr(
+            fmu_tools,
+            "library_name",
+            lambda version, identifier="Probe": f"binaries/{FOLDERS[version]}/{identifier}.dll",
+        )
+        yield
 
 
 def exchange_fmu(path, model, version, interfaces=("ModelExchange",), flags=""):

@@ -259,6 +259,15 @@ class Pool(ABC):
         """Whether the pool can run compiled hooks within a step (``NativePool.prepare_play``)."""
         return False
 
+    @property
+    def plays_alone(self) -> bool:
+        """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
+
+        Then it also offers ``roll_out``, ``prepare_single`` and ``start_of_play``, and starts
+        episodes within the steps in which others end.
+        """
+        return False
+
     def prepare_play(
         self,
         variables: tuple[Variable, ...],
@@ -280,7 +289,7 @@ class Pool(ABC):
         """Do many steps of the prepared play in one call; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
+            SimulationError: If the pool does not support it; see ``plays_alone``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
@@ -288,7 +297,7 @@ class Pool(ABC):
         """Make the functions that do whole steps of a single environment; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
+            SimulationError: If the pool does not support it; see ``plays_alone``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
@@ -308,7 +317,7 @@ class Pool(ABC):
         """The function that starts episodes outside of a step; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
+            SimulationError: If the pool does not support it; see ``plays_alone``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
 

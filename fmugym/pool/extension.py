@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections.abc import Callable
+from types import CodeType
+from typing import Final, ParamSpec, TypeVar
 
-__all__ = ["HOW_TO_BUILD", "has_native_pool", "require_refusal", "warn_of_slow_path"]
+__all__ = [
+    "HOW_TO_BUILD",
+    "has_native_pool",
+    "passes_refusals",
+    "require_refusal",
+    "warn_of_slow_path",
+]
 
 logger = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 HOW_TO_BUILD = (
     "the C extension of fmugym was not built. Install a C compiler (on Debian: apt install gcc; "
@@ -32,16 +44,31 @@ def warn_of_slow_path() -> None:
     logger.warning("FMUs are stepped by Python, which is slow: %s", HOW_TO_BUILD)
 
 
+_passed: Final[set[CodeType]] = set()
+"""The code of the functions from ``passes_refusals``."""
+
+
+def passes_refusals(function: Callable[P, R]) -> Callable[P, R]:
+    """Mark a function that may be called again if the C code, which it calls, refuses arguments.
+
+    It must change nothing before that. ``require_refusal`` then lets it pass.
+    """
+    _passed.add(function.__code__)
+    return function
+
+
 def require_refusal(error: Exception) -> None:
     """Raise an error again unless the C code has refused the arguments of a call.
 
     A refused call may be repeated with other arguments. Errors of the receiver of messages and of
     signal handlers come after the work was done. They have passed Python functions; those of the C
-    code have not.
+    code have not, or only those from ``passes_refusals``.
 
     Args:
         error: What a call of the C code has raised, in the function that made the call.
     """
     trace = error.__traceback__
-    if trace is not None and trace.tb_next is not None:
-        raise error
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+        if trace.tb_frame.f_code not in _passed:
+            raise error

@@ -24,6 +24,7 @@ from typing import Final, ParamSpec, TypeVar
 
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.pool.base import PoolSpec
+from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.memory import grown_bytes, heap_bytes, heap_is_known, memory_is_known
 
@@ -96,6 +97,7 @@ class _Measurement:
         self._calls_left, self._enough = calls, count
         self._deadline = resets.read() + most_resets
 
+    @passes_refusals
     def around(self, call: Callable[[], R]) -> R:
         """Measure a call, and keep it if it has counted anything."""
         before, counted = heap_bytes(), self._counted.read()
@@ -172,6 +174,7 @@ class LeakWatch:
         """Watch the calls of a function that resets instances."""
 
         @functools.wraps(function)
+        @passes_refusals
         def watched(*args: P.args, **kwargs: P.kwargs) -> R:
             left = self._calls_left = self._calls_left - 1
             if left > 0:
@@ -187,6 +190,7 @@ class LeakWatch:
             return function(*args, **kwargs)
         return self._look_around(function, *args, **kwargs)
 
+    @passes_refusals
     def _look_around(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function, and look at the memory."""
         measurement = self._replacing or self._plain

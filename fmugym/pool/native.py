@@ -64,7 +64,7 @@ from fmugym.pool.systems import system_settings
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
 from fmugym.systems.description import SystemDescription
 
-__all__ = ["NativePool"]
+__all__ = ["NativePool", "prepare"]
 
 _MOST_CACHED: Final = 64
 
@@ -215,6 +215,11 @@ class NativePool(SavingPool):
     def can_play(self) -> bool:
         """See ``Pool.can_play``; nobody waits for licences within a step."""
         return not self._spec.licence_wait
+
+    @property
+    def plays_alone(self) -> bool:
+        """See ``Pool.plays_alone``."""
+        return self.can_play
 
     # The contract of Pool.
 
@@ -537,18 +542,8 @@ class NativePool(SavingPool):
             how many episodes have ended, and how many of these were followed. The arrays of the
             result are new, or those of an earlier step that nobody holds any more.
         """
-        count, ended, limit = episodes
-        self._pool.prepare_play(
-            start=self._access(variables),
-            start_values=start_values,
-            inputs=programs[0],
-            judgement=programs[1],
-            actions=dict(actions),
-            draws=draws[0],
-            states=draws[1],
-            episodes={"step_counts": count, "ended": ended, "limit": limit},
-            **surroundings,
-        )
+        start = self._access(variables)
+        prepare(self._pool, start, programs, actions, start_values, draws, episodes, surroundings)
         return self._pool.play
 
     def roll_out(self, *arrays: Any) -> int:
@@ -613,6 +608,31 @@ class NativePool(SavingPool):
     def uses_states(self) -> bool:
         """Whether resets restore saved initial states, as far as known so far."""
         return self._pool.uses_states()
+
+
+def prepare(
+    pool: _native.Pool,
+    start: _native.Access,
+    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
+    actions: Mapping[str, Any],
+    start_values: FloatArray,
+    draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
+    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
+    surroundings: Mapping[str, Any],
+) -> None:
+    """Do ``NativePool.prepare_play``, with the access to its variables."""
+    count, ended, limit = episodes
+    pool.prepare_play(
+        start=start,
+        start_values=start_values,
+        inputs=programs[0],
+        judgement=programs[1],
+        actions=dict(actions),
+        draws=draws[0],
+        states=draws[1],
+        episodes={"step_counts": count, "ended": ended, "limit": limit},
+        **surroundings,
+    )
 
 
 class _Receiver:

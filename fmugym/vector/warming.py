@@ -43,7 +43,7 @@ def compiled(env: FMUEnv, warm_up: WarmUp, pool: Any) -> CompiledWarmUp | None:
         What does the warm-up; None if the pool cannot do whole steps, or the warm-up does what no
         program can do.
     """
-    if not pool.can_play or not env._input_writer.all_real:
+    if not pool.plays_alone or not env._input_writer.all_real:
         return None
     try:
         return CompiledWarmUp(env, warm_up, pool)

@@ -628,6 +628,24 @@ static void do_play(PyPool *self, bool alone, void *context) {
     }
 }
 
+static void do_before(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->ends.outside = false;
+    t->bad_action = play_has_bad_action(&t->turn);
+    if (!t->bad_action) {
+        t->troubled = pool_play_before(&self->pool, &t->call);
+    }
+}
+
+static void do_after(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+
+    t->call.alone = alone;
+    t->troubled = pool_play_after(&self->pool, &t->call, &t->ends);
+}
+
 static bool is_outside(const PyTurn *t) {
     if (t->ends.outside) {
         PyErr_SetString(PyExc_IndexError, "a hook looks up an index outside of its table");
@@ -663,8 +681,11 @@ static PyObject *turn_result(const Playing *playing, const StepArrays *arrays, c
     return tuple;
 }
 
-static bool play_turn(PyPool *self, PyTurn *t) {
-    if (!perform(self, PLAY, do_play, t)) {
+static bool play_turn(PyPool *self, int operation, PyTurn *t) {
+    static Work *const works[OPERATIONS] = {
+        [PLAY] = do_play, [BEFORE] = do_before, [AFTER] = do_after};
+
+    if (!perform(self, operation, works[operation], t)) {
         return false;
     }
     if (t->bad_action) {
@@ -694,7 +715,22 @@ static void release_turn(const Playing *playing, PyTurn *t) {
     }
 }
 
-static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+/* What comes before the FMUs' part fills nothing that it returns. */
+static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
+    PyTurn t;
+    bool done = false;
+
+    clear_turn(playing, &t);
+    if (take_arrays(self, playing, args, &t)) {
+        settle_turn(self, playing, &t);
+        done = play_turn(self, BEFORE, &t);
+    }
+    release_turn(playing, &t);
+    return done ? Py_NewRef(Py_None) : NULL;
+}
+
+static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = PyCapsule_GetPointer(capsule, PLAYING);
     StepArrays arrays;
     PyTurn t;
@@ -704,7 +740,7 @@ static PyObject *play_with(PyPool *self, PyObject *capsule, PyObject *const *arg
     if (results_provide(playing->results, &arrays) && take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         settle_results(playing, &arrays, &t);
-        result = play_turn(self, &t) ? turn_result(playing, &arrays, &t) : NULL;
+        result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
     results_drop(playing->results, &arrays);
     release_turn(playing, &t);
@@ -727,16 +763,30 @@ static bool has_results(const PyPool *self) {
     return playing->results != NULL;
 }
 
-PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+static PyObject *play_by(PyObject *object, int operation, PyObject *const *args,
+                         Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
     if (!has_arguments(nargs, STEP_ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = play_with(self, playing, args);
+    PyObject *result = operation == BEFORE ? play_before_with(self, playing, args)
+                                           : play_with(self, operation, playing, args);
     Py_DECREF(playing);
     return result;
+}
+
+PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, PLAY, args, nargs);
+}
+
+PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, BEFORE, args, nargs);
+}
+
+PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return play_by(object, AFTER, args, nargs);
 }
 
 /* Rollouts: each array has a row for each step. */

@@ -345,6 +345,10 @@ static bool take_paths(PyPool *self, PyObject *paths, Py_ssize_t wanted) {
     if (self->paths == NULL) {
         return false;
     }
+    if (count == 0) {
+        self->pool.settings.elsewhere = true;
+        return true;
+    }
     if (count != wanted) {
         PyErr_Format(PyExc_ValueError, "%zd libraries are wanted, not %zd", wanted, count);
     }
@@ -528,6 +532,8 @@ static PyMethodDef methods[] = {
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
+    FAST("play_before", py_play_before),
+    FAST("play_after", py_play_after),
     FAST("rollout", py_rollout),
     {"exchange_play", py_exchange_play, METH_O, NULL},
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,

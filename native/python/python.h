@@ -127,6 +127,8 @@ PyObject *py_exchange_play(PyObject *object, PyObject *other);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

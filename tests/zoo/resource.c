@@ -10,9 +10,17 @@ struct Animal {
     double y;
 };
 
+/* Of a URI, what comes before the path; on Windows a path begins with its drive. */
+#if defined _WIN32
+#define BEFORE_PATH "file:///"
+#else
+#define BEFORE_PATH "file://"
+#endif
+
 /* A location is a path, or a URI of the form file:///PATH. */
 static void name_file(const char *location, char *name, size_t size) {
-    const char *path = strncmp(location, "file://", 7) == 0 ? location + 7 : location;
+    const size_t length = strlen(BEFORE_PATH);
+    const char *path = strncmp(location, BEFORE_PATH, length) == 0 ? location + length : location;
 
     snprintf(name, size, "%s/%sy.txt", path, FMI_VERSION == 1 ? "resources/" : "");
 }

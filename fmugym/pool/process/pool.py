@@ -36,6 +36,7 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
+from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
@@ -111,6 +112,7 @@ class ProcessPool(SavingPool):
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
         setup = replace(setup, native=native, threads=threads, own_files=own_files)
+        self._setup, self._arrays = setup, arrays
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
@@ -239,6 +241,32 @@ class ProcessPool(SavingPool):
             self._drop_recording()
         else:
             self._note_step(skip, seconds)
+
+    # Compiled hooks
+
+    @property
+    def can_play(self) -> bool:
+        """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
+        return has_native_pool() and self._setup.native and not self._spec.licence_wait
+
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
+        """See ``Pool.prepare_play``."""
+        if not self.can_play:
+            raise SimulationError("compiled hooks need the native pool")
+        from fmugym.pool.process.play import PlayAround
+
+        return PlayAround(self._setup, self._arrays, self._advance).prepare(*parts, **named)
+
+    def _advance(
+        self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray
+    ) -> None:
+        """Reset the instances that start an episode, and step the others."""
+        with self._lock:
+            skip = None
+            if np.count_nonzero(starting):
+                skip = starting
+                self.reset(variables, values, starting)
+            self._step(skip)
 
     @property
     def _one_by_one(self) -> int:

@@ -221,7 +221,8 @@ class ProgramCoding:
 
     def _ask_open(self, writer: _Writer, setup: Setup) -> None:
         self._setup = setup
-        description, spec = setup.description, setup.spec
+        description = setup.description
+        spec = setup.spec.fitting(description)
         place = PlaceOfFMU.in_wine(
             setup.folder, setup.folder / setup.library, description.fmi_major_version
         )

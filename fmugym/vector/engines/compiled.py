@@ -137,6 +137,7 @@ class CompiledEngine(BatchEngine):
         self._draws_ahead = draws is None
         self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
         in_pass = not self._draws_ahead and self.env._warm_ups is None
+        in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
         self._make_rows(task)
         layout = _Layout(task, self.env)
@@ -153,8 +154,10 @@ class CompiledEngine(BatchEngine):
             {**self._surroundings(task), "results": (np.empty, StepResult, layout.names, arrays)},
         )
         self._play_with_resets = self._pool.watched(self._play)
-        self._start = self._pool.start_of_play()
         self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
+        self._resets_apart = self._resets_apart or not self._pool.plays_alone
+        if not self._resets_apart:
+            self._start = self._pool.start_of_play()
         self._prepared = True
 
     def _make_rows(self, task: TracedTask) -> None:
@@ -430,7 +433,7 @@ class CompiledEngine(BatchEngine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if not self._prepared or self._left:
+        if not self._prepared or self._left or not self._pool.plays_alone:
             return None
         horizon = len(actions)
         shape = horizon, self._n

@@ -1,0 +1,227 @@
+"""Compiled hooks of environments whose FMUs run in worker processes."""
+
+import os
+import signal
+
+import exchange_tools
+import numpy as np
+import pytest
+from process_tools import FaultyEnv, faulty_fmu, start_values
+from test_vector_tasks import Delayed, Goal, Tables, Tracking
+from vector_tools import (
+    CART_POLE,
+    MODES,
+    Drawing,
+    require_equal,
+    require_same_infos,
+    run_side_by_side,
+)
+
+import fmugym
+from fmugym import ConfigError, FMUVectorEnv, SimulationError
+from fmugym.pool import has_native_pool
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.vector.engines.compiled import CompiledEngine
+
+if has_native_pool():
+    from fmugym.pool.process.play import PlayAround
+
+pytestmark = pytest.mark.skipif(
+    not has_native_pool(), reason="hooks are compiled by the C extension"
+)
+each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+
+
+@pytest.fixture(name="make")
+def fixture_make():
+    made = []
+
+    def make(cls, num_envs=5, hooks="compiled", workers=2, **options):
+        if workers:
+            options |= {"isolation": "process", "workers": workers}
+        made.append(FMUVectorEnv(cls, num_envs, hooks=hooks, **options))
+        assert isinstance(made[-1]._pool, ProcessPool) == bool(workers)
+        return made[-1]
+
+    yield make
+    for envs in made:
+        envs.close()
+
+
+class Short(Drawing):
+    """Ends often, and begins elsewhere in each episode."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=7)
+
+
+class Sampled(fmugym.FMUEnv):
+    """What else the config may ask of a step."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "x_dot", "phi", "phi_dot"],
+            "bounds": {"f": (-20, 20)},
+            "time_step": 0.02,
+            "substeps": 2,
+            "warm_up": 0.1,
+            "start_time": 3.0,
+            "samplings": {"x": "mean"},
+            "monitor_names": ["phi_ddot"],
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), config)
+
+    def _is_done(self):
+        return np.abs(self.state[2]) > 0.2
+
+
+@each_mode
+@pytest.mark.parametrize("cls", [Short, CART_POLE, Sampled, Tracking, Delayed, Goal, Tables])
+def test_results_are_those_of_one_process(make, cls, mode):
+    """To the last bit, with episodes that start in every way."""
+    isolated = make(cls, 70, autoreset_mode=mode)
+    here = make(cls, 70, workers=None, autoreset_mode=mode)
+    assert isinstance(isolated._engine, CompiledEngine)
+    assert run_side_by_side(isolated, here, mode, 40)
+    for name in ("variables", "previous_state", "action", "inputs", "step_count"):
+        np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
+
+
+class Halves(Short):
+    """One hook cannot be compiled."""
+
+    def _reward_policy(self):
+        return np.partition(np.asarray(self.state), 1, axis=0)[1]
+
+
+@each_mode
+def test_one_hook_may_stay_in_python(make, mode):
+    isolated = make(Halves, hooks="auto", autoreset_mode=mode)
+    here = make(Halves, hooks="auto", workers=None, autoreset_mode=mode)
+    assert isolated._engine._left
+    assert run_side_by_side(isolated, here, mode, 40)
+
+
+@pytest.mark.parametrize("cls", [Short, Tracking])
+def test_snapshots_rollouts_and_parameters(make, cls):
+    isolated, here = make(cls), make(cls, workers=None)
+    results = []
+    for envs in (isolated, here):
+        envs.reset(seed=4)
+        envs.action_space.seed(1)
+        actions = np.array([envs.action_space.sample() for _ in range(8)])
+        for action in actions[:3]:
+            envs.step(action)
+        snapshot = envs.save_state()
+        rolled = envs.rollout(snapshot[[0]], actions[3:].swapaxes(0, 1))
+        went_on = [envs.step(action) for action in actions[3:]]
+        envs.restore_state(snapshot)
+        again = envs.step(actions[3])
+        results.append((rolled.rewards, again[0], again[1], went_on[-1][0]))
+        require_equal(again[1], went_on[0][1])
+    for ours, theirs in zip(*results, strict=True):
+        require_equal(ours, theirs)
+
+
+def test_python_workers_leave_hooks_on_arrays(make):
+    with pytest.raises(ConfigError, match="the pool is not the native one"):
+        make(CART_POLE, backend="python")
+    assert not isinstance(make(CART_POLE, backend="python", hooks="auto")._engine, CompiledEngine)
+
+
+def test_a_process_that_is_killed(make):
+    """The episodes of its block end, and the next step starts them again."""
+    isolated, here = make(Short, 4), make(Short, 4, workers=None)
+    actions = np.full((4, 1), 0.005, np.float32)
+    for envs in (isolated, here):
+        envs.reset(seed=2)
+        envs.step(actions)
+    os.kill(isolated._pool.processes()[0], signal.SIGKILL)
+    found, wanted = (envs.step(actions) for envs in (isolated, here))
+    assert found[3].tolist() == [True, True, False, False]
+    assert "SIGKILL" in found[4]["fault"][0]
+    require_equal(found[0][2:], wanted[0][2:])
+    found = isolated.step(actions)
+    assert not found[3].any()
+    assert found[4]["_drawn"].tolist() == [True, True, False, False]
+    wanted = here.step(actions)
+    require_equal(found[0][2:], wanted[0][2:])
+    assert isolated.get_attr("step_count")[0] == 0
+
+
+def test_faults_are_those_of_hooks_on_arrays(make, tmp_path):
+    path = faulty_fmu(tmp_path)
+    results = []
+    for hooks in ("compiled", "array"):
+        envs = make(lambda: FaultyEnv(path, "crash", call_timeout=20.0), 3, hooks, workers=3)
+        envs.set_attr("fault", [start_values("crash")["fault"], 0, 0])
+        envs.reset(seed=0)
+        rows = [envs.step(np.ones((3, 1))) for _ in range(6)]
+        results.append(rows)
+    for compiled, array in zip(*results, strict=True):
+        for ours, theirs in zip(compiled[:4], array[:4], strict=True):
+            require_equal(ours, theirs)
+        faults = [row[4].get("fault", [None])[0] for row in (compiled, array)]
+        assert [f and "SIGSEGV" in f for f in faults] in ([True, True], [None, None])
+
+
+class Free(fmugym.FMUEnv):
+    """An FMU whose memory is watched."""
+
+    def __init__(self, path):
+        config = {"model_input_names": "u", "model_output_names": "x", "bounds": {"u": (-1, 1)}}
+        super().__init__(path, config | {"time_step": 0.1, "max_episode_steps": 3})
+
+    def _is_done(self):
+        return self.out["x"] > 1e9
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+def test_actions_of_another_type_in_a_step_that_resets(make, tmp_path, workers):
+    """The C code refuses them, and gets them converted."""
+    path = exchange_tools.exchange_fmu(tmp_path / "m.fmu", "dahlquist", 2, ("CoSimulation",))
+    envs = make(lambda: Free(path), 4, workers=workers)
+    rows = []
+    for dtype in (np.float32, np.float64):
+        envs.reset(seed=0)
+        rows.append([envs.step(np.full((4, 1), 0.5, dtype))[0] for _ in range(9)])
+    np.testing.assert_array_equal(*rows)
+
+
+def test_refused_actions_change_nothing(make):
+    envs = make(CART_POLE, 3)
+    envs.reset(seed=0)
+    envs.step([0, 1, 0])
+    snapshot = envs.save_state()
+    expected = envs.step([1, 1, 0])
+    envs.restore_state(snapshot)
+    with pytest.raises(ConfigError):
+        envs.step([0, 2, 1])
+    require_equal(envs.step([1, 1, 0])[0], expected[0])
+
+
+def test_infos_tell_of_draws(make):
+    isolated, here = make(Short), make(Short, workers=None)
+    for _ in range(2):
+        require_same_infos(*(envs.reset(seed=5)[1] for envs in (isolated, here)))
+
+
+def test_a_pool_without_a_library_steps_nothing(make):
+    """Whatever is asked of the native pool that runs the programs, nothing crashes."""
+    envs = make(Short, 3)
+    envs.reset(seed=0)
+    around = PlayAround(envs._pool._setup, envs._pool._arrays, lambda *_: None)
+    arrays = np.zeros((3, 1), np.float32), np.zeros((2, 3)), None, None
+    for name in ("play", "play_before", "play_after"):
+        with pytest.raises(ValueError, match="not prepared"):
+            getattr(around._pool, name)(*arrays)
+    before = envs._pool.outputs.copy()
+    assert around._pool.step_own() == 3
+    nothing = around._access(())
+    assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
+    assert around._pool.read(nothing, np.zeros((0, 3))) == 0
+    np.testing.assert_array_equal(envs._pool.outputs, before)
+    around._pool.close()
+    with pytest.raises(SimulationError, match="closed"):
+        around._pool.step_own()
