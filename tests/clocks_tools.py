@@ -28,13 +28,20 @@ REALS = {
     "eager": (37, 'causality="parameter" variability="fixed" start="0"'),
     "alarms": (38, 'causality="output" variability="discrete"'),
 }
+ARRAYS = {
+    "commands": (40, 'causality="input" variability="discrete" clocks="0" start="0 0"'),
+    "samples": (41, 'causality="output" variability="discrete" clocks="0"'),
+    "plains": (42, 'causality="input" variability="continuous" start="0 0"'),
+}
+"""Of two elements each."""
+
 FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
 
 
-def clocks_fmu(path, interface="CoSimulation", event_mode=True, flags=""):
-    """Write the FMU with one interface."""
+def clocks_fmu(path, interface="CoSimulation", event_mode=True, flags="", arrays=False):
+    """Write the FMU with one interface, and if asked for with the arrays."""
     files = {
-        "modelDescription.xml": _describe(interface, event_mode, flags),
+        "modelDescription.xml": _describe(interface, event_mode, flags, arrays),
         fmu_tools.library_name(3, "Clocks"): _library(),
     }
     return fmu_tools.write_fmu(Path(path), files)
@@ -46,7 +53,7 @@ def _library():
     return building.library(source, stubs=stubs)
 
 
-def _describe(interface, event_mode, flags):
+def _describe(interface, event_mode, flags, arrays):
     extra = ' canHandleVariableCommunicationStepSize="true"' if interface == "CoSimulation" else ""
     extra += ' hasEventMode="true"' if event_mode and interface == "CoSimulation" else ""
     clocks = "".join(
@@ -58,6 +65,12 @@ def _describe(interface, event_mode, flags):
         f'<Float64 name="{name}" valueReference="{reference}" {kind}/>'
         for name, (reference, kind) in (REALS | _counts()).items()
     )
+    if arrays:
+        reals += "".join(
+            f'<Float64 name="{name}" valueReference="{reference}" {kind}><Dimension start="2"/>'
+            "</Float64>"
+            for name, (reference, kind) in ARRAYS.items()
+        )
     structure = '<ContinuousStateDerivative valueReference="31"/>'
     return (
         '<fmiModelDescription fmiVersion="3.0" modelName="Clocks" instantiationToken="{clocks}">'

@@ -478,6 +478,15 @@ class ModelDescription:
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
+    @cached_property
+    def arrays_beside_clocked(self) -> tuple[Variable, ...]:
+        """The arrays that may be set in steps, but without clocks, where some inputs have these."""
+        if not self.clocked_inputs:
+            return ()
+        clocked = {variable.name for variable in self.clocked_inputs}
+        arrays = (v for v in self.variables.values() if v.shape and v.settable_in_step)
+        return tuple(v for v in arrays if v.name not in clocked)
+
     @property
     def has_reset(self) -> bool:
         """Whether the FMI version has a function for resets: FMI 1.0 has none in model exchange."""
