@@ -88,9 +88,9 @@ class FMUEnv(Constructed):
             it. Or the name of a way to step the FMU, see ``fmugym.trial.opening.make_pool``.
         isolation: Where the FMU runs; by default where the config says.
         hooks: The way of calling hooks. ``"auto"`` compiles them after 1,000 steps if that gives
-            the same results, so that the native pool runs them in its step. ``"compiled"`` does so
-            in the first step, and it is an error where that is not possible. ``"python"`` never
-            does.
+            the same results, so that the native pool runs them in its step; one or two may stay in
+            Python. ``"compiled"`` does so in the first step, and it is an error if a hook cannot be
+            compiled. ``"python"`` never does.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is its model description.
@@ -326,8 +326,8 @@ class FMUEnv(Constructed):
                 return self._completed(result)
             if result is not None:
                 return self._judged_again()
-        except BaseException:  # as in ``step``: the FMU may have moved
-            self._ended = True
+        except BaseException:  # as in ``step``
+            self._ended = self._player.may_have_moved
             self._halt()
             raise
         self._player.doubt(self)

@@ -22,9 +22,16 @@ typedef enum {
     CLOCK_OUTPUT     /* ticks when the FMU wants it to */
 } ClockKind;
 
+/* A time between two ticks, or before the first one. */
+typedef struct {
+    double seconds;              /* NaN if the FMU has to be asked */
+    int64_t counter, resolution; /* their ratio is the same time, exactly; 0 if it is no fraction */
+} Interval;
+
 typedef struct Clock {
     uint32_t reference, kind;
-    double interval, shift; /* in seconds; NaN if the FMU has to be asked */
+    Interval interval, shift;
+    int64_t by_fractions; /* whether the FMU takes and tells these times as fractions */
 } Clock;
 
 enum { NO_CLOCK = UINT32_MAX };
@@ -36,11 +43,12 @@ typedef struct Clocked {
     uint32_t size;             /* the number of values */
 } Clocked;
 
-/* What is kept of a clock, and saved with the state. Its next tick is at origin + count * interval:
- * a sum of intervals would drift. */
+/* What is kept of a clock, and saved with the state. Its next tick is so many intervals after the
+ * origin: a sum of intervals would drift. */
 typedef struct {
-    double origin, interval;
-    int64_t count;
+    double origin;
+    Interval interval;
+    int64_t passed; /* intervals; with a fraction, parts of a second that its resolution gives */
     int64_t ticked; /* whether it ticked in the last communication step, or at the start */
 } Ticks;
 
@@ -53,7 +61,20 @@ typedef struct {
     int (*get_shift)(void *instance, const uint32_t *references, size_t count, double *shifts);
     int (*set_interval)(void *instance, const uint32_t *references, size_t count,
                         const double *intervals);
+    int (*get_interval_fraction)(void *instance, const uint32_t *references, size_t count,
+                                 uint64_t *counters, uint64_t *resolutions, int *qualifiers);
+    int (*get_shift_fraction)(void *instance, const uint32_t *references, size_t count,
+                              uint64_t *counters, uint64_t *resolutions);
+    int (*set_interval_fraction)(void *instance, const uint32_t *references, size_t count,
+                                 const uint64_t *counters, const uint64_t *resolutions);
 } ClockFunctions;
+
+/* ticks.c: the time of the next tick; the tick after it. A new interval begins with the next tick. */
+double ticks_next(const Ticks *ticks);
+void ticks_advance(Ticks *ticks);
+void ticks_change(Ticks *ticks, Interval interval);
+/* Makes an interval of a fraction. Returns false if it is none, or its parts are too large. */
+bool interval_of(uint64_t counter, uint64_t resolution, Interval *interval);
 
 /* To be called in initialization mode: sets or asks for intervals, and plans the first ticks. */
 Status clocks_prepare(struct Solver *me);

@@ -1,16 +1,14 @@
 #include "clock.h"
 
 #include <float.h>
+#include <inttypes.h>
 #include <math.h>
+#include <string.h>
 
 #include "solver.h"
 
 /* FMI's interval qualifiers */
 enum { NOT_YET_KNOWN, UNCHANGED, CHANGED };
-
-static double next_tick(const Ticks *ticks) {
-    return ticks->origin + (double)ticks->count * ticks->interval;
-}
 
 static Status missing(Solver *me, const Clock *clock) {
     return solver_fail(me, "the FMU lacks a function for its clock with value reference %u",
@@ -18,74 +16,137 @@ static Status missing(Solver *me, const Clock *clock) {
 }
 
 /* A clock that repeats too soon would never let time pass. */
-static Status check_interval(Solver *me, const Clock *clock, double interval) {
+static Status check_interval(Solver *me, const Clock *clock, const Interval *interval) {
     const bool may_be_zero = clock->kind == CLOCK_COUNTDOWN;
 
-    if (may_be_zero ? interval >= 0.0 : interval > 0.0) {
+    if (may_be_zero ? interval->seconds >= 0.0 : interval->seconds > 0.0) {
         return STATUS_OK;
     }
     return solver_fail(me, "the clock with value reference %u has an interval of %g s at t = %g s",
-                       (unsigned)clock->reference, interval, me->memory.time);
+                       (unsigned)clock->reference, interval->seconds, me->memory.time);
 }
 
-/* Asks for the interval. It stays as it is if the FMU tells no other one. */
-static Status ask_interval(Solver *me, const Clock *clock, double *interval, int *qualifier) {
-    double value = *interval;
-
-    *qualifier = NOT_YET_KNOWN;
-    if (me->clock_functions->get_interval == NULL) {
-        return missing(me, clock);
+static Status take_fraction(Solver *me, const Clock *clock, uint64_t counter, uint64_t resolution,
+                            Interval *interval) {
+    if (interval_of(counter, resolution, interval)) {
+        return STATUS_OK;
     }
-    Status status = sane(me->clock_functions->get_interval(me->component, &clock->reference, 1,
-                                                           &value, qualifier));
-    solver_restore_floats(me);
-    if (status <= STATUS_WARNING && *qualifier == CHANGED) {
-        const Status checked = check_interval(me, clock, value);
-        status = checked > status ? checked : status;
-        *interval = value;
-    }
-    return status;
+    return solver_fail(me,
+                       "the clock with value reference %u has an interval or shift of "
+                       "%" PRIu64 "/%" PRIu64 " s at t = %g s",
+                       (unsigned)clock->reference, counter, resolution, me->memory.time);
 }
 
-static Status ask_shift(Solver *me, const Clock *clock, double *shift) {
-    if (me->clock_functions->get_shift == NULL) {
+static Status worse(Status a, Status b) {
+    return a > b ? a : b;
+}
+
+static Status ask_decimal(Solver *me, const Clock *clock, Interval *interval, int *qualifier) {
+    const ClockFunctions *f = me->clock_functions;
+    double seconds = 0.0;
+
+    if (f->get_interval == NULL) {
         return missing(me, clock);
     }
     const Status status =
-        sane(me->clock_functions->get_shift(me->component, &clock->reference, 1, shift));
+        sane(f->get_interval(me->component, &clock->reference, 1, &seconds, qualifier));
+    solver_restore_floats(me);
+    if (*qualifier == CHANGED) {
+        *interval = (Interval){.seconds = seconds};
+    }
+    return status;
+}
+
+static Status ask_fraction(Solver *me, const Clock *clock, Interval *interval, int *qualifier) {
+    const ClockFunctions *f = me->clock_functions;
+    uint64_t counter = 0, resolution = 0;
+
+    if (f->get_interval_fraction == NULL) {
+        return missing(me, clock);
+    }
+    const Status status = sane(f->get_interval_fraction(me->component, &clock->reference, 1,
+                                                        &counter, &resolution, qualifier));
+    solver_restore_floats(me);
+    return status <= STATUS_WARNING && *qualifier == CHANGED
+               ? worse(status, take_fraction(me, clock, counter, resolution, interval))
+               : status;
+}
+
+/* Asks for the interval. It stays as it is if the FMU tells no other one. */
+static Status ask_interval(Solver *me, const Clock *clock, Interval *interval, int *qualifier) {
+    *qualifier = NOT_YET_KNOWN;
+    const Status status = clock->by_fractions ? ask_fraction(me, clock, interval, qualifier)
+                                              : ask_decimal(me, clock, interval, qualifier);
+    return status <= STATUS_WARNING && *qualifier == CHANGED
+               ? worse(status, check_interval(me, clock, interval))
+               : status;
+}
+
+static Status ask_shift(Solver *me, const Clock *clock, Interval *shift) {
+    const ClockFunctions *f = me->clock_functions;
+    uint64_t counter = 0, resolution = 0;
+    Status status;
+
+    if (clock->by_fractions ? f->get_shift_fraction == NULL : f->get_shift == NULL) {
+        return missing(me, clock);
+    }
+    *shift = (Interval){.seconds = 0.0};
+    status = sane(clock->by_fractions
+                      ? f->get_shift_fraction(me->component, &clock->reference, 1, &counter,
+                                              &resolution)
+                      : f->get_shift(me->component, &clock->reference, 1, &shift->seconds));
+    solver_restore_floats(me);
+    return status <= STATUS_WARNING && clock->by_fractions
+               ? worse(status, take_fraction(me, clock, counter, resolution, shift))
+               : status;
+}
+
+static Status set_interval(Solver *me, const Clock *clock) {
+    const ClockFunctions *f = me->clock_functions;
+    const bool by_fraction = clock->by_fractions && clock->interval.resolution > 0;
+    const uint64_t counter = (uint64_t)clock->interval.counter;
+    const uint64_t resolution = (uint64_t)clock->interval.resolution;
+
+    if (by_fraction ? f->set_interval_fraction == NULL : f->set_interval == NULL) {
+        return missing(me, clock);
+    }
+    const Status status = sane(
+        by_fraction
+            ? f->set_interval_fraction(me->component, &clock->reference, 1, &counter, &resolution)
+            : f->set_interval(me->component, &clock->reference, 1, &clock->interval.seconds));
     solver_restore_floats(me);
     return status;
 }
 
-static Status set_interval(Solver *me, const Clock *clock) {
-    if (me->clock_functions->set_interval == NULL) {
-        return missing(me, clock);
+/* The first tick comes after the shift, others after intervals. */
+static Ticks first_ticks(double time, Interval shift, Interval interval) {
+    Ticks ticks = {.origin = time, .interval = shift, .passed = shift.counter};
+
+    if (interval.resolution > 0 && shift.resolution > 0) {
+        ticks_change(&ticks, interval);
+        return ticks;
     }
-    const Status status = sane(me->clock_functions->set_interval(
-        me->component, &clock->reference, 1, &clock->interval));
-    solver_restore_floats(me);
-    return status;
+    return (Ticks){.origin = time + shift.seconds, .interval = interval};
 }
 
 static Status prepare(Solver *me, const Clock *clock, Ticks *ticks) {
     const bool never = clock->kind >= CLOCK_COUNTDOWN;
-    double interval = clock->interval, shift = clock->shift;
+    Interval interval = clock->interval, shift = clock->shift;
     Status status = STATUS_OK;
     int qualifier;
 
     if (clock->kind == CLOCK_CONSTANT || clock->kind == CLOCK_FIXED) {
-        status = check_interval(me, clock, interval); /* the XML may give none */
+        status = check_interval(me, clock, &interval); /* the XML may give none */
     }
     if (clock->kind == CLOCK_FIXED && status <= STATUS_WARNING) {
         status = set_interval(me, clock);
     } else if (clock->kind >= CLOCK_CALCULATED && clock->kind <= CLOCK_CHANGING) {
         status = ask_interval(me, clock, &interval, &qualifier);
     }
-    if (status <= STATUS_WARNING && isnan(shift)) {
+    if (status <= STATUS_WARNING && isnan(shift.seconds)) {
         status = ask_shift(me, clock, &shift);
     }
-    *ticks = never ? (Ticks){.origin = INFINITY}
-                   : (Ticks){.origin = me->memory.time + shift, .interval = interval};
+    *ticks = never ? (Ticks){.origin = INFINITY} : first_ticks(me->memory.time, shift, interval);
     return status;
 }
 
@@ -108,7 +169,7 @@ void clocks_begin_step(Solver *me) {
 
 /* Whether two times differ by no more than their rounding. */
 static bool is_due(const Solver *me, const Ticks *ticks) {
-    return next_tick(ticks) <= me->memory.time + 16.0 * DBL_EPSILON * fabs(me->memory.time);
+    return ticks_next(ticks) <= me->memory.time + 16.0 * DBL_EPSILON * fabs(me->memory.time);
 }
 
 static Status activate(Solver *me, size_t index) {
@@ -160,12 +221,12 @@ Status clocks_watch(Solver *me) {
 }
 
 static Status plan_countdown(Solver *me, const Clock *clock, Ticks *ticks, bool ticked) {
-    double interval = 0.0;
+    Interval interval = {.seconds = 0.0};
     int qualifier;
     const Status status = ask_interval(me, clock, &interval, &qualifier);
 
     if (qualifier == CHANGED) {
-        ticks->origin = me->memory.time + interval;
+        ticks->origin = me->memory.time + interval.seconds;
     } else if (qualifier == NOT_YET_KNOWN || ticked) {
         ticks->origin = INFINITY;
     }
@@ -175,20 +236,18 @@ static Status plan_countdown(Solver *me, const Clock *clock, Ticks *ticks, bool 
 /* A new interval begins with the tick at which the FMU tells it. */
 static Status plan_after_tick(Solver *me, const Clock *clock, Ticks *ticks) {
     const bool may_change = clock->kind == CLOCK_TUNABLE || clock->kind == CLOCK_CHANGING;
-    double interval = ticks->interval;
+    Interval interval = ticks->interval;
     Status status = STATUS_OK;
     int qualifier = UNCHANGED;
 
     if (may_change) {
         status = ask_interval(me, clock, &interval, &qualifier);
     }
-    if (interval != ticks->interval) {
-        ticks->origin = next_tick(ticks);
-        ticks->interval = interval;
-        ticks->count = 0;
+    if (memcmp(&interval, &ticks->interval, sizeof interval) != 0) {
+        ticks_change(ticks, interval);
     }
-    ticks->count++;
-    return status > STATUS_WARNING ? status : check_interval(me, clock, ticks->interval);
+    ticks_advance(ticks);
+    return status > STATUS_WARNING ? status : check_interval(me, clock, &ticks->interval);
 }
 
 Status clocks_plan(Solver *me) {
@@ -211,7 +270,7 @@ double clocks_next(const Solver *me) {
     double next = INFINITY;
 
     for (size_t i = 0; i < me->solving->number_of_clocks; i++) {
-        next = fmin(next, next_tick(&me->ticks[i]));
+        next = fmin(next, ticks_next(&me->ticks[i]));
     }
     return next;
 }

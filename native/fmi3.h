@@ -72,7 +72,10 @@ typedef struct {
     {"SetClock", offsetof(Functions, clocks.set), false},                                          \
     {"GetIntervalDecimal", offsetof(Functions, clocks.get_interval), false},                       \
     {"GetShiftDecimal", offsetof(Functions, clocks.get_shift), false},                             \
-    {"SetIntervalDecimal", offsetof(Functions, clocks.set_interval), false}
+    {"SetIntervalDecimal", offsetof(Functions, clocks.set_interval), false},                       \
+    {"GetIntervalFraction", offsetof(Functions, clocks.get_interval_fraction), false},             \
+    {"GetShiftFraction", offsetof(Functions, clocks.get_shift_fraction), false},                   \
+    {"SetIntervalFraction", offsetof(Functions, clocks.set_interval_fraction), false}
 
 /* The bindings of functions that both interfaces have. */
 #define SHARED_BINDINGS                                                                            \

@@ -178,6 +178,10 @@ Status system_step_once(Composite *me, double time, double step, bool no_return)
     for (size_t i = 0; i < s->number_of_groups && goes_on(status); i++) {
         status = step_group(me, &s->groups[i], span);
     }
+    /* each tick is for one step only */
+    for (size_t i = 0; i < s->number_of_clocks && goes_on(status); i++) {
+        me->inputs[s->clocks[i]] = 0.0;
+    }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
 }

@@ -141,6 +141,8 @@ typedef struct System {
     size_t largest_state; /* of a part that is kept, in bytes */
     size_t memory; /* doubles that the largest loop needs */
     size_t scratch; /* doubles that the longest list of variables of a part needs */
+    uint32_t *clocks; /* the slots of inputs that are clocks */
+    size_t number_of_clocks;
 } System;
 
 /* A value that is to be set before the initialization. */

@@ -139,6 +139,16 @@ static Status read_source(const Beginning *b, const Route *route, double *values
                                    : route_carry(me, route, me->whole + element->place, values);
 }
 
+/* FMI forbids to set inputs with clocks in Initialization Mode: they get their values in steps. */
+static bool waits_for_clock(const Component *part, uint32_t reference) {
+    for (size_t i = 0; i < part->solving.number_of_clocked; i++) {
+        if (part->solving.clocked[i].reference == reference) {
+            return true;
+        }
+    }
+    return false;
+}
+
 /* An FMU of FMI 1.0 that waits gets the values when it begins. An element of an array is set with
  * the others, which stay as they are. */
 static Status write_target(const Beginning *b, const Route *route, const double *values) {
@@ -148,7 +158,7 @@ static Status write_target(const Beginning *b, const Route *route, const double 
     const Element *element = &part->inputs.variables[place];
 
     memmove(&me->inputs[route->target], values, route->count * sizeof *values);
-    return me->parts.started[route->target_part]
+    return me->parts.started[route->target_part] && !waits_for_clock(part, element->reference)
                ? part_set(me, route->target_part, (Type)part->inputs.types[place], element,
                           &me->inputs[route->target] - element->place)
                : STATUS_OK;

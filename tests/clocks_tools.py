@@ -17,6 +17,12 @@ CLOCKS = {
 }
 """By name, in the order of the value references."""
 
+FRACTIONS = CLOCKS | {
+    "constant": 'intervalVariability="constant" resolution="3" intervalCounter="1" '
+    'shiftCounter="1"',
+    "fixed": 'intervalVariability="fixed" intervalCounter="1" resolution="7"',
+}
+
 REALS = {
     "x": (30, 'causality="output" variability="continuous" initial="exact" start="0"'),
     "der(x)": (31, 'causality="local" variability="continuous" derivative="30"'),
@@ -27,6 +33,7 @@ REALS = {
     "plain": (36, 'causality="input" variability="continuous" start="0"'),
     "eager": (37, 'causality="parameter" variability="fixed" start="0"'),
     "alarms": (38, 'causality="output" variability="discrete"'),
+    "bad counter": (39, 'causality="parameter" variability="fixed" start="0"'),
 }
 ARRAYS = {
     "commands": (40, 'causality="input" variability="discrete" clocks="0" start="0 0"'),
@@ -38,28 +45,36 @@ ARRAYS = {
 FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
 
 
-def clocks_fmu(path, interface="CoSimulation", event_mode=True, flags="", arrays=False):
-    """Write the FMU with one interface, and if asked for with the arrays."""
+def clocks_fmu(
+    path, interface="CoSimulation", event_mode=True, flags="", clocks=None, arrays=False
+):
+    """Write the FMU with one interface; if its clocks are ``FRACTIONS``, it takes no decimals.
+
+    If asked for, it has the arrays.
+    """
+    clocks = CLOCKS if clocks is None else clocks
     files = {
-        "modelDescription.xml": _describe(interface, event_mode, flags, arrays),
-        fmu_tools.library_name(3, "Clocks"): _library(),
+        "modelDescription.xml": _describe(interface, event_mode, flags, clocks, arrays),
+        fmu_tools.library_name(3, "Clocks"): _library(clocks is not CLOCKS),
     }
     return fmu_tools.write_fmu(Path(path), files)
 
 
-def _library():
+def _library(fractions):
     source = "exchange/clocks.c"
+    flags = ("-DFRACTIONS",) if fractions else ()
     stubs = fmu_tools.stubs(3, "fmi3", building.HERE / source)
-    return building.library(source, stubs=stubs)
+    return building.library(source, flags=flags, stubs=stubs)
 
 
-def _describe(interface, event_mode, flags, arrays):
+def _describe(interface, event_mode, flags, kinds, arrays):
     extra = ' canHandleVariableCommunicationStepSize="true"' if interface == "CoSimulation" else ""
     extra += ' hasEventMode="true"' if event_mode and interface == "CoSimulation" else ""
     clocks = "".join(
         f'<Clock name="{name}" valueReference="{i}" variability="discrete" {kind} '
-        f'causality="{"output" if name == "bell" else "input"}"/>'
-        for i, (name, kind) in enumerate(CLOCKS.items())
+        f'causality="{"output" if name == "bell" else "input"}" '
+        f'supportsFraction="{str(kinds is not CLOCKS).lower()}"/>'
+        for i, (name, kind) in enumerate(kinds.items())
     )
     reals = "".join(
         f'<Float64 name="{name}" valueReference="{reference}" {kind}/>'

@@ -13,7 +13,10 @@ from fmpy.validation import validate_model_description
 from fmugym.archive.description import (
     CLOCK_KINDS,
     INTERFACES,
+    MOST_FRACTIONS,
+    UNKNOWN,
     Capabilities,
+    Interval,
     ModelDescription,
     ModelExchange,
     Unit,
@@ -291,8 +294,9 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         ),
         clocks=tuple(map(int, (element.get("clocks") or "").split())),
         ticking=ticking,
-        interval=_clock_time(element, "interval") if ticking else math.nan,
-        shift=_shift(element, ticking),
+        interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
+        shift=_shift(source, element, ticking),
+        by_fractions=element.get("supportsFraction") in {"true", "1"},
     )
 
 
@@ -315,20 +319,31 @@ def _ticking(source: Any, element: Any) -> str:
     return str(kind)
 
 
-def _shift(element: Any, ticking: str) -> float:
+def _shift(source: Any, element: Any, ticking: str) -> Interval:
     """The time before the first tick. Only the FMU knows that of a calculated clock."""
-    shift = _clock_time(element, "shift")
-    return 0.0 if math.isnan(shift) and ticking != "calculated" else shift
+    shift = _clock_time(source, element, "shift")
+    return Interval(0.0) if shift is UNKNOWN and ticking != "calculated" else shift
 
 
-def _clock_time(element: Any, name: str) -> float:
-    """An interval or shift in seconds, given as a decimal or a fraction; NaN if it is not given."""
+def _clock_time(source: Any, element: Any, name: str) -> Interval:
+    """An interval or shift. A fraction is preferred to a decimal, because it is exact."""
     decimal, counter = element.get(f"{name}Decimal"), element.get(f"{name}Counter")
-    if decimal is not None:
-        return float(decimal)
-    if counter is None or element.get("resolution") is None:
-        return math.nan
-    return int(counter) / int(element.get("resolution"))
+    if counter is not None and element.get("resolution") is not None:
+        resolution = _fraction_part(source, "resolution", element.get("resolution"), 1)
+        return Interval.of_fraction(
+            _fraction_part(source, f"{name}Counter", counter, 0), resolution
+        )
+    return UNKNOWN if decimal is None else Interval(float(decimal))
+
+
+def _fraction_part(source: Any, attribute: str, text: str, least: int) -> int:
+    """Read a part of a fraction."""
+    if not text.isdecimal() or not least <= int(text) <= MOST_FRACTIONS:
+        raise FMULoadError(
+            f"the clock {source.name!r} has {attribute}={text!r}, expected a whole number from "
+            f"{least} to {MOST_FRACTIONS}"
+        )
+    return int(text)
 
 
 def _check_reference(source: Any) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import fmpy
 
@@ -23,7 +23,9 @@ __all__ = [
     "CLOCK_KINDS",
     "INTERFACES",
     "MOST_ELEMENTS",
+    "UNKNOWN",
     "Capabilities",
+    "Interval",
     "ModelDescription",
     "ModelExchange",
     "Unit",
@@ -68,6 +70,32 @@ CLOCK_KINDS = (
 )
 """The interval variabilities of clocks. Those before the last one have ticks of their own."""
 
+MOST_FRACTIONS: Final = 2**52
+"""The largest counter and resolution of an interval: float64 can hold a few of them exactly."""
+
+
+class Interval(NamedTuple):
+    """A time between two ticks of a clock, or before the first one.
+
+    Attributes:
+        seconds: NaN where only the FMU knows.
+        counter: The same in units of a second divided by the resolution, which is exact.
+        resolution: 0 where the time is no such fraction.
+    """
+
+    seconds: float
+    counter: int = 0
+    resolution: int = 0
+
+    @classmethod
+    def of_fraction(cls, counter: int, resolution: int) -> Interval:
+        """Make one from a fraction of a second; both numbers are at most ``MOST_FRACTIONS``."""
+        return cls(counter / resolution, counter, resolution)
+
+
+UNKNOWN: Final = Interval(math.nan)
+"""Only the FMU knows the interval."""
+
 
 @dataclass(frozen=True, eq=False)
 class Variable:
@@ -90,8 +118,8 @@ class Variable:
             a value reference of its own, the first one that of the array.
         clocks: The value references of the clocks that must tick whenever the value changes.
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
-        interval, shift: Of a clock: the time between its ticks and that before the first one in
-            seconds; NaN where only the FMU knows.
+        interval, shift: Of a clock: the time between its ticks and that before the first one.
+        by_fractions: Of a clock: whether the FMU takes and tells these times as fractions.
     """
 
     name: str
@@ -114,8 +142,9 @@ class Variable:
     driven: frozenset[int] | None = None
     clocks: tuple[int, ...] = ()
     ticking: str = ""
-    interval: float = math.nan
-    shift: float = math.nan
+    interval: Interval = UNKNOWN
+    shift: Interval = UNKNOWN
+    by_fractions: bool = False
 
     @property
     def kind(self) -> str:
@@ -165,7 +194,7 @@ class Variable:
 
     @property
     def number(self) -> int:
-        """Of a clock: its kind as ``enum ClockKind`` of ``native/clocks.h``."""
+        """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
         is_output = self.ticking == "triggered" and self.causality != "input"
         return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
 
@@ -471,7 +500,7 @@ class ModelDescription:
             return ()
         return tuple(v for v in self.variables.values() if v.ticking and not v.shape)
 
-    @cached_property
+    @property
     def clocked_inputs(self) -> tuple[Variable, ...]:
         """The inputs that may be set only while one of their clocks ticks."""
         known = {clock.value_reference for clock in self.clocks}

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from fmugym.archive.description import CLOCK_KINDS, Variable
+from fmugym.archive.description import CLOCK_KINDS, MOST_FRACTIONS, Interval, Variable
 from fmugym.fmi.status import Status
 
 __all__ = ["TICKS_SIZE", "CallError", "ClockCalls", "Qualifier", "Ticks", "Timetable"]
 
-_TICKS: Final = struct.Struct("=ddqq")
+_TICKS: Final = struct.Struct("=ddqqqq")
 TICKS_SIZE: Final = _TICKS.size
 """Bytes of serialized ticks."""
 
@@ -44,31 +44,55 @@ class Qualifier(IntEnum):
 
 
 class Ticks(NamedTuple):
-    """What is kept of a clock. Its next tick is at ``origin + passed * interval``.
+    """What is kept of a clock. Its next tick is so many intervals after its origin.
 
     Attributes:
+        origin: A time in seconds.
+        interval: Between two ticks.
+        passed: The intervals since the origin; with a fraction, the parts of a second that its
+            resolution gives.
         ticked: Whether it ticked in the last communication step, or at the start.
     """
 
     origin: float = math.inf
-    interval: float = 0.0
+    interval: Interval = Interval(0.0)
     passed: int = 0
     ticked: bool = False
 
     @property
     def next(self) -> float:
         """The time of the next tick."""
-        return self.origin + self.passed * self.interval
+        if self.interval.resolution:
+            return self.origin + self.passed / self.interval.resolution
+        return self.origin + self.passed * self.interval.seconds
+
+    def changed_to(self, interval: Interval) -> Ticks:
+        """A new interval begins with the next tick."""
+        a, b = self.interval.resolution, interval.resolution
+        if a and b:
+            common = math.lcm(a, b)
+            passed, counter = self.passed * (common // a), interval.counter * (common // b)
+            if max(common, passed, counter) <= MOST_FRACTIONS:
+                new = Interval(interval.seconds, counter, common)
+                return self._replace(interval=new, passed=passed)
+        return self._replace(origin=self.next, interval=interval, passed=0)
+
+    def advanced(self) -> Ticks:
+        """Go on to the tick after the next one."""
+        passed = self.passed + (self.interval.counter if self.interval.resolution else 1)
+        if passed > MOST_FRACTIONS:
+            return Ticks(self._replace(passed=passed).next, self.interval, 0, self.ticked)
+        return self._replace(passed=passed)
 
     def to_bytes(self) -> bytes:
         """Serialize them as the native pool does."""
-        return _TICKS.pack(*self)
+        return _TICKS.pack(self.origin, *self.interval, self.passed, self.ticked)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Ticks:
         """Read what ``to_bytes`` made."""
-        origin, interval, passed, ticked = _TICKS.unpack(data)
-        return cls(origin, interval, passed, bool(ticked))
+        origin, *interval, passed, ticked = _TICKS.unpack(data)
+        return cls(origin, Interval(*interval), passed, bool(ticked))
 
 
 class ClockCalls(ABC):
@@ -83,11 +107,11 @@ class ClockCalls(ABC):
         """Let an input clock tick now."""
 
     @abstractmethod
-    def interval(self, clock: Variable, known: float) -> tuple[float, Qualifier]:
-        """Ask for the interval; ``known`` is what is returned if the FMU tells none."""
+    def interval(self, clock: Variable) -> tuple[Interval, Qualifier]:
+        """Ask for the interval, which says nothing unless the qualifier is ``CHANGED``."""
 
     @abstractmethod
-    def shift(self, clock: Variable) -> float:
+    def shift(self, clock: Variable) -> Interval:
         """Ask for the time before the first tick."""
 
     @abstractmethod
@@ -114,7 +138,7 @@ class Timetable:
         self.clocks, self._calls = tuple(clocks), calls
         self._numbers = {c.value_reference: index for index, c in enumerate(self.clocks)}
         self._active = [False] * len(self.clocks)
-        self.ticks: list[Ticks] = [Ticks(0.0)] * len(self.clocks)
+        self.ticks = [Ticks(0.0)] * len(self.clocks)
 
     @property
     def next(self) -> float:
@@ -134,27 +158,45 @@ class Timetable:
             self._calls.set_interval(clock)
         elif clock.ticking in ("calculated", *_MAY_CHANGE):
             interval = self._ask(clock, interval, time)[0]
-        if math.isnan(shift):
-            shift = self._calls.shift(clock)
+        if math.isnan(shift.seconds):
+            shift = self._checked_fraction(clock, self._calls.shift(clock), time)
         if clock.ticking not in _PERIODIC:
             return Ticks()
-        return Ticks(time + shift, interval)
+        if interval.resolution and shift.resolution:
+            return Ticks(time, shift, shift.counter).changed_to(interval)
+        return Ticks(time + shift.seconds, interval)
 
-    def _ask(self, clock: Variable, known: float, time: float) -> tuple[float, Qualifier]:
-        interval, qualifier = self._calls.interval(clock, known)
+    def _ask(self, clock: Variable, known: Interval, time: float) -> tuple[Interval, Qualifier]:
+        interval, qualifier = self._calls.interval(clock)
         if qualifier is not Qualifier.CHANGED:
             return known, qualifier
+        interval = self._checked_fraction(clock, interval, time)
         self._check(clock, interval, time)
         return interval, qualifier
 
     @staticmethod
-    def _check(clock: Variable, interval: float, time: float) -> None:
+    def _checked_fraction(clock: Variable, interval: Interval, time: float) -> Interval:
+        """Compute the seconds of what the FMU tells as a fraction."""
+        _, counter, resolution = interval
+        if not clock.by_fractions:
+            return interval
+        if 0 < resolution <= MOST_FRACTIONS and counter <= MOST_FRACTIONS:
+            return Interval.of_fraction(counter, resolution)
+        raise CallError(
+            Status.ERROR,
+            f"the clock with value reference {clock.value_reference} has an interval or shift of "
+            f"{counter}/{resolution} s at t = {time:g} s",
+        )
+
+    @staticmethod
+    def _check(clock: Variable, interval: Interval, time: float) -> None:
         """A clock that repeats too soon would never let time pass."""
-        if not (interval > 0.0 or (clock.ticking == "countdown" and interval == 0.0)):
+        seconds = interval.seconds
+        if not (seconds > 0.0 or (clock.ticking == "countdown" and seconds == 0.0)):
             raise CallError(
                 Status.ERROR,
                 f"the clock with value reference {clock.value_reference} has an interval of "
-                f"{interval:g} s at t = {time:g} s",
+                f"{seconds:g} s at t = {time:g} s",
             )
 
     def begin_step(self) -> None:
@@ -202,9 +244,9 @@ class Timetable:
                 self.ticks[index] = self._plan_after_tick(clock, self.ticks[index], time)
 
     def _plan_countdown(self, clock: Variable, ticks: Ticks, ticked: bool, time: float) -> Ticks:
-        interval, qualifier = self._ask(clock, 0.0, time)
+        interval, qualifier = self._ask(clock, Interval(0.0), time)
         if qualifier is Qualifier.CHANGED:
-            return ticks._replace(origin=time + interval)
+            return ticks._replace(origin=time + interval.seconds)
         ends = qualifier is Qualifier.NOT_YET_KNOWN or ticked
         return ticks._replace(origin=math.inf) if ends else ticks
 
@@ -214,6 +256,6 @@ class Timetable:
         if clock.ticking in _MAY_CHANGE:
             interval, _ = self._ask(clock, interval, time)
         if interval != ticks.interval:
-            ticks = ticks._replace(origin=ticks.next, interval=interval, passed=0)
+            ticks = ticks.changed_to(interval)
         self._check(clock, ticks.interval, time)
-        return ticks._replace(passed=ticks.passed + 1)
+        return ticks.advanced()

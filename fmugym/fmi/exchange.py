@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -13,7 +14,7 @@ from fmpy.fmi1 import FMU1Model, fmi1EventInfo
 from fmpy.fmi2 import FMU2Model, fmi2EventInfo
 from fmpy.fmi3 import FMU3Model
 
-from fmugym.archive.description import Variable
+from fmugym.archive.description import Interval, Variable
 from fmugym.fmi.clocks import CallError, Qualifier
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
@@ -309,21 +310,39 @@ class FMUEquations(Equations):
         """See ``ClockCalls.activate``."""
         self._call_for("SetClock", clock, ctypes.c_bool(True))
 
-    def interval(self, clock: Variable, known: float) -> tuple[float, Qualifier]:
+    def interval(self, clock: Variable) -> tuple[Interval, Qualifier]:
         """See ``ClockCalls.interval``."""
-        interval, qualifier = ctypes.c_double(known), ctypes.c_int(Qualifier.NOT_YET_KNOWN)
-        self._call_for("GetIntervalDecimal", clock, interval, qualifier)
-        return interval.value, Qualifier(qualifier.value)
+        qualifier = ctypes.c_int(Qualifier.NOT_YET_KNOWN)
+        if clock.by_fractions:
+            interval = self._ask_for_fraction("GetIntervalFraction", clock, qualifier)
+        else:
+            interval = self._ask_for_decimal("GetIntervalDecimal", clock, qualifier)
+        return interval, Qualifier(qualifier.value)
 
-    def shift(self, clock: Variable) -> float:
+    def shift(self, clock: Variable) -> Interval:
         """See ``ClockCalls.shift``."""
-        shift = ctypes.c_double()
-        self._call_for("GetShiftDecimal", clock, shift)
-        return shift.value
+        if clock.by_fractions:
+            return self._ask_for_fraction("GetShiftFraction", clock)
+        return self._ask_for_decimal("GetShiftDecimal", clock)
 
     def set_interval(self, clock: Variable) -> None:
         """See ``ClockCalls.set_interval``."""
-        self._call_for("SetIntervalDecimal", clock, ctypes.c_double(clock.interval))
+        seconds, counter, resolution = clock.interval
+        if clock.by_fractions and resolution:
+            parts = ctypes.c_uint64(counter), ctypes.c_uint64(resolution)
+            self._call_for("SetIntervalFraction", clock, *parts)
+        else:
+            self._call_for("SetIntervalDecimal", clock, ctypes.c_double(seconds))
+
+    def _ask_for_decimal(self, name: str, clock: Variable, *qualifier: ctypes.c_int) -> Interval:
+        seconds = ctypes.c_double()
+        self._call_for(name, clock, seconds, *qualifier)
+        return Interval(seconds.value)
+
+    def _ask_for_fraction(self, name: str, clock: Variable, *qualifier: ctypes.c_int) -> Interval:
+        counter, resolution = ctypes.c_uint64(), ctypes.c_uint64()
+        self._call_for(name, clock, counter, resolution, *qualifier)
+        return Interval(math.nan, counter.value, resolution.value)
 
     def set_inputs(self, clock: Variable) -> None:
         """See ``ClockCalls.set_inputs``."""

@@ -567,11 +567,16 @@ class SystemInstance(Instance, Repeatable):
         return _carried(part, route, values)
 
     def _write_target(self, route: Route, values: Sequence[float]) -> None:
-        """Set inputs. An element of an array is set with the others, which stay as they are."""
+        """Set inputs. An element of an array is set with the others, which stay as they are.
+
+        FMI forbids to set inputs with clocks in Initialization Mode: they get their values in
+        steps.
+        """
         part = self._parts[route.target_part]
         self._take(route, values)
-        if part.started:
-            span = part.layout.span_of(route.target - part.layout.first_input)
+        place = route.target - part.layout.first_input
+        if part.started and not part.layout.waits_for_clock(part.layout.inputs[place]):
+            span = part.layout.span_of(place)
             part.set(part.layout.inputs[span], part.inputs.values[span])
 
     def _refresh(self) -> None:
@@ -638,6 +643,8 @@ class SystemInstance(Instance, Repeatable):
                 self._carry(route)
         for group in self._layout.plan.groups:
             self._step_group(group, time, step_size)
+        for part in self._parts:
+            part.inputs.values[list(part.layout.clocks)] = 0.0
         self._fresh = True
 
     def _carried(self, route: Route) -> list[float]:

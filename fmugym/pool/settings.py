@@ -56,7 +56,7 @@ _TYPES: Final = (
 _START_TIME: Final = 255
 """Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
 
-_CLOCK: Final = struct.Struct("=IIdd")
+_CLOCK: Final = struct.Struct("=IIdqqdqqq")
 _CLOCKED: Final = struct.Struct("=III")
 _NO_CLOCK: Final = 2**32 - 1
 _NUMBER: Final = struct.Struct("=d")
@@ -198,11 +198,14 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
 
 
 def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
-    """The arrays of ``Clock`` and ``Clocked`` of ``native/clocks.h``."""
+    """The arrays of ``Clock`` and ``Clocked`` of ``native/clock.h``."""
     clocks = description.clocks
     indices = {clock.value_reference: index for index, clock in enumerate(clocks)}
     return (
-        b"".join(_CLOCK.pack(c.value_reference, c.number, c.interval, c.shift) for c in clocks),
+        b"".join(
+            _CLOCK.pack(c.value_reference, c.number, *c.interval, *c.shift, c.by_fractions)
+            for c in clocks
+        ),
         b"".join(
             _CLOCKED.pack(variable.value_reference, indices[reference], variable.size)
             for variable in description.clocked_inputs

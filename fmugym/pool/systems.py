@@ -157,7 +157,7 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
 
 def _type(layout: Layout, end: PartVariable) -> bytes:
     """The C type; strings have none, and are never read."""
-    if not end.variable.numeric:
+    if end.variable.kind == "string":
         return b"\0"
     version = layout.parts[end.part].description.fmi_major_version
     return listing([end.variable], version)[0][:1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from math import prod
 from typing import Any, Final
 
@@ -11,11 +11,12 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.signals import is_of_signal_handler
+from fmugym.single.purity import unchanged_globals
 from fmugym.single.trace import SingleTask, kind_of
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import conclude
 from fmugym.task.values import EpisodeVariables
-from fmugym.vector.contents import borrowed
+from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.check import sample_of
 from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
 
@@ -30,20 +31,38 @@ _SCALES: Final = (0.1, 0.1, 1.0, 1.0, 10.0, 300.0)
 def require_equal(env: FMUEnv, task: SingleTask) -> None:
     """Run programs and hooks on random states, and compare all results to the last bit.
 
-    States in which a hook raises an exception are left out. NaNs are equal.
+    States in which a hook raises an exception, or the programs ask for Python, are left out. NaNs
+    are equal. Hooks that are left to Python are called, too: they must change nothing.
 
     Args:
         env: The environment, in an episode; its FMU is not used.
         task: The programs.
 
     Raises:
-        UntraceableError: If a result differs, or the hooks raise in every state.
+        UntraceableError: If a result differs, the hooks raise in every state, or a hook that is
+            left to Python changes something.
     """
     with np.errstate(all="ignore"), borrowed(env):
         comparison = _Comparison(env, task)
+        vars(env).update(_stand_ins(task.left))
         compared = sum(map(comparison.compare, range(_COUNT)))
+    if task.left:
+        with np.errstate(all="ignore"), unchanged_globals(env), borrowed(env) as contents:
+            comparison.require_pure(contents)
     if not compared:
         raise UntraceableError("the hooks raise an exception in all states that were tried")
+
+
+def _stand_ins(left: Iterable[str]) -> dict[str, Callable[..., Any]]:
+    """What stands in for hooks that are left to Python, while the others are compared."""
+    nothing: dict[str, Callable[..., Any]] = {
+        "_get_inputs": tuple,
+        "_is_truncated": bool,
+        "_reward_policy": float,
+        "_get_observation": tuple,
+    }
+    found = {name: nothing[name] for name in left}
+    return found | ({"_goal_reward": lambda *goals: 0.0} if "_reward_policy" in found else {})
 
 
 class _Comparison:
@@ -55,7 +74,8 @@ class _Comparison:
         noise = rng.normal(size=(2 * width, _COUNT)) * scales
         self._kept, self._outputs = (now + (1 + abs(now)) * part for part in np.split(noise, 2))
         self._last_inputs = rng.normal(size=(len(env.inputs), _COUNT)) * scales
-        self._wanted = np.full_like(self._last_inputs, np.nan)
+        self._makes_inputs = "_get_inputs" not in task.left
+        self._wanted = self._last_inputs[:, ::-1].copy()
         self._inputs = self._last_inputs.copy()
         self._counts = rng.integers(0, 1000, _COUNT)
         actions = [sample_of(env.action_space, rng) for _ in range(2 * _COUNT)]
@@ -115,22 +135,47 @@ class _Comparison:
         env = self._env
         with reading(env, self._readings(index)):
             try:
-                inputs = env._input_writer.checked(env._get_inputs(), env.action)
+                inputs = self._inputs_of(index)
             except Exception as error:  # hooks may raise anything
                 if is_of_signal_handler(error):
                     raise
                 return False
+            if _leaves_to_python(self._wanted[:, index], np.array(inputs)):
+                return False
             _require("_get_inputs", self._wanted[:, index], np.array(inputs))
             self._place_after(index, inputs)
             try:
-                observed = None if self._task.seen else ()
+                observed = None if self._task.seen else ()  # the pool's, or that of a hook left
                 result = conclude(env, env._form, False, False, observed)
             except Exception as error:  # as above
                 if is_of_signal_handler(error):
                     raise
                 return False
+            if _leaves_to_python(self._judged[-1][index], np.asarray(result[1])):
+                return False
             self._compare_results(index, result)
         return True
+
+    def _inputs_of(self, index: int) -> tuple[float, ...]:
+        if not self._makes_inputs:
+            return tuple(self._wanted[:, index].tolist())
+        return self._env._input_writer.checked(self._env._get_inputs(), self._env.action)
+
+    def require_pure(self, contents: Contents) -> None:
+        """Call the hooks that are left to Python in some states, and look for what they change.
+
+        Raises:
+            UntraceableError: If they change an attribute or an episode variable.
+        """
+        for index in range(0, _COUNT, _COUNT // 8):
+            with reading(self._env, self._readings(index)):
+                before = dict(self._env.variables)
+                for name in self._task.left:
+                    if name != "_get_inputs":
+                        self._place_after(index, tuple(self._inputs[:, index].tolist()))
+                    _call(self._env, name)
+                    changed = {n for n, v in self._env.variables.items() if v is not before[n]}
+                    _require_nothing_changed(name, min(changed, default=contents.changed()))
 
     def _readings(self, index: int) -> Readings:
         env = self._env
@@ -191,6 +236,11 @@ class _Comparison:
             _require("_update", self._after[name][:, index], np.asarray(value).reshape(-1))
 
 
+def _leaves_to_python(values: Any, expected: Any) -> bool:
+    """Whether a NaN asks Python to judge a step, where that finds a number."""
+    return bool(np.any((values != values) & (expected == expected)))
+
+
 def _require(hook: str, value: Any, expected: Any) -> None:
     if value.dtype == expected.dtype and value.shape == expected.shape:
         numbers = value == value
@@ -199,3 +249,17 @@ def _require(hook: str, value: Any, expected: Any) -> None:
         if same and bits:
             return
     raise UntraceableError(f"the program gives other values than {hook}")
+
+
+def _call(env: FMUEnv, hook: str) -> None:
+    """Call a hook in a random state, in which it may fail."""
+    try:
+        getattr(env, hook)()
+    except Exception as error:  # hooks may raise anything
+        if is_of_signal_handler(error):
+            raise
+
+
+def _require_nothing_changed(hook: str, changed: str | None) -> None:
+    if changed is not None:
+        raise UntraceableError(f"{hook} changes {changed!r}, and only some hooks are compiled")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+import weakref
+from collections.abc import Callable, Mapping
+from functools import partial
 from inspect import getattr_static
 from math import prod
 from typing import Any
@@ -16,6 +18,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.signals import is_of_signal_handler
 from fmugym.single.compare import require_equal
+from fmugym.single.left import HooksLeft, require_few
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
 from fmugym.task.readings import LATE, LateReading, make_late
 from fmugym.task.waiting import STEPS_BEFORE
@@ -35,6 +38,9 @@ class Player:
 
     Args:
         required: Whether hooks that cannot be compiled are an error.
+
+    Attributes:
+        may_have_moved: Whether an exception out of a step ends the episode: not before the FMU.
     """
 
     def __init__(self, required: bool) -> None:
@@ -46,6 +52,8 @@ class Player:
         self._task: SingleTask | None = None
         self._variables: Any = None
         self._ended_by_task = False
+        self._told: set[str] = set()
+        self.may_have_moved = True
 
     def ready(self, env: FMUEnv, action: Any) -> Any:
         """Make the function that steps the environment, if its hooks are compiled or can be.
@@ -68,7 +76,7 @@ class Player:
         if self._task is None or not self._take_over(env, self._task):
             return None
         env._width = len(attributes)
-        return self._calls.step
+        return self._step
 
     def doubt(self, env: FMUEnv) -> None:
         """Leave a step to Python; before the next one, look for attributes that have changed."""
@@ -89,11 +97,11 @@ class Player:
         try:
             _require_late(env)
             task = trace_single(env, action)
+            require_few(task.left)
             require_equal(env, task)
             self._prepare(env, task)
             make_late(FMUEnv)
-            self._task, self._required = task, False
-            self._known = len(vars(env))
+            self._task, self._known = task, len(vars(env))
         except Exception as reason:  # hooks may raise anything
             if is_of_signal_handler(reason):
                 raise
@@ -102,6 +110,20 @@ class Player:
             if self._required:
                 raise ConfigError(text) from None
             logger.info("%s. They run in Python, which is slower", text)
+        else:
+            self._tell_of_left(env, task)
+            self._required = False
+
+    def _tell_of_left(self, env: FMUEnv, task: SingleTask) -> None:
+        """Tell once of each hook that stays in Python."""
+        for name, why in task.left.items():
+            text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
+            if self._required:
+                env._player = None
+                raise ConfigError(text)
+            if name not in self._told:
+                logger.info("%s. It runs in Python, the others are compiled", text)
+        self._told |= task.left.keys()
 
     def _prepare(self, env: FMUEnv, task: SingleTask) -> None:
         """Make the arrays that the programs use, and hand everything to the pool."""
@@ -141,6 +163,42 @@ class Player:
             observed=env._pool_observes,
             watched=tuple(tuple(one) for one in task.watched if not one.is_method),
         )
+        self._readers = self._make_readers(env)
+        self._step, self.may_have_moved = self._calls.step, True
+        if task.left:
+            late = {"variables": self._present_variables} if self._reads_variables else {}
+            self._left = HooksLeft(env, task.left, self._readers | late)
+            self._step = partial(self._step_with_left, weakref.ref(env))
+
+    def _step_with_left(
+        self, ref: Callable[[], Any], action: Any, attributes: dict[str, Any], width: int
+    ) -> Any:
+        """Step as the pool does, but call some hooks in Python."""
+        env, left = ref(), self._left
+        if left.makes_inputs and not self._makes_inputs(env, action):
+            return None
+        result = self._calls.step(action, attributes, width)
+        if not result:
+            return result
+        if env._play is None:
+            self.forget(env)
+        self._ended_by_task = result[2]
+        return left.complete(env, result)
+
+    def _makes_inputs(self, env: FMUEnv, action: Any) -> bool:
+        """Let ``_get_inputs`` make the inputs; if it fails, Python does the step."""
+        if not _is_plain(env, action):
+            return False
+        self.may_have_moved = False
+        try:
+            self._wanted[:] = self._left.inputs(env, action)
+        except Exception as error:  # hooks may raise anything
+            if is_of_signal_handler(error):
+                raise
+            self.may_have_moved = True
+            return False
+        self.may_have_moved = True
+        return True
 
     def _actions_of(self, env: FMUEnv, task: SingleTask) -> dict[str, Any]:
         space: Any = env.action_space
@@ -210,7 +268,7 @@ class Player:
             del attributes[name]
         if self._reads_variables:
             self._variables = attributes.pop("variables")
-        env._play, env._width = self._calls.step, len(attributes)
+        env._play, env._width = self._step, len(attributes)
 
     def note_end(self, terminated: bool) -> None:
         """Note what ``_is_done`` returned in the last step of an episode."""
@@ -223,35 +281,37 @@ class Player:
         Only ``_get_info`` does not write them.
         """
         if name != "variables":
-            return self._reading(env, name)
-        if env._tells and self._task is not None:
-            self._variables.update(self._updated(self._task, self._now))
-            return self._variables
+            return self._readers[name]()
+        if env._tells:
+            return self._present_variables()
         self.give_back(env)
         return vars(env)[name]
 
-    def _reading(self, env: FMUEnv, name: str) -> Any:
-        match name:
-            case "_values":
-                return tuple(env._output_row.tolist())
-            case "state":
-                return tuple(env._output_row.tolist())[: env._output_count]
-            case "previous_state":
-                return tuple(self._kept.tolist())[: env._output_count]
-            case "inputs":
-                return tuple(env._input_row.tolist())
-            case "action":
-                return self._calls.actions()[0]
-            case "previous_action":
-                return self._calls.actions()[1]
-            case "step_count":
-                return self._count.item()
-        return self._ended_by_task
+    def _make_readers(self, env: FMUEnv) -> dict[str, Callable[[], Any]]:
+        """The functions that make the attributes which the environment does not have now."""
+        outputs, inputs, count = env._output_row, env._input_row, env._output_count
+        kept = self._kept
+        return {
+            "_values": lambda: tuple(outputs.tolist()),
+            "state": lambda: tuple(outputs.tolist()[:count]),
+            "previous_state": lambda: tuple(kept.tolist()[:count]),
+            "inputs": lambda: tuple(inputs.tolist()),
+            "action": lambda: self._calls.actions()[0],
+            "previous_action": lambda: self._calls.actions()[1],
+            "step_count": self._count.item,
+            "done": lambda: self._ended_by_task,
+        }
+
+    def _present_variables(self) -> Any:
+        """The episode variables with their present values; writing to them has no effect."""
+        if self._task is not None:
+            dict.update(self._variables, self._updated(self._task, self._now))
+        return self._variables
 
     def give_back(self, env: FMUEnv) -> None:
         """Let the environment keep all readings again; those that were set meanwhile stay."""
         attributes = vars(env)
-        readings = {name: self._reading(env, name) for name in LATE if name not in attributes}
+        readings = {name: self._readers[name]() for name in LATE if name not in attributes}
         self.give_variables(env, self._now)
         attributes.update(readings)
 
@@ -278,15 +338,16 @@ class Player:
         """Set what hooks read to what it is when the FMU has stepped, and nothing was judged."""
         values = tuple(self._kept.tolist())
         state = values[: env._output_count]
-        readings = {name: self._reading(env, name) for name in LATE}
+        readings = {name: self._readers[name]() for name in LATE}
         self.give_variables(env, self._before)
         vars(env).update(readings, _values=values, state=state, previous_state=state, done=False)
 
 
 def _value_of(kind: Kind, row: npt.NDArray[Any]) -> Any:
-    if kind.shape is not None:
-        return row.reshape(kind.shape).copy()
-    return row.item() if kind.python else row[0, 0]
+    _, python, shape = kind
+    if shape is not None:
+        return row.reshape(shape).copy()
+    return row.item() if python else row[0, 0]
 
 
 def _is_plain(env: FMUEnv, action: Any) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dis
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from inspect import getattr_static
-from types import BuiltinFunctionType, FunctionType, MappingProxyType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, MappingProxyType, ModuleType
 from typing import Any, Final
 
 import gymnasium
@@ -18,7 +19,7 @@ from fmugym.vector.contents import differs
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.tables import is_foreign, names_in, places_of, unwrapped
 
-__all__ = ["is_ours", "is_plain", "unchanged_globals"]
+__all__ = ["is_ours", "is_plain", "names_of", "unchanged_globals"]
 
 _LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range, np.generic)
 
@@ -99,9 +100,37 @@ def _restore(value: Any, copy: Any) -> None:
         value.update(copy)
 
 
-def _reached(env: FMUEnv) -> list[FunctionType]:
+def names_of(env: FMUEnv, hooks: Iterable[str]) -> set[str]:
+    """The names of the attributes and globals to which hooks refer.
+
+    Raises:
+        UntraceableError: If they assign an attribute or a global variable. A program that runs
+            before them would not know the new value.
+    """
+    names: set[str] = set()
+    for function in _reached(env, hooks):
+        names.update(names_in(function.__code__))
+        _require_no_assignment(function, function.__code__)
+    return names
+
+
+def _require_no_assignment(function: FunctionType, code: CodeType) -> None:
+    for one in dis.get_instructions(code):
+        if one.opname in _ASSIGNMENTS:
+            raise UntraceableError(f"{function.__name__} assigns {one.argval}, and is not compiled")
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            _require_no_assignment(function, constant)
+
+
+_ASSIGNMENTS: Final = frozenset({"STORE_ATTR", "DELETE_ATTR", "STORE_GLOBAL", "DELETE_GLOBAL"})
+
+
+def _reached(
+    env: FMUEnv, hooks: Iterable[str] = (*ORDER[:-1], "_goal_reward")
+) -> list[FunctionType]:
     """The functions of hooks, and those that they call by name or by an attribute."""
-    waiting = [getattr_static(env, name, None) for name in (*ORDER[:-1], "_goal_reward")]
+    waiting = [getattr_static(env, name, None) for name in hooks]
     found: dict[int, FunctionType] = {}
     while waiting:
         function = unwrapped(waiting.pop())
@@ -110,8 +139,10 @@ def _reached(env: FMUEnv) -> list[FunctionType]:
             continue
         found[id(function)] = function
         waiting += [place[name] for place, name in places_of(function)]
-        names = (name for name in names_in(function.__code__) if not name.startswith("__"))
+        names = [name for name in names_in(function.__code__) if not name.startswith("__")]
         waiting += [getattr_static(env, name, None) for name in names]
+        if "super" in names:
+            waiting += [vars(cls).get(name) for cls in type(env).__mro__ for name in names]
     return list(found.values())
 
 

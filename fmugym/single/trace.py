@@ -89,6 +89,8 @@ class SingleTask:
         action_type: The class of the actions.
         watched: The attributes that hooks read.
         inherited: The names that hooks read, and that the environment does not have itself.
+        left: The hooks that cannot be traced, and why. They run in Python; no other hook needs
+            what they return.
     """
 
     inputs: Program
@@ -100,6 +102,7 @@ class SingleTask:
     action_type: type
     watched: tuple[Watched, ...]
     inherited: frozenset[str]
+    left: Mapping[str, str]
 
     def loads(self, kind: str) -> bool:
         """Whether one of the programs loads values of this kind."""
@@ -120,7 +123,9 @@ def trace_single(env: FMUEnv, action: Any) -> SingleTask:
         action: An action, for its type.
 
     Raises:
-        UntraceableError: If a hook does what a program cannot do, or reads what cannot be watched.
+        UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
+            program cannot do, or if a hook may do more than compute or reads what cannot be
+            watched.
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
@@ -133,7 +138,7 @@ def trace_single(env: FMUEnv, action: Any) -> SingleTask:
         reading(env, Readings.of(env)),
         noting_reads(env) as names,
     ):
-        parts = _Tracer(env, action).parts()
+        parts = _Tracer(env, action, names).parts()
     watched = watched_in(attributes, names)
     inherited = frozenset(name for name in names if name not in attributes)
     return SingleTask(**parts, watched=watched, inherited=inherited)
@@ -145,10 +150,13 @@ class _Tracer:
     Args:
         env: The environment, in an episode.
         action: An action, for its type.
+        read: The names of the attributes that were read up to now; those that only hooks read
+            that cannot be traced are taken out.
     """
 
-    def __init__(self, env: FMUEnv, action: Any) -> None:
-        self._env, self._action = env, action
+    def __init__(self, env: FMUEnv, action: Any, read: set[str]) -> None:
+        self._env, self._action, self._read = env, action, read
+        self._left: dict[str, str] = {}
         self._parameters = dict(env.parameters)
         self._graph = ScalarGraph()
         self._tables = dict(tables_of(env))
@@ -160,11 +168,11 @@ class _Tracer:
             self._variables[name] = kind
 
     def parts(self) -> dict[str, Any]:
-        """Trace all hooks, again if ``_update`` gives variables other types."""
-        for _ in range(3):
-            before = dict(self._variables)
+        """Trace all hooks, again if ``_update`` gives variables other types, or one is left out."""
+        for _ in range(7):
+            before = dict(self._variables), dict(self._left)
             parts = self._traced()
-            if self._variables == before:
+            if (self._variables, self._left) == before:
                 return parts
         raise UntraceableError("_update gives a variable another type in each step")
 
@@ -176,8 +184,9 @@ class _Tracer:
         self._env.done = Scalar(_single(self._graph, done, np.bool_), bool)
         truncated = self._constant(False, np.bool_)
         if self._env._own.is_truncated:
-            truncated = self._call("_is_truncated", self._flag)
-        reward = self._call("_reward_policy", self._number)
+            truncated = self._or_left("_is_truncated", self._flag, truncated)
+        no_reward = self._constant(0.0, np.float64)
+        reward = self._or_left("_reward_policy", self._number, no_reward)
         seen, keys, more = self._trace_seen()
         results = [cell.node for cell in (done, truncated, self._guarded(reward))]
         return {
@@ -188,6 +197,7 @@ class _Tracer:
             "variables": dict(self._variables),
             "updated": updated,
             "action_type": type(self._action),
+            "left": dict(self._left),
         }
 
     def _begin(self, judging: bool) -> None:
@@ -207,6 +217,21 @@ class _Tracer:
                 raise UntraceableError("it multiplies arrays, and the library's sums differ")
             return cells
 
+    def _or_left(self, name: str, of: Callable[[Any], Any], nothing: Any) -> Any:
+        """Trace a hook. If that fails, leave it to Python; something else takes its place.
+
+        What it has read need not be watched, but the hook itself must not be replaced.
+        """
+        if name in self._left:
+            return nothing
+        before = set(self._read)
+        try:
+            return self._call(name, of)
+        except UntraceableError as reason:
+            self._left[name] = str(reason)
+            self._read.intersection_update(before | {name})
+            return nothing
+
     def _constant(self, value: Any, dtype: npt.DTypeLike) -> Cell:
         return self._graph.constant(value, np.dtype(dtype))
 
@@ -221,7 +246,8 @@ class _Tracer:
 
     def _trace_inputs(self) -> Program:
         self._begin(judging=False)
-        cells = [self._guarded(cell) for cell in self._call("_get_inputs", self._input_cells)]
+        found = self._or_left("_get_inputs", self._input_cells, [])
+        cells = [self._guarded(cell) for cell in found]
         stores = [Store(cell.node, ("wanted", index)) for index, cell in enumerate(cells)]
         return compile_graph(self._graph, stores, [], 0)
 
@@ -284,7 +310,7 @@ class _Tracer:
         if self._env._pool_observes:
             return [], None, []
         found: tuple[list[SeenArray], tuple[str, ...] | None, list[Store]]
-        found = self._call("_get_observation", self._see)
+        found = self._or_left("_get_observation", self._see, ([], None, []))
         return found
 
     def _see(self, value: Any) -> tuple[list[SeenArray], tuple[str, ...] | None, list[Store]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -74,6 +75,18 @@ class SystemDescription(ModelDescription):
     def components(self) -> tuple[ModelDescription, ...]:
         """See ``ModelDescription.components``."""
         return self.parts
+
+    @cached_property
+    def clocks(self) -> tuple[Variable, ...]:
+        """The clocks of all components: outputs tell whether one ticked, and some inputs let it."""
+        ticking = (v for v in self.variables.values() if v.ticking)
+        ends = ((v, self.ends[v.value_reference][0]) for v in ticking)
+        return tuple(v for v, end in ends if end.variable in self.parts[end.part].clocks)
+
+    @property
+    def clocked_inputs(self) -> tuple[Variable, ...]:
+        """None: each component lets its own inputs wait for their clocks."""
+        return ()
 
     def resized(self, sizes: Mapping[str, int]) -> ModelDescription:
         """Refuse sizes: the connections of the system fit the arrays as they are.
@@ -266,10 +279,10 @@ def _number_of(plan: SystemPlan, component: str) -> int:
 def _usable(
     part: ModelDescription, starts: Sequence[tuple[str, float | str]]
 ) -> Iterator[Variable]:
-    """Binary values, arrays of Strings and clocks cannot be variables of a system."""
+    """Binary values, arrays of Strings and arrays of clocks cannot be variables of a system."""
     values = dict(starts)
     for variable in part.variables.values():
-        is_number = variable.is_number and not variable.ticking
+        is_number = variable.is_number and not (variable.ticking and variable.shape)
         is_text = variable.kind == "string" and variable.is_scalar
         if (is_number and _is_good_array(variable)) or is_text:
             yield _started(variable, values)

@@ -139,8 +139,9 @@ class Wiring:
         for element in target.elements:
             other = self._driven.setdefault(element.name, connection)
             if other is not connection:
-                sources = f"{other.source}, {connection.source}"
-                raise ConfigError(f"{element.name} has two sources: {sources}")
+                raise ConfigError(
+                    f"{element.name} has two sources: {other.source}, {connection.source}"
+                )
         is_parameter = variable.causality == "parameter" and variable.settable_at_start
         if variable.causality != "input" and not (from_system and is_parameter):
             raise ConfigError(
@@ -216,7 +217,8 @@ class Wiring:
         """The inputs of components that nothing drives; they are inputs of the system."""
         for component in self.components.values():
             for variable in component.fmu.description.variables.values():
-                if variable.causality == "input":
+                ticks_itself = variable.ticking and not variable.settable_in_step
+                if variable.causality == "input" and not ticks_itself:
                     yield from self._open_parts(Port(component, variable))
 
     def _open_parts(self, port: Port) -> Iterator[Port]:

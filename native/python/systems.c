@@ -199,6 +199,19 @@ static void count_slots(System *s) {
     }
 }
 
+static bool find_clocks(System *s) {
+    s->clocks = calloc(s->inputs + 1, sizeof *s->clocks);
+    for (size_t i = 0; s->clocks != NULL && i < s->count; i++) {
+        const Component *part = &s->parts[i];
+        for (size_t j = 0; j < part->inputs.count; j++) {
+            if (part->inputs.types[j] == TYPE_CLOCK) {
+                s->clocks[s->number_of_clocks++] = (uint32_t)(part->first_input + j);
+            }
+        }
+    }
+    return s->clocks != NULL || PyErr_NoMemory() != NULL;
+}
+
 static bool take_parts(PyObject *tuple, System *s) {
     s->parts = array_for(tuple, sizeof *s->parts, &s->count);
     for (size_t i = 0; s->parts != NULL && i < s->count; i++) {
@@ -206,10 +219,11 @@ static bool take_parts(PyObject *tuple, System *s) {
             return false;
         }
     }
-    if (s->parts != NULL) {
-        count_slots(s);
+    if (s->parts == NULL) {
+        return false;
     }
-    return s->parts != NULL;
+    count_slots(s);
+    return find_clocks(s);
 }
 
 /* Routes and ends */
@@ -499,6 +513,7 @@ void drop_system(System *s) {
     }
     if (s != NULL) {
         free(s->parts);
+        free(s->clocks);
         free(s->routes);
         free(s->ends);
         free(s->groups);

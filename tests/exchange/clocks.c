@@ -2,7 +2,9 @@
    mode. It breaks off if a call comes in the wrong mode, if a step passes a tick or an alarm, and if
    a clocked input is set while its clock does not tick.
 
-   x' = 1 from x = 0. An alarm at each whole number plus 0.3 starts the countdown. */
+   x' = 1 from x = 0. An alarm at each whole number plus 0.3 starts the countdown.
+
+   With FRACTIONS, its intervals are fractions, and it has no functions for decimals. */
 
 #include <math.h>
 #include <stdbool.h>
@@ -16,14 +18,14 @@ enum { INSTANTIATED, INITIALIZING, EVENT, CONTINUOUS };
 
 /* Value references: clocks, their counts, the times of their last ticks, and others. */
 enum { CONSTANT, FIXED, CALCULATED, TUNABLE, CHANGING, COUNTDOWN, STRIKE, BELL, CLOCKS };
-enum { COUNT = 10, LAST = 20, X = 30, DER_X, PERIOD, PACE, COMMAND, SAMPLE, PLAIN, EAGER, ALARM };
+enum { COUNT = 10, LAST = 20, X = 30, DER_X, PERIOD, PACE, COMMAND, SAMPLE, PLAIN, EAGER, ALARM, BAD };
 enum { COMMANDS = 40, SAMPLES, PLAINS, END_OF_ARRAYS, SIZE = 2 }; /* arrays */
 
 typedef struct {
     int mode;
     bool exchange, active[CLOCKS], counts_down;
     double time, x, next_alarm, countdown;
-    double fixed_interval, period, pace, command, sample, plain, eager, alarms;
+    double fixed_interval, period, pace, command, sample, plain, eager, alarms, bad_counter;
     double count[CLOCKS], last[CLOCKS], commands[SIZE], samples[SIZE], plains[SIZE];
 } Model;
 
@@ -121,6 +123,65 @@ int fmi3EnterContinuousTimeMode(Model *me) {
 
 /* Clocks */
 
+#ifdef FRACTIONS
+
+static const double OF_CONSTANT = 1.0 / 3;
+
+int fmi3GetIntervalFraction(Model *me, const unsigned *references, size_t count,
+                            uint64_t *counters, uint64_t *resolutions, int *qualifiers) {
+    REQUIRE(me->mode == INITIALIZING || me->mode == EVENT);
+    REQUIRE(count == 1 && references[0] >= CALCULATED && references[0] <= COUNTDOWN);
+    qualifiers[0] = 2;
+    if (references[0] == CALCULATED) {
+        counters[0] = me->bad_counter > 0.0 ? (uint64_t)me->bad_counter : 1;
+        resolutions[0] = me->bad_counter > 0.0 ? 0 : 3;
+    } else if (references[0] == TUNABLE) {
+        counters[0] = 1;
+        resolutions[0] = fmod(me->count[TUNABLE], 2.0) == 0.0 ? 3 : 4;
+    } else if (references[0] == CHANGING) {
+        counters[0] = 1 + (uint64_t)me->count[CHANGING];
+        resolutions[0] = 30;
+    } else {
+        counters[0] = 250;
+        resolutions[0] = 1000;
+        qualifiers[0] = me->countdown > 0.0 ? 2 : me->counts_down;
+        me->countdown = 0.0;
+    }
+    return OK;
+}
+
+int fmi3GetShiftFraction(Model *me, const unsigned *references, size_t count, uint64_t *counters,
+                         uint64_t *resolutions) {
+    REQUIRE(me->mode == INITIALIZING && count == 1 && references[0] == CALCULATED);
+    counters[0] = 1;
+    resolutions[0] = 7;
+    return OK;
+}
+
+int fmi3SetIntervalFraction(Model *me, const unsigned *references, size_t count,
+                            const uint64_t *counters, const uint64_t *resolutions) {
+    REQUIRE(me->mode == INITIALIZING && count == 1 && references[0] == FIXED);
+    REQUIRE(counters[0] == 1 && resolutions[0] == 7);
+    me->fixed_interval = 1.0 / 7;
+    return OK;
+}
+
+int fmi3GetIntervalDecimal(Model *me) {
+    return ERROR;
+}
+
+int fmi3GetShiftDecimal(Model *me) {
+    return ERROR;
+}
+
+int fmi3SetIntervalDecimal(Model *me) {
+    return ERROR;
+}
+
+#else
+
+static const double OF_CONSTANT = 0.1;
+
 static double interval_of(const Model *me, unsigned clock) {
     return clock == CALCULATED ? me->period
            : clock == TUNABLE  ? me->pace
@@ -156,6 +217,20 @@ int fmi3SetIntervalDecimal(Model *me, const unsigned *references, size_t count,
     me->fixed_interval = intervals[0];
     return OK;
 }
+
+int fmi3GetIntervalFraction(Model *me) {
+    return ERROR;
+}
+
+int fmi3GetShiftFraction(Model *me) {
+    return ERROR;
+}
+
+int fmi3SetIntervalFraction(Model *me) {
+    return ERROR;
+}
+
+#endif
 
 int fmi3SetClock(Model *me, const unsigned *references, size_t count, const bool *values) {
     REQUIRE(me->mode == EVENT);
@@ -215,6 +290,7 @@ static double *place_of(Model *me, unsigned reference) {
     case PLAIN: return &me->plain;
     case EAGER: return &me->eager;
     case ALARM: return &me->alarms;
+    case BAD: return &me->bad_counter;
     case COMMANDS: return me->commands;
     case SAMPLES: return me->samples;
     case PLAINS: return me->plains;
@@ -269,7 +345,7 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     const double until = time + step;
 
     REQUIRE(me->mode == CONTINUOUS && fabs(time - me->time) < 1e-9 && step > 0.0);
-    REQUIRE(me->last[CONSTANT] < 0.0 || until < me->last[CONSTANT] + 0.1 + 1e-9);
+    REQUIRE(me->last[CONSTANT] < 0.0 || until < me->last[CONSTANT] + OF_CONSTANT + 1e-9);
     me->time = me->eager > 0.0 ? fmin(until, time + me->eager) : until;
     *event = me->time >= me->next_alarm;
     me->time = *event ? me->next_alarm : me->time;

@@ -1,0 +1,432 @@
+"""A single environment in which some hooks are compiled and the others stay in Python."""
+
+import logging
+import math
+import signal
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from test_single_compiled import require_readings, same
+from vector_tools import Drawing
+
+import fmugym
+from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.pool import has_native_pool
+from fmugym.single.player import Player
+
+pytestmark = pytest.mark.skipif(
+    not has_native_pool(), reason="hooks are compiled for the native pool"
+)
+
+
+class Task(Drawing):
+    """All hooks can be compiled; those that read the most are replaced in turn."""
+
+    def __init__(self):
+        super().__init__(
+            episode_variables={"target": Uniform(-1.0, 1.0), "sum": 0.0, "last": np.zeros(2)},
+            max_episode_steps=9,
+            monitor_names=["theta_ddot"],
+        )
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (4,), np.float32)
+
+    def _get_inputs(self):
+        return 0.5 * self.action[0] + 0.1 * self.previous_action[0]
+
+    def _update(self):
+        self.variables["sum"] += self.variables["target"] - self.state[0]
+        self.variables["last"] = np.array([self.state[0], self.variables["last"][0]])
+
+    def _is_done(self):
+        return abs(self.variables["sum"]) > 6.0
+
+    def _is_truncated(self):
+        return self.state[1] > 0.9
+
+    def _reward_policy(self):
+        return -abs(self.variables["target"] - self.out["q"]) - self.inputs[0] ** 2
+
+    def _get_observation(self):
+        rows = [*self.state, self.variables["sum"], self.variables["last"][1]]
+        return np.array(rows, np.float32)
+
+
+class Inputs(Task):
+    def _get_inputs(self):
+        push = float(self.action[0]) + 0.1 * float(self.previous_action[0])
+        if self.state[0] > self.previous_state[0] or self.step_count > 5:
+            push = -push
+        return push if self.variables["sum"] > 0 else 0.5 * push
+
+
+class Truncated(Task):
+    def _is_truncated(self):
+        if self.done:
+            return False
+        return bool(self.time > 0.1 and self.out["theta_ddot"] > 0)
+
+
+class Reward(Task):
+    def _reward_policy(self):
+        if self.done:
+            return -10.0
+        previous = math.hypot(*self.previous_state)
+        return math.sin(self.state[0]) - previous + float(self.previous_action[0])
+
+
+class Observation(Task):
+    def _get_observation(self):
+        least = sorted([*self.state, float(self.inputs[0]), self.variables["sum"]])
+        return np.array(least, np.float32)
+
+
+class Both(Reward, Observation):
+    pass
+
+
+class Flags(Truncated, Observation):
+    pass
+
+
+class Everything(Inputs, Truncated, Reward, Observation):
+    """With so many hooks in Python, compiling the others would save no time."""
+
+
+class Goal(Task):
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        return gym.spaces.Dict(dict.fromkeys(["observation", "achieved_goal", "desired_goal"], box))
+
+    def _get_observation(self):
+        names = {"observation": self.state[1], "achieved_goal": self.state[0]}
+        names["desired_goal"] = self.variables["target"]
+        return {name: np.array([value], np.float32) for name, value in names.items()}
+
+    _reward_policy = fmugym.FMUEnv._reward_policy
+
+    def _goal_reward(self, achieved_goal, desired_goal):
+        distance = abs(float(achieved_goal[0]) - float(desired_goal[0]))
+        return 1.0 if distance < 0.2 else -distance
+
+
+class GoalSeen(Goal):
+    def _get_observation(self):
+        seen = super()._get_observation()
+        return seen if self.state[0] > 0 else {name: 2 * part for name, part in seen.items()}
+
+
+class WithInfo(Observation):
+    def _get_info(self):
+        return {"sum": self.variables["sum"], "seen": self.state[0]}
+
+
+LEFT = {
+    Inputs: {"_get_inputs"},
+    Truncated: {"_is_truncated"},
+    Reward: {"_reward_policy"},
+    Observation: {"_get_observation"},
+    Both: {"_reward_policy", "_get_observation"},
+    Flags: {"_is_truncated", "_get_observation"},
+    Goal: {"_reward_policy"},
+    GoalSeen: {"_reward_policy", "_get_observation"},
+    WithInfo: {"_get_observation"},
+}
+
+
+def at_once(env):
+    """Compile what can be compiled in the first step."""
+    env.reset(seed=5)
+    env._player = Player(required=False)
+    return env
+
+
+def pair(cls):
+    one, other = at_once(cls()), cls()
+    other._way = "python"
+    other.reset(seed=5)
+    return one, other
+
+
+@pytest.mark.parametrize("cls", LEFT)
+def test_it_equals_python(cls):
+    one, other = pair(cls)
+    ends = compiled = 0
+    one.action_space.seed(1)
+    for index in range(120):
+        action = one.action_space.sample()
+        first, second = one.step(action), other.step(action)
+        assert same(first, second), (index, first, second)
+        compiled += one._play is not None
+        if index % 4 == 0:
+            require_readings(one, other)
+        if first[2] or first[3]:
+            ends += 1
+            require_readings(one, other)
+            assert same(one.reset(), other.reset())
+    assert set(one._player._task.left) == LEFT[cls]
+    assert ends > 5
+    assert compiled > 80
+    one.close()
+    other.close()
+
+
+@pytest.mark.parametrize("cls", [Inputs, Truncated, Reward, Observation, Both, Flags, GoalSeen])
+def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
+    env = at_once(cls())
+    env.step(env.action_space.sample())
+    assert env._play is not None
+    calls = []
+    for name in LEFT[cls]:
+        hook = getattr(cls, name)
+
+        def counted(self, hook=hook, name=name):
+            calls.append(name)
+            return hook(self)
+
+        monkeypatch.setattr(cls, name, counted)
+    env.step(env.action_space.sample())
+    assert env._play is not None
+    order = ["_get_inputs", "_is_truncated", "_reward_policy", "_get_observation"]
+    expected = [name for name in order if name in LEFT[cls]]
+    if cls is GoalSeen:
+        expected = ["_get_observation"]  # ``_goal_reward`` gets the same one
+    assert calls == expected
+    env.close()
+
+
+class TestFaults:
+    @pytest.mark.parametrize("value", [math.nan, math.inf])
+    @pytest.mark.parametrize("cls", [Reward, Observation])
+    def test_numbers_that_are_not_finite(self, cls, value):
+        class Bad(cls):
+            def _reward_policy(self):
+                reward = super()._reward_policy()
+                return value if self.step_count == 4 and cls is Reward else reward
+
+            def _get_observation(self):
+                seen = super()._get_observation()
+                has_moved = self.state != self.previous_state  # not after the fault
+                if self.step_count == 4 and has_moved and cls is Observation:
+                    seen = seen * np.float32(value)
+                return seen
+
+        one, other = pair(Bad)
+        for _ in range(4):
+            first, second = one.step(np.float32([0.004])), other.step(np.float32([0.004]))
+            assert same(first, second)
+        assert "fault" in first[4]
+        require_readings(one, other)
+        assert same(one.reset(), other.reset())
+        assert same(one.step(np.float32([0.004])), other.step(np.float32([0.004])))
+        one.close()
+        other.close()
+
+    @pytest.mark.parametrize("cls", [Truncated, Reward, Observation])
+    def test_exceptions_end_the_episode(self, cls):
+        (hook,) = LEFT[cls]
+
+        def failing(self):
+            if self.step_count == 3:
+                raise ZeroDivisionError("three")
+            return getattr(cls, hook)(self)
+
+        one, other = pair(type("Failing", (cls,), {hook: failing}))
+        for env in (one, other):
+            env.step(np.float32([0.004]))
+            env.step(np.float32([0.004]))
+            with pytest.raises(ZeroDivisionError, match="three"):
+                env.step(np.float32([0.004]))
+        require_readings(one, other)
+        for env in (one, other):
+            with pytest.raises(SimulationError, match="reset"):
+                env.step(np.float32([0.004]))
+        assert same(one.reset(), other.reset())
+        one.close()
+        other.close()
+
+    def test_exceptions_before_the_fmu_steps_change_nothing(self):
+        class Picky(Inputs):
+            def _get_inputs(self):
+                if self.action[0] > 0.0095:
+                    raise ZeroDivisionError("large")
+                return super()._get_inputs()
+
+        one, other = pair(Picky)
+        for env in (one, other):
+            env.step(np.float32([0.004]))
+            with pytest.raises(ZeroDivisionError, match="large"):
+                env.step(np.float32([0.01]))
+        require_readings(one, other)
+        assert same(one.step(np.float32([0.002])), other.step(np.float32([0.002])))
+        require_readings(one, other)
+        one.close()
+        other.close()
+
+    def test_what_a_signal_handler_raises_in_get_inputs_comes_out_once(self):
+        alarms = []
+
+        class Slow(Inputs):
+            def _get_inputs(self):
+                if self.action[0] > 0.0095 and not alarms:
+                    signal.raise_signal(signal.SIGALRM)
+                return super()._get_inputs()
+
+        def ring(*_):
+            alarms.append(True)
+            raise TimeoutError("too late")
+
+        one, other = pair(Slow)
+        before = signal.signal(signal.SIGALRM, ring)
+        try:
+            for env in (one, other):
+                alarms.clear()
+                env.step(np.float32([0.004]))
+                with pytest.raises(TimeoutError):
+                    env.step(np.float32([0.01]))
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        require_readings(one, other)
+        assert same(one.step(np.float32([0.002])), other.step(np.float32([0.002])))
+        one.close()
+        other.close()
+
+    @pytest.mark.parametrize(
+        ("hook", "value"),
+        [
+            ("_is_truncated", None),
+            ("_is_truncated", 0.5),
+            ("_reward_policy", None),
+            ("_get_observation", None),
+            ("_get_observation", np.zeros(3)),
+            ("_get_inputs", (1.0, 2.0)),
+        ],
+    )
+    def test_what_cannot_be_used_is_an_error(self, hook, value):
+        cls = next(cls for cls, left in LEFT.items() if left == {hook})
+
+        def bad(self):
+            good = getattr(cls, hook)(self)
+            return value if self.step_count == (2 if hook == "_get_inputs" else 3) else good
+
+        one, other = pair(type("Bad", (cls,), {hook: bad}))
+        texts = []
+        for env in (one, other):
+            env.step(np.float32([0.004]))
+            env.step(np.float32([0.004]))
+            with pytest.raises(ConfigError, match=hook) as error:
+                env.step(np.float32([0.004]))
+            texts.append(str(error.value))
+        assert texts[0] == texts[1]
+        one.close()
+        other.close()
+
+    def test_hooks_may_not_draw(self):
+        class Drawn(Reward):
+            def _reward_policy(self):
+                if self.step_count < 3:
+                    return super()._reward_policy()
+                return float(self.np_random.uniform())
+
+        one, other = pair(Drawn)
+        for env in (one, other):
+            env.step(np.float32([0.004]))
+            env.step(np.float32([0.004]))
+            with pytest.raises(SimulationError, match="random"):
+                env.step(np.float32([0.004]))
+        one.close()
+        other.close()
+
+
+def test_each_hook_is_named_once(caplog):
+    with caplog.at_level(logging.INFO, logger="fmugym.single.player"):
+        env = at_once(Both())
+        for number in range(3):  # a new attribute makes it compile the hooks again
+            env.step(env.action_space.sample())
+            env._player._wait = 0
+            env.note = number
+            env.step(env.action_space.sample())
+    texts = [record.getMessage() for record in caplog.records]
+    assert len(texts) == 2
+    for name in LEFT[Both]:
+        assert sum(f"{name}, line" in text for text in texts) == 1
+    env.close()
+
+
+def test_compiled_is_an_error_and_names_the_hook():
+    env = Reward()
+    env._way = "compiled"
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"Reward.*_reward_policy, line"):
+        env.step(env.action_space.sample())
+    env.close()
+
+
+class Noting(Reward):
+    """Sets an attribute that a compiled hook may read."""
+
+    def _is_truncated(self):
+        self.seen = self.state[0]
+        return bool(self.seen > 0.99)
+
+
+class Filling(Observation):
+    """Returns an attribute that it fills."""
+
+    def __init__(self):
+        super().__init__()
+        self.array = np.zeros(4, np.float32)
+
+    def _get_observation(self):
+        self.array[:] = super()._get_observation()
+        return self.array.copy()
+
+
+class Writing(Truncated):
+    def _is_truncated(self):
+        if self.state[0] > -10.0:
+            self.variables["sum"] = 0.5
+        return False
+
+
+class Unsteady(Task):
+    """``_is_done``, on which others depend, cannot be compiled."""
+
+    def _is_done(self):
+        return bool(self.state[0] > 0.5 and self.state[1] > 0)
+
+
+@pytest.mark.parametrize("cls", [Noting, Filling, Writing, Unsteady, Everything])
+def test_other_hooks_keep_all_in_python(cls):
+    """Above all, hooks that change something: compiled hooks may read it."""
+    one, other = pair(cls)
+    for _ in range(30):
+        action = one.action_space.sample()
+        first, second = one.step(action), other.step(action)
+        assert same(first, second)
+        assert one._play is None
+        if first[2] or first[3]:
+            assert same(one.reset(), other.reset())
+    assert one._player is None
+    one.close()
+    other.close()
+
+
+def test_snapshots_and_attributes():
+    one, other = pair(Both)
+    actions = [one.action_space.sample() for _ in range(6)]
+    for action in actions[:3]:
+        one.step(action)
+        other.step(action)
+    saved = one.save_state(), other.save_state()
+    ahead = [[env.step(action) for action in actions[3:]] for env in (one, other)]
+    assert same(tuple(ahead[0]), tuple(ahead[1]))
+    assert same(one.restore_state(saved[1]), other.restore_state(saved[0]))
+    require_readings(one, other)
+    again = [[env.step(action) for action in actions[3:]] for env in (one, other)]
+    assert same(tuple(again[0]), tuple(ahead[0]))
+    assert same(tuple(again[1]), tuple(ahead[0]))
+    one.close()
+    other.close()

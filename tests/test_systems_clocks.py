@@ -1,0 +1,178 @@
+"""Components with clocks in systems: they tick as they do in an FMU that runs alone."""
+
+import clocks_tools
+import numpy as np
+import pytest
+from system_tools import (
+    LOG,
+    closing_pools,  # noqa: F401  # the fixture "make"
+    in_each_engine,
+    linear,
+    linear_fmu,
+)
+
+from fmugym import FMU, Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv
+from fmugym.pool import PoolSpec
+from fmugym.pool.local import local_pool
+from fmugym.tools import cli
+
+COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
+LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
+INPUTS = ("strike", "command", "pace")
+OUTPUTS = (*COUNTS, *LASTS, "x", "sample", "bell", "countdown", "strike")
+both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+
+
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clocks")
+    names = "CoSimulation", "ModelExchange"
+    return {n: clocks_tools.clocks_fmu(folder / f"{n}.fmu", n) for n in names} | {
+        "linear": linear_fmu(folder / "linear.fmu", 3),
+        "without": clocks_tools.clocks_fmu(folder / "without.fmu", event_mode=False),
+    }
+
+
+def named(names):
+    return [f"c.{name}" for name in names]
+
+
+def run(pool, commands):
+    pool.reset((), np.zeros((0, pool.num_instances)))
+    assert not pool.statuses.any(), pool.failure(0)
+    rows = []
+    for inputs in commands:
+        outputs, statuses = pool.step(np.tile(inputs[:, None], pool.num_instances))
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs.copy())
+    return np.array(rows)
+
+
+def commands(count=30, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.column_stack(
+        [rng.integers(0, 2, count), rng.normal(size=count), rng.uniform(0.05, 0.6, count)]
+    )
+
+
+@in_each_engine
+@both_interfaces
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_a_component_does_what_the_fmu_does_alone(make, fmus, native, interface, substeps):
+    """Also with substeps: a clock that is set ticks once in a step of the environment."""
+    fmu = FMU(fmus[interface], probe_timeout=None)
+    variables = [tuple(map(fmu.variable, names)) for names in (INPUTS, OUTPUTS)]
+    alone = local_pool(fmu, PoolSpec(*variables, 0.17, substeps=substeps), 2, LOG, native=native)
+    system = FMUSystem({"c": fmus[interface]})
+    lists = named(INPUTS), named(OUTPUTS)
+    pool = make(system, *lists, native, 2, 0.17, substeps=substeps)
+    try:
+        expected = run(alone, commands())
+        found = run(pool, commands())
+    finally:
+        alone.close()
+    assert expected[-1, 6, 0] > 5, "the clock that is set"
+    assert found.tobytes() == expected.tobytes()
+
+
+def with_follower(fmus, **options):
+    """A linear component adds what clocks do to its state, and drives an input with a clock."""
+    follower = linear("f", fmus["linear"], b=[[1, 0], [0, 1]], c=np.eye(2))
+    return FMUSystem(
+        {"c": fmus["CoSimulation"], "f": Component(follower.path, dict(follower.starts))},
+        ["c.count of constant -> f.u1", "c.sample -> f.u2", "f.y1 -> c.command"],
+        **options,
+    )
+
+
+@pytest.mark.parametrize("master", ["gauss_seidel", "jacobi"])
+def test_both_engines_compute_the_same_to_the_last_bit(make, fmus, master):
+    outputs = [*named(OUTPUTS), "f.y1", "f.y2"]
+    rows = [
+        run(
+            make(with_follower(fmus, master=master), ["c.strike"], outputs, native, 2),
+            commands()[:, :1],
+        )
+        for native in (False, True)
+    ]
+    assert rows[0].tobytes() == rows[1].tobytes()
+    ticks = np.diff(rows[0][:, 0, 0], prepend=0)
+    assert ticks.sum() == rows[0][-1, 0, 0] == 30
+    assert rows[0][-1, -1, 0] > 0
+
+
+@in_each_engine
+def test_a_restored_state_goes_on_with_the_same_ticks(make, fmus, native):
+    pool = make(with_follower(fmus), ["c.strike"], [*named(OUTPUTS), "f.y2"], native, 2)
+    pool.reset((), np.zeros((0, 2)))
+    actions = commands()[:, :1, None].repeat(2, 2)
+    for action in actions[:13]:
+        pool.step(action)
+    snapshot = pool.save()
+    first = [pool.step(action)[0].copy() for action in actions[13:]]
+    pool.restore(snapshot)
+    assert np.array_equal(first, [pool.step(action)[0].copy() for action in actions[13:]])
+
+
+class Env(FMUEnv):
+    def __init__(self, fmu, inputs="c.strike", outputs=("c.x", "c.bell", "c.strike", "f.y2")):
+        config = {
+            "model_input_names": inputs,
+            "model_output_names": outputs,
+            "time_step": 0.1,
+            "max_episode_steps": 8,
+        }
+        super().__init__(fmu, config)
+
+    def _is_done(self):
+        return False
+
+
+def test_environments_set_and_see_clocks(fmus):
+    system = with_follower(fmus)
+    envs = FMUVectorEnv(lambda: Env(system), 2)
+    single = Env(system)
+    envs.reset(seed=1)
+    single.reset(seed=1)
+    for strike in (0, 1, 1, 0):
+        rows = envs.step(np.full((2, 1), strike))[0]
+        assert np.array_equal(rows[0], single.step([strike])[0])
+        assert rows[:, 2].tolist() == [strike] * 2
+    envs.close()
+    single.close()
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        "connection", ["c.bell -> d.strike", "c.x -> d.strike", "c.bell -> told", "go -> c.strike"]
+    )
+    def test_clocks_are_not_connected(self, fmus, connection):
+        path = fmus["CoSimulation"]
+        with pytest.raises(ConfigError, match=r"[cd]\.(bell|strike) is a clock") as error:
+            FMUSystem({"c": path, "d": path}, [connection])
+        assert connection in str(error.value)
+
+    def test_clocks_that_tick_by_themselves_are_no_inputs(self, fmus):
+        system = FMUSystem({"c": fmus["CoSimulation"]})
+        names = {port.name for port in system.open_inputs}
+        assert {"c.strike", "c.plain"} <= names
+        assert "c.constant" not in names
+        with pytest.raises(ConfigError, match=r"'c\.constant'.*triggered"):
+            Env(system, "c.constant", "c.x")
+
+    def test_clocks_need_event_mode(self, fmus):
+        system = FMUSystem({"c": fmus["without"], "d": fmus["CoSimulation"]})
+        with pytest.raises(ConfigError, match=r"'c\.strike'.*event mode"):
+            Env(system, "c.strike", "c.x")
+
+    def test_clocks_have_no_start_values(self, fmus):
+        with pytest.raises(ConfigError, match=r"c\.strike"):
+            FMUSystem({"c": Component(fmus["CoSimulation"], {"strike": 1})})
+
+
+def test_new_lists_them(fmus, tmp_path):
+    file = FMUSystem({"c": fmus["CoSimulation"]}).write(tmp_path / "s.ssp")
+    assert cli.main(["new", str(file), "--output", str(tmp_path / "task.toml")]) == 0
+    text = (tmp_path / "task.toml").read_text()
+    assert '"c.strike"' in text
+    assert '"c.constant"' not in text
