@@ -55,6 +55,7 @@ SLOW_MODULES = {
     "test_systems_control",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_linearization",
     "test_systems_parts",
     "test_systems_resets",
     "test_systems_ssp",
@@ -237,9 +238,7 @@ EXHAUSTIVE_TESTS = (
 
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
-    return (
-        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
-    ) or "wine" in node_id.partition("[")[2]
+    return "::TestInWine" in node_id or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):
