@@ -18,10 +18,11 @@ from fmugym.archive.texts import with_texts
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
-from fmugym.fmi.library import Library
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
+from fmugym.fmi.system import open_library
 from fmugym.pool.spec import PoolSpec
+from fmugym.systems.description import SystemDescription
 from fmugym.task.interface import checked_value, start_variable
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
@@ -69,14 +70,16 @@ def linearize(
     inputs: str | Sequence[str] | None = None,
     at: Mapping[str, float | str] | None = None,
 ) -> LinearModel:
-    """Linearize an FMU at the point it reaches by its initialization.
+    """Linearize an FMU or a system at the point it reaches by its initialization.
 
     The FMU computes the derivatives itself, by ``fmi2GetDirectionalDerivative`` or
     ``fmi3GetDirectionalDerivative``, or by ``fmi3GetAdjointDerivative`` if it has nothing else. So
-    there is no step size and no truncation error.
+    there is no step size and no truncation error. For a system, the derivatives of its components
+    are joined by the chain rule, as if values were exchanged at all times.
 
     Args:
-        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used.
+        fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used;
+            or an ``FMUSystem``.
         states: Names of continuous states, or one name; by default all that the FMU declares. The
             other states are held constant.
         inputs: Names of continuous inputs, or one name; by default all of them.
@@ -101,13 +104,17 @@ def linearize(
     if fmu.in_wine:
         with closing(_InstanceInWine(fmu, start)) as worker:
             return _linear_model(worker, description, x, u)
-    with fmu_calls, closing(Library(fmu, logger)) as library:
+    with fmu_calls, closing(open_library(fmu, logger, None, (), ())) as library:
         instance = library.instantiate()
         _initialize(instance, description, start)
         return _linear_model(_InstanceHere(instance), description, x, u)
 
 
 def _require_derivatives(description: ModelDescription) -> None:
+    """Refuse an FMU, or a component of a system, that does not tell its derivatives."""
+    if isinstance(description, SystemDescription):
+        _require_chain(description)
+        return
     name = f"{description.model_name} (FMI {description.fmi_version})"
     if not description.capabilities.provides_derivatives:
         raise ConfigError(
@@ -120,6 +127,27 @@ def _require_derivatives(description: ModelDescription) -> None:
             f"{name} cannot be linearized: its ModelStructure declares no scalar derivatives "
             "of continuous states"
         )
+
+
+def _require_chain(description: SystemDescription) -> None:
+    """Whether all components tell their derivatives, and no connection carries an array."""
+    plan = description.plan
+    for component, part in zip(plan.components, description.parts, strict=True):
+        if not part.capabilities.provides_derivatives:
+            raise ConfigError(
+                f"{plan.name} cannot be linearized: the derivatives of a system are those of all "
+                f"components by the chain rule, and component {component.name!r} provides none"
+            )
+    parts = dict(zip((one.name for one in plan.components), description.parts, strict=True))
+    for link in plan.links:
+        if not parts[link.source].variable(link.output).is_scalar:
+            raise ConfigError(
+                f"{plan.name} cannot be linearized: {link.source}.{link.output} -> "
+                f"{link.target}.{link.input} carries elements of arrays, and linear models take "
+                "scalars only"
+            )
+    if not description.state_derivatives:
+        raise ConfigError(f"{plan.name} cannot be linearized: its components declare no states")
 
 
 def _inputs(description: ModelDescription) -> list[str]:

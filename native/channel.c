@@ -6,6 +6,7 @@
 #if !defined _WIN32
 #include <errno.h>
 #include <poll.h>
+#include <sched.h>
 #include <sys/socket.h>
 #include <unistd.h>
 #endif
@@ -64,6 +65,7 @@ bool channel_open(Channel *channel, int socket) {
     setsockopt(socket, SOL_SOCKET, SO_NOSIGPIPE, &yes, sizeof yes);
 #endif
     channel->socket = socket;
+    channel->without_looks = 0;
     return make_room(channel);
 }
 
@@ -77,9 +79,26 @@ void channel_close(Channel *channel) {
 #define MSG_NOSIGNAL 0
 #endif
 
-/* How often a process looks before it goes to sleep: to be woken takes tens of microseconds. All looks
- * take about 20. It does not let others run meanwhile, which on a busy machine takes milliseconds. */
-enum { LOOKS = 40 };
+/* To be woken takes microseconds, so a process looks so often before it goes to sleep, and lets others
+ * run in between. On a busy machine this may take milliseconds: then it sleeps at once for the next
+ * messages. */
+enum { LOOKS = 40, LONGEST_LOOK = 50000 /* ns */, MESSAGES_WITHOUT = 1000 };
+
+/* Returns whether there is time for another look. */
+static bool let_others_run(Channel *channel) {
+    const uint64_t before = clock_now();
+
+    sched_yield();
+    if (clock_now() - before > LONGEST_LOOK) {
+        channel->without_looks = MESSAGES_WITHOUT;
+    }
+    return channel->without_looks == 0;
+}
+
+static int looks_for(Channel *channel) {
+    channel->without_looks -= channel->without_looks > 0;
+    return channel->without_looks > 0 ? 0 : LOOKS;
+}
 
 static Arrival wait_for(const Channel *channel, short events, uint64_t deadline) {
     struct pollfd one = {.fd = channel->socket, .events = events};
@@ -114,7 +133,7 @@ static size_t send_some(Channel *channel, const char *bytes, size_t size, uint64
 
 static size_t receive_some(Channel *channel, char *bytes, size_t size, uint64_t deadline,
                            Arrival *arrival) {
-    size_t looks = 0;
+    int looks = looks_for(channel);
 
     for (*arrival = CAME; *arrival == CAME;) {
         const ssize_t received = recv(channel->socket, bytes, size, MSG_DONTWAIT);
@@ -123,8 +142,8 @@ static size_t receive_some(Channel *channel, char *bytes, size_t size, uint64_t 
         }
         if (received == 0 || !would_wait()) {
             *arrival = GONE;
-        } else if (looks++ < LOOKS) {
-            spin_pause();
+        } else if (looks > 0) {
+            looks = let_others_run(channel) ? looks - 1 : 0;
         } else {
             *arrival = wait_for(channel, POLLIN, deadline);
         }

@@ -11,6 +11,7 @@ typedef struct {
     HANDLE input, output;
 #else
     int socket;
+    int without_looks; /* messages for which the process sleeps at once */
 #endif
     char *received; /* what has come and was not asked for yet */
     size_t begin, end;

@@ -15,6 +15,7 @@
 
 #include "log.h"
 #include "served.h"
+#include "texts.h"
 
 enum {
     MOST_DEATHS = 5,       /* in a row, after which no process is started any more */
@@ -30,34 +31,6 @@ static const uint64_t MILLISECOND = 1000000;
 static Mutex list_lock = MUTEX_INITIALIZER;
 static Host *hosts;
 
-/* Texts */
-
-typedef struct Text {
-    struct Text *next;
-    char text[];
-} Text;
-
-static Mutex text_lock = MUTEX_INITIALIZER;
-static Text *texts;
-
-const char *kept_text(const char *text) {
-    mutex_lock(&text_lock);
-    Text *found = texts;
-    while (found != NULL && strcmp(found->text, text) != 0) {
-        found = found->next;
-    }
-    if (found == NULL) {
-        found = malloc(sizeof *found + strlen(text) + 1);
-        if (found != NULL) {
-            strcpy(found->text, text);
-            found->next = texts;
-            texts = found;
-        }
-    }
-    mutex_unlock(&text_lock);
-    return found == NULL ? NULL : found->text;
-}
-
 /* Forks. The processes stay with the one that started them. */
 
 static void forget(Host *host) {
@@ -70,7 +43,7 @@ static void set_fate(Host *host, const char *how) {
     char text[512];
 
     snprintf(text, sizeof text, "%s, whose worker process %s", host->label, how);
-    host->fate = kept_text(text);
+    host->fate = text_with(text_number(text));
 }
 
 static void before_fork(void) {
@@ -83,7 +56,6 @@ static void after_fork_in_parent(void) {
 
 static void after_fork_in_child(void) {
     mutex_reset(&list_lock);
-    mutex_reset(&text_lock);
     for (Host *host = hosts; host != NULL; host = host->next) {
         mutex_reset(&host->lock);
         if (host->process != 0) {

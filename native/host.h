@@ -40,9 +40,6 @@ bool host_ask(Host *host, char code, int patience, char *answer);
 /* Notes that the process is of use. */
 void host_praise(Host *host);
 
-/* A copy of the text, one for all equal texts, that stays for ever. */
-const char *kept_text(const char *text);
-
 #endif
 
 #endif

@@ -3,10 +3,9 @@
 #include <stdio.h>
 #include <string.h>
 
-#include "texts.h"
-
 #include "far.h"
 #include "served.h"
+#include "texts.h"
 
 #if defined _WIN32
 
@@ -77,7 +76,7 @@ static Status initialize(const Library *library, void *component, const Experime
     me->holds = false;
     if (answered) {
         status = far_take_status(me);
-        const char *text = kept_text(packet_take_text(&me->host->in));
+        const char *text = text_with(text_number(packet_take_text(&me->host->in)));
         *doing = inner > STATUS_WARNING || text == NULL ? *doing : text;
         host_praise(me->host);
     }
@@ -254,7 +253,7 @@ static bool exchange_one_by_one(const Library *library, const Exchange *e) {
     return exchange_by(me->part->fmi, library, e);
 }
 
-static Status far_reset(const Library *library, void *component) {
+static Status reset(const Library *library, void *component) {
     Far *me = component;
 
     (void)library;
@@ -263,7 +262,7 @@ static Status far_reset(const Library *library, void *component) {
     return far_made_anew(me) ? STATUS_OK : far_ask_simply(me, ASK_RESET);
 }
 
-static Status far_terminate(const Library *library, void *component) {
+static Status terminate(const Library *library, void *component) {
     Far *me = component;
 
     (void)library;
@@ -281,15 +280,14 @@ static bool bind(Library *library, char *error, size_t size) {
 }
 
 #define REMOTE_FUNCTIONS                                                                           \
-    .bind = bind, .instantiate = far_instantiate, .initialize = initialize, .do_step = do_step,        \
+    .bind = bind, .instantiate = far_instantiate, .initialize = initialize, .do_step = do_step,    \
     .exchange = exchange_one_by_one, .get = get, .set = set, .set_string = set_string,             \
-    .get_string = get_string,                                                                      \
-    .reset = far_reset, .terminate = far_terminate, .free_instance = far_free, .blamed = far_blamed,      \
-    .drop = far_drop
+    .get_string = get_string, .reset = reset, .terminate = terminate, .free_instance = far_free,   \
+    .blamed = far_blamed, .drop = far_drop
 #define REMOTE_STATES                                                                              \
-    .choose_messages = far_choose_messages, .get_state = far_get_state, .set_state = far_set_state,            \
-    .free_state = far_free_state, .state_size = far_state_size, .serialize = far_serialize,                    \
-    .deserialize = far_deserialize
+    .choose_messages = far_choose_messages, .get_state = far_get_state,                            \
+    .set_state = far_set_state, .free_state = far_free_state, .state_size = far_state_size,        \
+    .serialize = far_serialize, .deserialize = far_deserialize
 
 const Fmi *remote_table(int64_t version) {
     static const Fmi first = {.boolean_size = sizeof(char), REMOTE_FUNCTIONS};

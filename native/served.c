@@ -6,6 +6,7 @@
 
 #if !defined _WIN32
 #include <fcntl.h>
+#include <signal.h>
 #include <unistd.h>
 #endif
 
@@ -400,14 +401,39 @@ void serve_component(Channel *channel) {
 
 #if !defined _WIN32
 
+/* The first are meant for the other side, and often sent to all of its processes. The others would stop
+ * a process in the background that uses the terminal. */
+static void ignore_signals(void) {
+    static const int ignored[] = {SIGINT, SIGTERM, SIGHUP, SIGTTIN, SIGTTOU};
+
+    for (size_t i = 0; i < sizeof ignored / sizeof *ignored; i++) {
+        signal(ignored[i], SIG_IGN);
+    }
+}
+
+/* An FMU that hangs must not outlive the other side. */
+static void *end_with_parent(void *unused) {
+    const pid_t parent = getppid();
+
+    (void)unused;
+    while (getppid() == parent) {
+        sleep(1);
+    }
+    end_process(1);
+    return NULL;
+}
+
 void serve_standard_streams(void) {
     static Channel channel;
+    pthread_t watch;
     const int connection = fcntl(0, F_DUPFD_CLOEXEC, 3), nothing = open("/dev/null", O_RDONLY);
 
     if (connection >= 0 && nothing >= 0 && channel_open(&channel, connection)) {
         dup2(nothing, 0);
         dup2(2, 1);
         close(nothing);
+        ignore_signals();
+        pthread_create(&watch, NULL, end_with_parent, NULL);
         serve_component(&channel);
     }
 }

@@ -10,7 +10,9 @@
 static const char *label_of(const Composite *me, size_t index) {
     const Component *part = &me->system->parts[index];
     const char *label =
-        part->fmi->blamed == NULL ? NULL : part->fmi->blamed(me->components[index]);
+        part->fmi->blamed == NULL || me->components[index] == NULL
+            ? NULL
+            : part->fmi->blamed(me->components[index]);
     return label == NULL ? part->label : label;
 }
 

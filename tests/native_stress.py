@@ -22,15 +22,16 @@ import sys
 import tempfile
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 from exchange_tools import exchange_fmu
 
-from fmugym import FMU, SimulationError, _native, bundled_fmu
+from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
-from fmugym.pool.spec import SOLVERS
+from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
@@ -124,13 +125,13 @@ class Receiver(logging.Handler):
 class Subject:
     """A pool over one of the FMUs, and the arrays for its calls."""
 
-    def __init__(self, path, names, start, rng):
+    def __init__(self, source, names, start, rng, **options):
         log = logging.Logger("stress")
         receiver = Receiver(rng)
         log.addHandler(receiver)
         inputs, outputs = names
-        fmu = FMU(path)
-        self.n = int(rng.choice([1, 3, 40, 300] if "m_cart" in start else [1, 3]))
+        fmu = FMU(source) if isinstance(source, Path | str) else source.as_fmu()
+        self.n = int(rng.choice([1, 3, 40, 300] if "m_cart" in start[0] else [1, 3]))
         spec = PoolSpec(
             tuple(map(fmu.variable, inputs)),
             tuple(map(fmu.variable, outputs)),
@@ -138,6 +139,7 @@ class Subject:
             num_observed=len(outputs),
             solver=str(rng.choice(SOLVERS)),
             max_step=0.01,
+            **options,
         )
         self.pool = NativePool(fmu, spec, self.n, log, threads=int(rng.integers(1, 5)))
         receiver.pool = self.pool
@@ -309,7 +311,9 @@ class Ring:
         while True:
             self.seed += 1
             with contextlib.suppress(KeyboardInterrupt, ReceiverError, SimulationError):
-                return Subject(*recipe, np.random.default_rng(self.seed))
+                source, names, start, options = recipe
+                rng = np.random.default_rng(self.seed)
+                return Subject(source, names, start, rng, **options)
 
     def act(self, rng):
         index, name = int(rng.integers(len(self.subjects))), str(rng.choice(ACTIONS))
@@ -326,24 +330,40 @@ class Ring:
         counts[name] += 1
 
 
+def systems():
+    """Carts and a pendulum: with a reset method each; and with estimates of errors."""
+    paths = {"a": bundled_fmu("CartPole", "2.0"), "b": bundled_fmu("CartPole", "3.0")}
+    paths["c"] = bundled_fmu("Pendulum", "2.0")
+    links = [
+        Connection("a.x", "b.f", 0.1, convert_units=False),
+        Connection("b.x_dot", "c.tau", 0.1, convert_units=False),
+    ]
+    names = ["a.f"], ["a.x", "c.theta"]
+    for methods in (("restore", "instance", "restore"), ("reset", "restore", "reset")):
+        own = {"component_resets": tuple(map(ResetMethod, methods))}
+        yield FMUSystem(paths, links), names, ["a.m_cart"], own
+    yield FMUSystem(paths, links, error_tolerance=1e-3), names, ["a.m_cart"], {}
+
+
 def recipes(folder, with_python):
     """What there are pools of."""
     for version in ("2.0", "3.0"):
         path = bundled_fmu("CartPole", version)
-        yield path, (["f"], ["x", "theta"]), ["m_cart"]
+        yield path, (["f"], ["x", "theta"]), ["m_cart"], {}
+    yield from systems()
     for version, model, input_, output, start in (
         (1, "ball", "e", "h", "h"),
         (2, "circuit", "duty", "voltage", "limit"),
         (3, "van_der_pol", "mu", "x1", "x2"),
     ):
         path = exchange_fmu(f"{folder}/{model}.fmu", model, version)
-        yield path, ([input_], [output]), [start]
+        yield path, ([input_], [output]), [start], {}
     if with_python:
         import foreign_tank
         from pythonfmu.builder import FmuBuilder
 
         path = FmuBuilder.build_FMU(foreign_tank.__file__, folder)
-        yield path, (["inflow"], ["level"]), ["area"]
+        yield path, (["inflow"], ["level"]), ["area"], {}
 
 
 def on_alarm(*_):

@@ -1,9 +1,9 @@
 """Run the stress of the native pool with sanitizers: errors of memory, of arithmetic, of threads.
 
-    python tests/sanitize.py [--seconds 30] [--only address thread] [--keep-going]
+    python tests/sanitize.py [--seconds 30] [--systems 100] [--only address thread]
 
 Builds the C extension with gcc's address and undefined-behaviour sanitizers, and with its thread
-sanitizer, each into a copy of the package, and runs ``native_stress.py`` on
+sanitizer, each into a copy of the package, and runs ``native_stress.py`` and ``fuzz_systems.py`` on
 it. Needs gcc on Linux. Prints each finding; the exit status is 0 if there is none.
 """
 
@@ -98,7 +98,15 @@ def run(sanitizer, folder, *command):
     return subprocess.run([sys.executable, *command], env=environment, cwd=folder).returncode
 
 
-def check(name, seconds, seeds):
+def runs(seconds, seeds, systems):
+    """What is run: by name, the arguments of Python."""
+    for seed in range(seeds):
+        stress = str(HERE / "native_stress.py"), str(seconds), str(seed)
+        yield f"seed {seed}", (*stress, *(["python"] if seed % 2 else []))
+    yield "systems", (str(HERE / "fuzz_systems.py"), "--count", str(systems))
+
+
+def check(name, seconds, seeds, systems):
     """Run the stress with a sanitizer.
 
     Returns:
@@ -108,14 +116,12 @@ def check(name, seconds, seeds):
     clean = True
     with tempfile.TemporaryDirectory() as folder:
         build(sanitizer, Path(folder))
-        for seed in range(seeds):
+        for what, command in runs(seconds, seeds, systems):
             begin = time.monotonic()
-            stress = str(HERE / "native_stress.py"), str(seconds), str(seed)
-            stress += ("python",) if seed % 2 else ()
-            status = run(sanitizer, Path(folder), *stress)
+            status = run(sanitizer, Path(folder), *command)
             took = time.monotonic() - begin
             verdict = "clean" if status == 0 else f"FAILED with exit status {status}"
-            print(f"{name}, seed {seed}: {verdict} after {took:.0f} s", flush=True)
+            print(f"{name}, {what}: {verdict} after {took:.0f} s", flush=True)
             clean = clean and status == 0
     return clean
 
@@ -124,9 +130,11 @@ def main():
     parser = argparse.ArgumentParser(description="Stress the native pool with sanitizers.")
     parser.add_argument("--seconds", type=float, default=30)
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--systems", type=int, default=100)
     parser.add_argument("--only", nargs="+", choices=SANITIZERS, default=list(SANITIZERS))
     arguments = parser.parse_args()
-    results = [check(name, arguments.seconds, arguments.seeds) for name in arguments.only]
+    given = arguments.seconds, arguments.seeds, arguments.systems
+    results = [check(name, *given) for name in arguments.only]
     sys.exit(not all(results))
 
 

@@ -9,14 +9,20 @@ import os
 import pickle
 import shutil
 import signal
+import subprocess
+import sys
+import textwrap
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import building
+import clocks_tools
 import exchange_tools
 import fmu_tools
 import numpy as np
 import pytest
+import values_tools
 import wine_tools
 from process_tools import faulty_fmu, start_values
 from system_tools import linear, linear_fmu, masses, system
@@ -206,6 +212,70 @@ class TestResults:
         assert play(pool).tobytes() == rows.tobytes()
         assert pool.health()["retries"].sum() > 0
 
+    @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
+    def test_arrays_with_sizes_of_their_own(self, make, tmp_path, interface):
+        path = values_tools.state_space_fmu(tmp_path / "S.fmu")
+        sizes = {"n": 3, "m": 2, "r": 2}
+        starts = {
+            "A": (-np.eye(3) + 0.1).tolist(),
+            "B": np.full((3, 2), 0.3).tolist(),
+            "C": np.arange(6.0).reshape(2, 3).tolist(),
+            "D": np.zeros((2, 2)).tolist(),
+            "x_0": [1.0, -0.5, 0.25],
+        }
+        results = []
+        for isolate in (False, True):
+            one = Component(path, sizes | starts, interface, feedthrough=False, isolate=isolate)
+            both = FMUSystem({"p": one, "q": one}, ["p.y -> q.u", "q.y -> p.u"])
+            outputs = [f"{name}.y[{i}]" for name in "pq" for i in (1, 2)]
+            pool = make(both.plan, outputs)
+            results.append(play(pool))
+        assert np.ptp(results[0]) > 1.0
+        assert results[0].tobytes() == results[1].tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_numbers_of_every_type(self, make, tmp_path, version):
+        path = values_tools.feedthrough_fmu(tmp_path / "F.fmu", version)
+        plan = system([Planned("f", path)], ())
+        fmu = SystemFMU(plan)
+        names = [v.name for v in fmu.description.variables.values() if v.is_number]
+        inputs = [n for n in names if fmu.variable(n).causality == "input"]
+        outputs = [n for n in names if fmu.variable(n).causality == "output"]
+        rows = []
+        for one in (plan, apart(plan, "f")):
+            pool = make(one, outputs, inputs=inputs)
+            assert not reset(pool).any(), pool.failure(0)
+            for k in range(3):
+                values = np.full((len(inputs), 2), float(k)) + np.array([0.0, 1.0])
+                outs, statuses = pool.step(values)
+                assert not statuses.any(), pool.failure(0)
+                rows.append(outs.tobytes())
+        assert len(set(rows)) == 3
+        assert rows[:3] == rows[3:]
+
+    def test_clocks(self, make, tmp_path):
+        path = clocks_tools.clocks_fmu(tmp_path / "Clocks.fmu")
+        plan = system([Planned("c", path)], ())
+        outputs = ["c.x", "c.sample", "c.alarms"]
+        rows = play(make(plan, outputs, inputs=["c.plain"]), 20)
+        pool = make(apart(plan, "c"), outputs, inputs=["c.plain"])
+        assert play(pool, 20).tobytes() == rows.tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_strings_and_messages(self, make, tmp_path, caplog, version):
+        """The FMU logs its String; the message names the system and the component."""
+        probe = fmu_tools.probe_fmu(tmp_path, version)
+        told = []
+        for isolate in (False, True):
+            parts = Planned("loud", probe, starts=(("label", "Ümlaut"),), isolate=isolate)
+            pool = make(system([parts], ()), ["loud.sum"])
+            caplog.clear()
+            assert not reset(pool, ["loud.log_status"], [[-1.0, 1.0]]).any(), pool.failure(0)
+            pool.step()
+            told.append([r.getMessage() for r in caplog.records if "loud" in r.getMessage()])
+        assert any("system_1.loud" in text and "Ümlaut is 100%" in text for text in told[0])
+        assert told[0] == told[1]
+
     def test_many_threads(self, make, fmus):
         plan = masses([fmus[2], fmus[3]])
         one = play(make(plan, MASSES, 300, threads=1), 5)
@@ -225,6 +295,14 @@ def children():
                 if f"PPid:\t{os.getpid()}\n" in status and b"serve_component" in command:
                     found.append(int(process.name))
     return found
+
+
+def is_running(process):
+    """Whether there is such a process, and it is more than a note that it has ended."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return False
 
 
 on_linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="/proc lists processes")
@@ -330,6 +408,36 @@ class TestFaults:
         assert not set(children()) - self.others
 
     @on_linux
+    @pytest.mark.parametrize("stage", ["nowhere", "step"])
+    def test_workers_end_with_a_process_that_is_killed(self, fmus, faulty, stage):
+        """Also if the FMU hangs."""
+        script = f"""
+            import numpy as np
+            from test_systems_apart import *
+            plan = with_fault({dict(fmus)!r}, {str(faulty)!r})
+            fmu = SystemFMU(plan)
+            spec = PoolSpec((), (fmu.variable("bad.y"),), 0.5)
+            pool = local_pool(fmu, spec, 1, LOG, native=True)
+            names = tuple(map(fmu.variable, NAMES))
+            pool.reset(names, asking_for("hang", stage={stage!r}))
+            print(*children(), flush=True)
+            for _ in range(10**9):
+                pool.step()
+        """
+        script = textwrap.dedent(script).replace("PosixPath", "Path")
+        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+        with subprocess.Popen(
+            [sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment
+        ) as parent:
+            worker = int(parent.stdout.readline())
+            time.sleep(0.3)
+            parent.kill()
+        deadline = time.monotonic() + 20
+        while is_running(worker):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    @on_linux
     @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
     def test_a_fork_gets_workers_of_its_own(self, make, fmus):
         pool = make(apart(masses([fmus[2], fmus[2]]), "first"), MASSES, 1)
@@ -386,7 +494,40 @@ def episodes(env, seed=3):
     return np.array([first, *(env.step(env.action_space.sample())[0] for _ in range(30))])
 
 
+class Telling(fmugym.FMUEnv):
+    """Reads a text that an FMU gives."""
+
+    def __init__(self, source):
+        config = {
+            "model_input_names": ["f.Float64_in"],
+            "model_output_names": ["f.Float64_out"],
+            "model_parameters": {
+                "f.String_parameter": fmugym.Choice(["short", "", "a longer one"])
+            },
+            "monitor_names": ["f.String_told"],
+            "time_step": 0.1,
+            "bounds": {"f.Float64_in": (-1, 1), "f.Float64_out": (-1, 1)},
+        }
+        super().__init__(source, config)
+
+    def _is_done(self):
+        return False
+
+
 class TestWhereAnFMUStands:
+    def test_hooks_read_texts(self, tmp_path):
+        path = values_tools.feedthrough_fmu(tmp_path / "F.fmu", 3)
+        told = []
+        for isolate in (False, True):
+            source = FMUSystem({"f": Component(path, isolate=isolate)})
+            with contextlib.closing(Telling(source)) as env:
+                for seed in range(4):
+                    env.reset(seed=seed)
+                    env.step(env.action_space.sample())
+                    told.append(env.out["f.String_told"])
+        assert len(set(told)) > 1
+        assert told[:4] == told[4:]
+
     @pytest.mark.parametrize("isolation", [None, "process"])
     def test_a_vector_environment(self, isolation):
         results = []
@@ -471,6 +612,16 @@ class TestInWine:
         mixed = masses([path, fmus[3]])
         assert SystemFMU(mixed).whereabouts_by_name == {"first": "wine", "second": "here"}
         assert play(make(mixed, MASSES)).tobytes() == rows.tobytes()
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_model_exchange(self, make, tmp_path, version):
+        """x' = -k x from 1: the closed form."""
+        path = wine_tools.exchange_fmu(tmp_path / "Model.fmu", "dahlquist", version)
+        pool = make(system([Planned("d", path)], ()), ["d.x"], tolerance=1e-8)
+        assert not reset(pool, ["d.k"], [[1.0, 2.0]]).any(), pool.failure(0)
+        for _ in range(10):
+            assert not pool.step()[1].any()
+        np.testing.assert_allclose(pool.outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
 
     def test_a_pendulum_beside_a_native_one(self, tmp_path):
         """The libraries differ in their sine and cosine by rounding."""

@@ -226,9 +226,11 @@ class TestEnvironments:
         )
         assert fit.values["east.A_f"] == pytest.approx(140.0, rel=1e-3)
 
-    def test_a_system_has_no_derivatives(self):
-        with pytest.raises(ConfigError, match="two houses"):
-            fmugym.linearize(two_houses())
+    def test_a_linear_model_has_the_names_of_the_system(self):
+        model = fmugym.linearize(two_houses())
+        assert {"east.T_m", "west.T_m"} <= set(model.states)
+        assert {"outside", "east.u", "west.u"} <= set(model.inputs)
+        assert "east.T_out" not in model.inputs
 
     def test_what_drives_a_name_is_the_only_one(self):
         """An input behind a name of the system is set by that name alone."""

@@ -1,9 +1,12 @@
 """SSP archives: what is read of them, compared with FMPy's reader, and what is written."""
 
 import copy
+import logging
 import random
 import zipfile
+from types import MappingProxyType
 
+import numpy as np
 import pytest
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
 from lxml import etree
@@ -17,6 +20,8 @@ from fmugym import (
     FMUSystem,
     bundled_fmu,
 )
+from fmugym.pool import PoolSpec
+from fmugym.pool.local import local_pool
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
 
@@ -575,3 +580,92 @@ class TestWriting:
     def test_a_folder_that_does_not_exist(self, tmp_path):
         with pytest.raises(FMULoadError, match="none"):
             self.make().write(tmp_path / "none" / "demo.ssp")
+
+
+class TestNestedConnectors:
+    """Connectors of nested systems that nothing outside is joined to."""
+
+    PORTS = MappingProxyType({"warmth": "input degC", "one": "input W", "out": "output degC"})
+    WIRES = (
+        connection("warmth", "east.T_out"),
+        connection("warmth", "west.T_out", linear(0.5, 1.0)),
+        connection("one", "east.Q_int"),
+        connection("west.T_air", "out"),
+    )
+
+    def archive(self, pack, ports=None, wires=(), more=()):
+        houses = [component(name, HOUSE_PORTS) for name in ("east", "west")]
+        pair = system("pair", self.PORTS, houses, self.WIRES)
+        return pack(system("root", ports or {}, [pair, *more], wires))
+
+    def test_one_that_fans_out_is_one_input(self, pack):
+        fmu = FMUSystem.read(self.archive(pack)).as_fmu()
+        variable = fmu.variable("pair.warmth")
+        assert (variable.causality, variable.unit) == ("input", "degC")
+        inputs = {v.name for v in fmu.description.variables.values() if v.causality == "input"}
+        assert {"pair.warmth", "pair.east.Q_int"} <= inputs
+        assert not inputs & {"pair.east.T_out", "pair.west.T_out"}
+
+    def test_it_reaches_all_components(self, pack):
+        """As if each were set by hand, converted and scaled on the way."""
+        fmu = FMUSystem.read(self.archive(pack)).as_fmu()
+        names = ["pair.east.T_out", "pair.west.T_out", "pair.out", "pair.west.T_air"]
+        spec = PoolSpec((fmu.variable("pair.warmth"),), tuple(map(fmu.variable, names)), 900.0)
+        pool = local_pool(fmu, spec, 1, logging.getLogger("fmugym.test"))
+        try:
+            pool.reset((), np.zeros((0, 1)))
+            rows = pool.step(np.array([[7.0]]))[0][:, 0]
+        finally:
+            pool.close()
+        unit = bundled_input_unit()
+        there = 7.0 + (273.15 if unit == "K" else 0.0)
+        assert rows[:2] == pytest.approx([there, 0.5 * there + 1.0], abs=1e-9)
+        assert rows[2] == pytest.approx(rows[3] - (273.15 if unit == "K" else 0.0), abs=1e-9)
+
+    def test_an_output_has_the_name_of_the_connector(self, pack):
+        fmu = FMUSystem.read(self.archive(pack)).as_fmu()
+        variable = fmu.variable("pair.out")
+        assert (variable.causality, variable.unit) == ("output", "degC")
+
+    def test_what_is_driven_from_outside_is_no_input(self, pack):
+        third = component("third", HOUSE_PORTS)
+        wires = [connection("third.T_air", "pair.warmth"), connection("pair.out", "third.T_out")]
+        made = FMUSystem.read(self.archive(pack, wires=wires, more=[third]))
+        assert "pair.warmth" not in made.as_fmu().description.variables
+        assert {(link.source, link.target) for link in made.links} == {
+            ("third", "pair.east"),
+            ("third", "pair.west"),
+            ("pair.west", "third"),
+        }
+
+    def test_they_are_written_and_read_back(self, pack, tmp_path):
+        given = FMUSystem.read(self.archive(pack))
+        again = FMUSystem.read(given.write(tmp_path / "again.ssp"))
+        assert again.connectors == given.connectors
+        assert {one.name: len(one.ends) for one in given.connectors} == {
+            "pair.warmth": 2,
+            "pair.out": 1,
+        }
+
+    def test_a_parameter_fans_out_too(self, pack):
+        ports = {"area": "parameter m2"}
+        houses = [component(name, {"A_f": "parameter m2"}) for name in ("east", "west")]
+        wires = [connection("area", f"{name}.A_f") for name in ("east", "west")]
+        made = FMUSystem.read(pack(system("root", {}, [system("pair", ports, houses, wires)])))
+        variable = made.as_fmu().variable("pair.area")
+        assert variable.causality == "parameter"
+        assert len(made.connectors[0].ends) == 2
+
+    def test_a_component_of_the_same_name_comes_first(self, pack):
+        """Then the connector stays without a name, as its component inputs have theirs."""
+        houses = [component(name, HOUSE_PORTS) for name in ("warmth", "west")]
+        wires = [connection("warmth", f"{name}.T_out") for name in ("warmth", "west")]
+        ports = {"warmth": "input K"}
+        made = FMUSystem.read(pack(system("root", {}, [system("pair", ports, houses, wires)])))
+        assert made.as_fmu().variable("pair.warmth.T_out").causality == "input"
+
+
+def bundled_input_unit():
+    from fmugym import FMU
+
+    return FMU(HOUSE).variable("T_out").unit

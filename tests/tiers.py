@@ -29,6 +29,7 @@ SLOW_MODULES = {
     "test_fuzz_face",
     "test_fuzz_hooks",
     "test_fuzz_signals",
+    "test_fuzz_systems",
     "test_fuzz_tasks",
     "test_input_interpolation",
     "test_lab_fuzz",
@@ -53,6 +54,7 @@ SLOW_MODULES = {
     "test_systems_control",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_linearization",
     "test_systems_parts",
     "test_systems_resets",
     "test_systems_ssp",
@@ -94,6 +96,7 @@ EVERY_IN_CI = {
     "test_string_outputs": 5,
     "test_strings": 5,
     "test_systems": 5,
+    "test_systems_apart": 3,
     "test_systems_control": 3,
     "test_systems_resets": 5,
     "test_value_types": 3,
@@ -233,9 +236,7 @@ EXHAUSTIVE_TESTS = (
 
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
-    return (
-        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
-    ) or "wine" in node_id.partition("[")[2]
+    return "::TestInWine" in node_id or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):

@@ -22,6 +22,7 @@ from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
+from fmugym.fmi.chain import chained_jacobian
 from fmugym.fmi.control import Repeatable, StepControl
 from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
 from fmugym.fmi.kept import KeptStart
@@ -714,6 +715,20 @@ class SystemInstance(Instance, Repeatable):
             for state in before:
                 state.release()
         self._terminated |= was_terminated
+
+    def jacobian(
+        self, unknowns: Sequence[Variable], knowns: Sequence[Variable]
+    ) -> npt.NDArray[np.float64]:
+        """See ``Instance.jacobian``; the derivatives of the components make those of the system."""
+        self._require(Phase.STEPPING, "differentiate")
+        behind = [
+            [self._layout.ends_of(variable) for variable in some] for some in (unknowns, knowns)
+        ]
+        return chained_jacobian(
+            self._layout,
+            lambda part, of, by: self._parts[part].instance.jacobian(of, by),
+            *behind,
+        )
 
     # States and resets
 

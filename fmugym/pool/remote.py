@@ -88,7 +88,7 @@ def _command(wine: Wine | None) -> list[str]:
         return [*wine.command, "component"]
     executable = os.fsdecode(multiprocessing.spawn.get_executable())
     folders = list(sys.modules["fmugym"].__path__)
-    return [executable, "-c", _SERVE.format(path=sys.path, folders=folders)]
+    return [executable, "-c", _SERVE.format(path=[*map(str, sys.path)], folders=folders)]
 
 
 def _texts(environment: Mapping[str, str]) -> tuple[bytes, ...]:

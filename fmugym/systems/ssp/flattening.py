@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 from fmugym.archive.description import ModelDescription, Unit, Variable
 from fmugym.archive.units import IDENTITY, conversion_of_link
 from fmugym.errors import ConfigError, FMULoadError, shown
 from fmugym.systems.connections import Connection
-from fmugym.systems.ssp.elements import Element, Scaling, SystemElement, Wire
+from fmugym.systems.ssp.elements import Element, OwnConnector, Scaling, SystemElement, Wire
 from fmugym.systems.ssp.parameters import Setting, read_settings
 
 __all__ = ["Flat", "Node"]
@@ -136,8 +137,46 @@ class Flat:
                         f"the connection {_named(source)} -> {_named(target)} joins no component "
                         "and is ignored"
                     )
-                elif source[0] == () or source[0] in self.components:
+                elif source[0] == () or source[0] in self.components or source in self._fans:
                     yield self._connection(target, chain)
+        for target in self._nested_outputs():
+            yield self._connection(target, self._chain(target))
+
+    def connectors(self) -> Iterator[tuple[str, OwnConnector]]:
+        """The connectors that can be inputs, outputs and parameters of the whole, by their names.
+
+        These are those of the root; and those of nested systems that nothing outside drives and
+        that lead to several components, or that an output of a component leads to.
+        """
+        yield from self.root.connectors.items()
+        for place, name in (*self._fans, *self._nested_outputs()):
+            yield _named((place, name)), self._systems[place].connectors[name]
+
+    @cached_property
+    def _fans(self) -> tuple[Node, ...]:
+        """The connectors of nested systems that are an input or parameter of the whole."""
+        return tuple(
+            node
+            for node in self._out_of
+            if node not in self._into
+            and self._can_be_named(node)
+            and len(list(self._reached(node, _Value()))) > 1
+        )
+
+    def _nested_outputs(self) -> Iterator[Node]:
+        """The connectors of nested systems that an output of a component leads to."""
+        for node in self._into:
+            if not self._can_be_named(node):
+                continue
+            gives = self._systems[node[0]].connectors[node[1]].gives
+            if gives and self._chain(node)[0][0][0] in self.components:
+                yield node
+
+    def _can_be_named(self, node: Node) -> bool:
+        """Whether a node is a connector of a nested system whose name no component has."""
+        place, name = node
+        nested = place != () and place in self._systems and name in self._systems[place].connectors
+        return nested and _named(node) not in map(".".join, self.components)
 
     def _chain(self, target: Node) -> list[tuple[Node, Wire]]:
         """The ways from the first source to a node."""

@@ -88,9 +88,9 @@ class _Reader:
             "components": components,
             "connections": connections,
             "name": root.get("name") or tree.name,
-            "units": _own_units(tree, connections),
+            "units": _own_units(flat, connections),
             "unit_definitions": units,
-            "own_names": [name for name in tree.connectors if "." in name],
+            "own_names": [name for name, _ in flat.connectors() if "." in name],
             "description": tree.description,
             "findings": [*self.archive.notes, *self.findings],
             "file": self.archive.path,
@@ -161,12 +161,12 @@ def _folder_of(archive: SafeZip) -> Path:
     return folder
 
 
-def _own_units(tree: SystemElement, connections: Sequence[Connection]) -> dict[str, str]:
-    """The units of the connectors of the root that connections use."""
+def _own_units(flat: Flat, connections: Sequence[Connection]) -> dict[str, str]:
+    """The units of the connectors of systems that connections use."""
     used = {end for one in connections for end in (one.source, one.target)}
     return {
         name: connector.unit
-        for name, connector in tree.connectors.items()
+        for name, connector in flat.connectors()
         if connector.unit is not None and name in used
     }
 

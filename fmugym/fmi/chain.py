@@ -1,0 +1,95 @@
+"""The derivatives of a system by the chain rule, from those of its components."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import Variable
+from fmugym.systems.description import PartVariable
+from fmugym.systems.layout import Layout, Route
+
+__all__ = ["chained_jacobian"]
+
+FloatArray = npt.NDArray[np.float64]
+Ends = Sequence[Sequence[PartVariable]]
+Differentiate = Callable[[int, Sequence[Variable], Sequence[Variable]], FloatArray]
+"""Takes the number of a component, its unknowns and its knowns; see ``Instance.jacobian``."""
+
+
+def chained_jacobian(
+    layout: Layout, differentiate: Differentiate, unknowns: Ends, knowns: Ends
+) -> FloatArray:
+    """Differentiate variables of a system by others, as if values were exchanged at all times.
+
+    What connections carry, y, depends on the knowns k directly and by way of other connections:
+    dy = M dy + N dk, so that dy/dk = (1 - M)^-1 N. Algebraic loops make M no triangular matrix.
+    Only continuous Reals have derivatives; other connections are held constant.
+
+    Args:
+        layout: The slots and routes of the system.
+        differentiate: Differentiates one component at the present point.
+        unknowns: What stands behind each variable to differentiate; the first end counts.
+        knowns: What stands behind each variable to differentiate by: one end or several.
+
+    Returns:
+        The partial derivatives, shape (len(unknowns), len(knowns)), in the units of the system.
+    """
+    routes = [route for route in layout.routes if _is_continuous(layout, route)]
+    carried = [_source(layout, route) for route in routes]
+    chain = _Chain(layout, differentiate, routes)
+    links = chain.by_routes(carried)
+    direct = chain.by_knowns(carried, knowns)
+    by_links = np.linalg.solve(np.eye(len(routes)) - links, direct)
+    ends = [behind[0] for behind in unknowns]
+    return chain.by_knowns(ends, knowns) + chain.by_routes(ends) @ by_links
+
+
+class _Chain:
+    """The derivatives of some variables by connections and by knowns."""
+
+    def __init__(
+        self, layout: Layout, differentiate: Differentiate, routes: Sequence[Route]
+    ) -> None:
+        self._layout, self._differentiate, self._routes = layout, differentiate, routes
+
+    def by_routes(self, ends: Sequence[PartVariable]) -> FloatArray:
+        """By the sources of connections, which act on their targets."""
+        targets = [[_target(self._layout, route)] for route in self._routes]
+        return self.by_knowns(ends, targets)
+
+    def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> FloatArray:
+        """By variables, without the way of connections."""
+        result = np.zeros((len(ends), len(knowns)))
+        for part in {end.part for end in ends}:
+            rows = [row for row, end in enumerate(ends) if end.part == part]
+            pairs = [(j, end) for j, known in enumerate(knowns) for end in _within(known, part)]
+            found = self._differentiate(
+                part, [ends[row].variable for row in rows], [end.variable for _, end in pairs]
+            )
+            for (column, end), values in zip(pairs, found.T, strict=True):
+                gains = np.array([ends[row].gain for row in rows])
+                result[rows, column] += values * gains * end.gain
+        return result
+
+
+def _within(ends: Iterable[PartVariable], part: int) -> list[PartVariable]:
+    return [end for end in ends if end.part == part]
+
+
+def _source(layout: Layout, route: Route) -> PartVariable:
+    part = layout.parts[route.source_part]
+    return PartVariable(route.source_part, part.outputs[route.source - part.first_output])
+
+
+def _target(layout: Layout, route: Route) -> PartVariable:
+    part = layout.parts[route.target_part]
+    variable = part.inputs[route.target - part.first_input]
+    return PartVariable(route.target_part, variable, route.gain)
+
+
+def _is_continuous(layout: Layout, route: Route) -> bool:
+    ends = _source(layout, route).variable, _target(layout, route).variable
+    return all(one.kind == "real" and one.variability == "continuous" for one in ends)
