@@ -492,6 +492,10 @@ class ModelDescription:
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
+    def can_interpolate(self, variable: Variable) -> bool:
+        """Whether an input may change linearly within a step; it must be a continuous Real, too."""
+        return self.capabilities.can_interpolate_inputs
+
     @property
     def has_reset(self) -> bool:
         """Whether the FMI version has a function for resets: FMI 1.0 has none in model exchange."""
