@@ -4,7 +4,7 @@
 #define FMUGYM_LANES_H
 
 enum {
-    PROGRAM_WIDTH = 64, /* most instances evaluated at the same time */
+    PROGRAM_WIDTH = 128, /* most instances evaluated at the same time */
     PROGRAM_BLOCK = 16  /* operations compute a multiple of this many values */
 };
 

@@ -90,7 +90,7 @@ static void leave_out(Position *p, size_t first, size_t count) {
 
 static size_t roll_out(Position *p, const Task *task, size_t first, size_t count,
                        Scratch scratch) {
-    uint8_t over[RUN];
+    uint8_t over[ROLLOUT_RUN];
     size_t troubled = 0;
 
     begin_at_first_step(p, task);
@@ -116,8 +116,8 @@ size_t run_rollout(Task *task, size_t begin, size_t end, Scratch scratch) {
     p.verdict = (Verdict){.ended = 0};
     play_open(task->call->turn, &p.registers);
     for (size_t run = begin; run < end && troubled == 0; run++) {
-        const size_t first = run * RUN;
-        const size_t count = length_of_run(first, task->pool->settings.count);
+        const size_t first = run * ROLLOUT_RUN, rest = task->pool->settings.count - first;
+        const size_t count = rest < ROLLOUT_RUN ? rest : ROLLOUT_RUN;
         troubled += roll_out(&p, task, first, count, scratch);
     }
     if (p.verdict.outside) {

@@ -7,7 +7,10 @@
 #include "starts.h"
 #include "task.h"
 
-enum { RUN = PROGRAM_WIDTH /* number of instances in a run */ };
+enum {
+    RUN = PROGRAM_WIDTH, /* number of instances in a run */
+    ROLLOUT_RUN = 64     /* in a rollout, where shorter runs keep more threads busy */
+};
 
 static inline size_t length_of_run(size_t first, size_t end) {
     return end - first < RUN ? end - first : RUN;

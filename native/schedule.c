@@ -14,7 +14,7 @@ static const double LARGEST_CHUNK = 50e3;
 static const double WORTH_A_THREAD = 10e3; /* amount of work that justifies waking another thread */
 
 enum {
-    STACK_VALUES = 4096,
+    STACK_VALUES = 8192,
     MANY = 64,         /* with this many instances or more, every call is measured */
     MEASURE_EVERY = 16 /* with fewer instances, one call in this many is measured */
 };
@@ -63,7 +63,7 @@ static size_t work_with(Task *task, size_t begin, size_t end, Scratch scratch) {
 }
 
 static size_t length_of_longest_run(const Task *task, size_t begin, size_t end) {
-    return task->listed ? 0 : task->operation == ROLLOUT ? RUN : length_of_run(begin, end);
+    return task->listed ? 0 : task->operation == ROLLOUT ? ROLLOUT_RUN : length_of_run(begin, end);
 }
 
 static size_t work_with_memory(Task *task, size_t begin, size_t end) {

@@ -11,7 +11,7 @@ from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
 
 pytestmark = pytest.mark.skipif(not has_native_pool(), reason="programs run in the native pool")
 
-LENGTHS = (1, 15, 16, 17, 63, 64, 65, 130)
+LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
 DOUBLE = np.dtype(np.float64)
 
 

@@ -118,22 +118,24 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     envs.close()
 
 
-@pytest.mark.skipif(bool(wine_tools.why_not()), reason=wine_tools.why_not())
-@pytest.mark.parametrize("version", [1, 3])
-def test_in_wine(tmp_path, version):
-    path = values_tools.feedthrough_fmu(tmp_path / "Windows.fmu", version, for_windows=True)
-    envs = FMUVectorEnv(lambda: Echo(path), 2)
-    for episode in range(3):
-        _, infos = envs.reset(seed=None if episode else 3)
-        drawn = infos["drawn"]["String_parameter"].tolist()
-        assert drawn == [test_strings.drawn_words(seed, 3)[episode] for seed in (3, 4)]
-        assert infos["told"].tolist() == drawn
-        assert envs.step(np.zeros(2, np.int64))[4]["told"].tolist() == drawn
-    saved = envs.save_state()
-    envs.reset()
-    envs.restore_state(saved)
-    assert [out["String_told"] for out in envs.get_attr("out")] == drawn
-    envs.close()
+@pytest.mark.usefixtures("wine")
+class TestInWine:
+    @pytest.mark.parametrize("version", [1, 3])
+    def test_each_environment_has_its_own(self, tmp_path, version):
+        with wine_tools.building_for_windows():
+            path = values_tools.feedthrough_fmu(tmp_path / "Windows.fmu", version)
+        envs = FMUVectorEnv(lambda: Echo(path), 2)
+        for episode in range(3):
+            _, infos = envs.reset(seed=None if episode else 3)
+            drawn = infos["drawn"]["String_parameter"].tolist()
+            assert drawn == [test_strings.drawn_words(seed, 3)[episode] for seed in (3, 4)]
+            assert infos["told"].tolist() == drawn
+            assert envs.step(np.zeros(2, np.int64))[4]["told"].tolist() == drawn
+        saved = envs.save_state()
+        envs.reset()
+        envs.restore_state(saved)
+        assert [out["String_told"] for out in envs.get_attr("out")] == drawn
+        envs.close()
 
 
 class Pair(test_strings.Reading):

@@ -42,7 +42,7 @@ def outside(monkeypatch):
 
 
 @pytest.mark.parametrize("mode", [SAME_STEP, DISABLED], ids=lambda mode: mode.name)
-@pytest.mark.parametrize("num_envs", [1, 7, 70])
+@pytest.mark.parametrize("num_envs", [1, 7, 140])
 def test_no_reset_is_made_outside_of_the_pass(mode, num_envs, outside):
     ours, theirs = make_pair(CART_POLE, mode, num_envs, hooks="compiled")
     assert run_side_by_side(ours, theirs, mode, 60) >= 2 * num_envs
@@ -276,7 +276,7 @@ class Tracking(Drawing):
 
 
 @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
-@pytest.mark.parametrize("num_envs", [3, 70])
+@pytest.mark.parametrize("num_envs", [3, 140])
 def test_tasks_with_observations_of_their_own(mode, num_envs, outside):
     ours, theirs = make_pair(Tracking, mode, num_envs, hooks="compiled")
     assert run_side_by_side(ours, theirs, mode, 40) > 5 * num_envs

@@ -241,10 +241,10 @@ def test_a_product_is_the_sum_in_the_order_of_its_terms(prototype):
         def _reward_policy(self):
             return GAINS[0] * self.state[0] + GAINS[1] * self.state[1]
 
-    envs = [FMUVectorEnv(cls, 70, hooks="compiled") for cls in (Product, Sum)]
+    envs = [FMUVectorEnv(cls, 140, hooks="compiled") for cls in (Product, Sum)]
     for one in envs:
         one.reset(seed=0)
-    actions = np.zeros((70, 1), np.float32)
+    actions = np.zeros((140, 1), np.float32)
     for _ in range(8):
         first, second = (one.step(actions)[1] for one in envs)
         assert first.tolist() == second.tolist()

@@ -237,9 +237,7 @@ EXHAUSTIVE_TESTS = (
 
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
-    return (
-        node_id.startswith(("test_windows_", "test_systems_")) and "::TestInWine" in node_id
-    ) or "wine" in node_id.partition("[")[2]
+    return "::TestInWine" in node_id or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import building
 import fmu_tools
-import wine_tools
 
 SIZES = {"m": 1, "n": 2, "r": 3}
 MATRICES = {
@@ -42,7 +41,7 @@ def state_space_fmu(path, interfaces=("ModelExchange", "CoSimulation"), fixed=Fa
     return fmu_tools.write_fmu(Path(path), files)
 
 
-def _library(model, version, build=building.library):
+def _library(model, version):
     source = f"values/{model}.c"
     prefix = "Model_fmi" if version == 1 else f"fmi{version}"
     stubs = fmu_tools.stubs(version, prefix, building.HERE / source)
@@ -50,11 +49,7 @@ def _library(model, version, build=building.library):
         made = [f"{prefix}{verb}{type_})" for verb in ("Get", "Set") for type_ in TYPES[version]]
         made += [f"{prefix}{verb}String)" for verb in ("Get", "Set")]
         stubs = "".join(f"{line}\n" for line in stubs.split() if not line.endswith(tuple(made)))
-    return build(source, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
-
-
-def _windows_library(source, flags, stubs):
-    return wine_tools.windows_library(source, flags=flags, stubs=stubs)
+    return building.library(source, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
 
 
 def _describe_state_space(interfaces, fixed):
@@ -97,19 +92,16 @@ def _describe_state_space(interfaces, fixed):
     )
 
 
-def feedthrough_fmu(path, version, for_windows=False):
-    """Write an FMU of ``feedthrough.c``, if asked for with a library for Windows only.
+def feedthrough_fmu(path, version):
+    """Write an FMU of ``feedthrough.c``.
 
     Of each type it has ``TYPE_in``, ``TYPE_out``, ``TYPE_parameter`` and ``TYPE_told``. FMI 1.0 and
     2.0 have ``v[1]`` and ``v[2]``, which come out as ``w[1]`` and ``w[2]``; FMI 3.0 has a matrix
     ``v``, which comes out as ``w``.
     """
-    name, build = fmu_tools.library_name(version, "Model"), building.library
-    if for_windows:
-        name, build = f"binaries/{wine_tools.FOLDERS[version]}/Model.dll", _windows_library
     files = {
         "modelDescription.xml": _describe_feedthrough(version),
-        name: _library("feedthrough", version, build),
+        fmu_tools.library_name(version, "Model"): _library("feedthrough", version),
     }
     return fmu_tools.write_fmu(Path(path), files)
 

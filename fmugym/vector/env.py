@@ -36,8 +36,9 @@ from fmugym.vector.arguments import (
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.compiled import CompiledEngine, find_programs
+from fmugym.vector.engines.compiled import CompiledEngine
 from fmugym.vector.engines.per_env import PerEnvEngine
+from fmugym.vector.engines.programs import find_programs
 from fmugym.vector.hooks.check import CURE, find_difference
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
@@ -241,8 +242,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 environments that this step resets, unless the class has its own ``step``.
 
         Returns:
-            Observations, rewards (float64), terminated, truncated, infos; all are new arrays. A
-            reward that is not finite is a fault, as an FMU that fails.
+            Observations, rewards (float64), terminated, truncated, infos. The arrays belong to the
+            caller; the memory of arrays that nobody holds any more may be used again. A reward that
+            is not finite is a fault, as an FMU that fails.
 
         Raises:
             ConfigError: If the actions do not fit, or a hook returns what cannot be used.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
@@ -23,13 +22,13 @@ from fmugym.task.readings import Readings
 from fmugym.task.snapshot import Columns
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
-from fmugym.vector.codec import coded, with_masks
+from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import Row, UntraceableError
+from fmugym.vector.hooks.program import Row
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.infos import (
     final_infos,
@@ -40,7 +39,7 @@ from fmugym.vector.infos import (
 )
 from fmugym.vector.streams import given_draws
 
-__all__ = ["CompiledEngine", "find_programs"]
+__all__ = ["CompiledEngine"]
 
 logger = logging.getLogger(__name__)
 
@@ -49,53 +48,11 @@ _BOOL = np.dtype(np.bool_)
 _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
-_WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
-"""Magnitudes of other states that programs are compared with hooks on."""
-
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
 
 _make_result: Callable[[tuple[Any, ...]], StepResult] = partial(tuple.__new__, StepResult)
 """Takes a third of the time of a NamedTuple's constructor."""
-
-
-def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
-    """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
-
-    Args:
-        env: A prototype whose hooks work on arrays.
-        required: Whether hooks that cannot be compiled are an error.
-
-    Returns:
-        The programs, or None.
-
-    Raises:
-        ConfigError: If the programs are required, but the hooks cannot be compiled.
-    """
-    try:
-        _require_playable(env)
-        task = trace_hooks(env)
-        require_same(env, sample_states(env, (1.0,)), task)
-        with suppress(IndexError):  # hooks may look up what is not in their tables
-            require_same(env, sample_states(env, _WILD_SCALES), task)
-    except Exception as reason:  # hooks may raise anything
-        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
-        if required:
-            raise ConfigError(text) from None
-        logger.info("%s. They run on arrays, which is slower", text)
-        return None
-    for why in task.left.values():
-        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
-        if required:
-            raise ConfigError(text)
-        logger.info("%s. It runs on arrays, the others are compiled", text)
-    return task
-
-
-def _require_playable(env: FMUEnv) -> None:
-    """Refuse environments that the native pool cannot play, whatever their hooks are."""
-    if not env._open_pool("a vector environment").can_play:
-        raise UntraceableError("the pool is not the native one")
 
 
 class CompiledEngine(BatchEngine):
@@ -140,7 +97,7 @@ class CompiledEngine(BatchEngine):
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
         self._make_rows(task)
-        layout = _Layout(task, self.env)
+        layout = Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
         n, flags = self._n, ((self._n,), _BOOL)
         arrays = (*layout.shapes, ((n,), np.dtype(np.float64)), flags, flags)
@@ -594,55 +551,6 @@ def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
     """Whether all variables that are drawn have kept the type of a draw."""
     types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
     return all(dtype == np.float64 for dtype in types)
-
-
-class _Layout:
-    """The arrays that a program or the pool fills, and the observations and infos in them.
-
-    Args:
-        task: The programs.
-        env: The environment, with the arrays of N.
-
-    Attributes:
-        shapes: The shape and type of each array.
-        names: None if the observations are the only array; the keys if they are a dict; otherwise
-            empty.
-        divided: Returns the observations and a new dict of infos that such arrays hold. None if
-            what ``new_arrays`` makes are the observations.
-    """
-
-    def __init__(self, task: TracedTask, env: FMUEnv) -> None:
-        self._n = len(env.step_count)
-        self._paths = [array.path for array in task.seen]
-        self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
-        self.names: tuple[str, ...] | None = ()
-        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
-        if not task.seen and env._pool_observes:
-            self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
-            self.names, self.divided = None, None
-        elif self._paths == [("observation",)]:
-            self.names, self.divided = None, None
-        elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
-            self.names, self.divided = tuple(path[-1] for path in self._paths), None
-
-    def new_arrays(self) -> Any:
-        """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
-        arrays = tuple(np.empty(shape, dtype) for shape, dtype in self.shapes)
-        if self.names is None:
-            return arrays[0]
-        return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
-
-    def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
-        """The observations and infos of any form."""
-        tree: dict[str, Any] = {"observation": {}, "info": {}}
-        for path, array in zip(self._paths, arrays, strict=True):
-            *parents, name = path
-            place = tree
-            for parent in parents:
-                place = place.setdefault(parent, {})
-            place[name] = array
-        infos = with_masks(tree["info"], np.ones(self._n, np.bool_)) if tree["info"] else {}
-        return tree["observation"], infos
 
 
 def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

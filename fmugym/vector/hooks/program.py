@@ -1,6 +1,6 @@
 """Programs: hooks in the form that the native pool runs.
 
-A program is a list of instructions on typed registers, each for 64 environments at a time. The
+A program is a list of instructions on typed registers, each for 128 environments at a time. The
 native pool runs it in the same pass as the FMU's step. What IEEE 754 settles is computed by the
 pool itself, everything else by the inner loops of numpy's own functions.
 """

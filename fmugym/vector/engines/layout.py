@@ -1,0 +1,63 @@
+"""The arrays that a compiled step fills, and the observations and infos in them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from fmugym.env import FMUEnv
+from fmugym.vector.codec import with_masks
+from fmugym.vector.hooks.trace import TracedTask
+
+__all__ = ["Layout"]
+
+
+class Layout:
+    """The arrays that a program or the pool fills, and the observations and infos in them.
+
+    Args:
+        task: The programs.
+        env: The environment, with the arrays of N.
+
+    Attributes:
+        shapes: The shape and type of each array.
+        names: None if the observations are the only array; the keys if they are a dict; otherwise
+            empty.
+        divided: Returns the observations and a new dict of infos that such arrays hold. None if
+            what ``new_arrays`` makes are the observations.
+    """
+
+    def __init__(self, task: TracedTask, env: FMUEnv) -> None:
+        self._n = len(env.step_count)
+        self._paths = [array.path for array in task.seen]
+        self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
+        self.names: tuple[str, ...] | None = ()
+        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
+        if not task.seen and env._pool_observes:
+            self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
+            self.names, self.divided = None, None
+        elif self._paths == [("observation",)]:
+            self.names, self.divided = None, None
+        elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
+            self.names, self.divided = tuple(path[-1] for path in self._paths), None
+
+    def new_arrays(self) -> Any:
+        """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
+        arrays = tuple(np.empty(shape, dtype) for shape, dtype in self.shapes)
+        if self.names is None:
+            return arrays[0]
+        return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
+
+    def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
+        """The observations and infos of any form."""
+        tree: dict[str, Any] = {"observation": {}, "info": {}}
+        for path, array in zip(self._paths, arrays, strict=True):
+            *parents, name = path
+            place = tree
+            for parent in parents:
+                place = place.setdefault(parent, {})
+            place[name] = array
+        infos = with_masks(tree["info"], np.ones(self._n, np.bool_)) if tree["info"] else {}
+        return tree["observation"], infos

@@ -1,0 +1,96 @@
+/* What is prepared for playing, and a turn of it. For the files that prepare it and that play. */
+
+#ifndef FMUGYM_PLAYING_H
+#define FMUGYM_PLAYING_H
+
+#include "programs.h"
+#include "results.h"
+
+enum {
+    STARTS,
+    STATES,
+    COUNTS,
+    ENDED,
+    CURRENT,
+    PREVIOUS,
+    NO_ACTION,
+    KEPT,
+    PLAY_BUFFERS
+};
+
+enum { MOST_DIMENSIONS = 8 };
+
+/* The result of prepare_play. It never changes; the next call replaces it as a whole. */
+typedef struct {
+    Play play;
+    PyProgram inputs, judgement;
+    Py_buffer buffers[PLAY_BUFFERS];
+    Py_buffer *row_buffers; /* two for each copy, one for each variable and variable's start */
+    size_t number_of_row_buffers;
+    RowCopy *copies;
+    VariableStart *variable_starts;
+    DrawnVariable *drawn_variables;
+    InputStart *input_starts;
+    int action_letter, action_dimensions;
+    Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
+    PyObject *start; /* the Access of the variables set before initialization */
+    PyObject *draws;
+    Results *results; /* NULL if only rollouts follow */
+} Playing;
+
+/* Of a capsule that prepare_play has made. */
+Playing *playing_of(PyObject *capsule);
+
+/* Whether the pool itself fills the observations, instead of the program. */
+bool pool_observes(const Playing *playing);
+
+/* One call that plays: */
+
+enum {
+    ACTIONS,
+    SEEN,
+    REWARDS,
+    TERMINATED,
+    TRUNCATED,
+    DRAWN,
+    LAST,
+    STARTED,
+    MASK,
+    TURN_BUFFERS
+};
+
+enum { STEP_ACTIONS, STEP_DRAWN, STEP_LAST, STEP_STARTED, STEP_ARGUMENTS };
+
+typedef struct {
+    Py_buffer buffers[TURN_BUFFERS];
+    Py_buffer seen_buffers[MOST_SEEN], last_buffers[MOST_SEEN];
+    char *seen[MOST_SEEN], *last_seen[MOST_SEEN];
+    size_t seen_sizes[MOST_SEEN];
+    Turn turn;
+    Call call;
+    bool bad_action;
+    size_t troubled;
+    Ends ends;
+} PyTurn;
+
+/* Takes memory that must have so many bytes, whatever its items are. */
+bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
+
+/* Takes what the steps of the turn write: one array that the pool fills itself, or those that the
+ * program stores. */
+bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t);
+
+/* Clears what is used of the many buffers. */
+void clear_turn(const Playing *playing, PyTurn *t);
+void release_turn(const Playing *playing, PyTurn *t);
+
+/* Lets the turn and its call refer to the buffers. */
+void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
+
+/* Whether a hook looked up an index outside of a table, which is an exception. */
+bool is_outside(const PyTurn *t);
+
+/* Returns false with an exception if nothing is prepared. */
+bool is_prepared(const PyPool *self);
+
+#endif
