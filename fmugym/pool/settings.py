@@ -57,7 +57,8 @@ _START_TIME: Final = 255
 """Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
 
 _CLOCK: Final = struct.Struct("=IIdqqdqqq")
-_CLOCKED: Final = struct.Struct("=II")
+_CLOCKED: Final = struct.Struct("=III")
+_NO_CLOCK: Final = 2**32 - 1
 _NUMBER: Final = struct.Struct("=d")
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
@@ -210,9 +211,13 @@ def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
             for c in clocks
         ),
         b"".join(
-            _CLOCKED.pack(variable.value_reference, indices[reference])
+            _CLOCKED.pack(variable.value_reference, indices[reference], variable.size)
             for variable in description.clocked_inputs
             for reference in variable.clocks
+        )
+        + b"".join(
+            _CLOCKED.pack(variable.value_reference, _NO_CLOCK, variable.size)
+            for variable in description.arrays_beside_clocked
         ),
     )
 

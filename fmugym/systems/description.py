@@ -141,7 +141,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         fixed_internal_step_size=None,
         capabilities=_capabilities(plan, parts),
         variables=variables,
-        state_derivatives=_state_derivatives(plan, parts),
+        derivatives=_derivatives(plan, parts),
         findings=plan.findings,
         error_categories=tuple(sorted({c for part in parts for c in part.error_categories})),
         units=_units(parts),
@@ -151,11 +151,11 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
     )
 
 
-def _state_derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, str]:
+def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, str]:
     return {
         f"{component.name}.{state}": f"{component.name}.{derivative}"
         for component, part in zip(plan.components, parts, strict=True)
-        for state, derivative in part.state_derivatives.items()
+        for state, derivative in part.derivatives.items()
     }
 
 
