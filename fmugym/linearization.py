@@ -7,14 +7,14 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription, Variable
 from fmugym.archive.fmu import FMU, StandsForFMU
-from fmugym.archive.texts import with_texts
+from fmugym.archive.texts import number_of, with_texts
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
@@ -23,7 +23,7 @@ from fmugym.fmi.status import Status
 from fmugym.fmi.system import open_library
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
-from fmugym.task.interface import checked_value, start_variable
+from fmugym.task.interface import checked_value, start_values
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
 
@@ -68,7 +68,7 @@ def linearize(
     *,
     states: str | Sequence[str] | None = None,
     inputs: str | Sequence[str] | None = None,
-    at: Mapping[str, float | str] | None = None,
+    at: Mapping[str, Any] | None = None,
 ) -> LinearModel:
     """Linearize an FMU or a system at the point it reaches by its initialization.
 
@@ -81,7 +81,7 @@ def linearize(
         fmu: Its path; or an ``FMU``, whose ``limits``, ``preload`` and ``probe_timeout`` are used;
             or an ``FMUSystem``.
         states: Names of continuous states, or one name; by default all that the FMU declares. The
-            other states are held constant.
+            other states are held constant. The name of an array stands for its elements.
         inputs: Names of continuous inputs, or one name; by default all of them.
         at: Values by name, set before initialization: start values of states, inputs, parameters.
 
@@ -124,8 +124,8 @@ def _require_derivatives(description: ModelDescription) -> None:
         )
     if not description.state_derivatives:
         raise ConfigError(
-            f"{name} cannot be linearized: its ModelStructure declares no scalar derivatives "
-            "of continuous states"
+            f"{name} cannot be linearized: its ModelStructure declares no derivatives of "
+            "continuous states"
         )
 
 
@@ -152,9 +152,10 @@ def _require_chain(description: SystemDescription) -> None:
 
 def _inputs(description: ModelDescription) -> list[str]:
     return [
-        v.name
+        one.name
         for v in description.variables.values()
-        if (v.causality, v.variability, v.kind, v.shape) == ("input", "continuous", "real", ())
+        if (v.causality, v.variability, v.kind) == ("input", "continuous", "real")
+        for one in v.elements
     ]
 
 
@@ -166,26 +167,27 @@ def _chosen(
 ) -> Variables:
     """Look up the chosen variables, or all known ones if none were chosen."""
     names = known if names is None else (names,) if isinstance(names, str) else names
-    for name in names:
-        variable = description.variable(name)
-        if name not in known:
+    chosen = tuple(variable for name in names for variable in description.scalars(name))
+    for variable in chosen:
+        if variable.name not in known:
             raise ConfigError(
-                f"{name!r} is no {kind} of {description.model_name} but a {variable.variability} "
-                f"{variable.causality}; expected some of: {', '.join(map(repr, known)) or 'none'}"
+                f"{variable.name!r} is no {kind} of {description.model_name} but a "
+                f"{variable.variability} {variable.causality}; expected some of: "
+                f"{', '.join(map(repr, known)) or 'none'}"
             )
-    return tuple(map(description.variable, names))
+    return chosen
 
 
 def _start_values(
-    description: ModelDescription, values: Mapping[str, float | str]
+    description: ModelDescription, values: Mapping[str, Any]
 ) -> dict[Variable, float]:
     """Check the values; a String gets the number of its text."""
     checked: dict[Variable, float] = {}
-    for name, value in values.items():
-        variable = start_variable(description, name, value)
+    for variable, value in start_values(description, values):
         if isinstance(value, str) and variable.kind == "string":
-            variable = with_texts(variable, [value])
-        checked[variable] = checked_value(variable, value)
+            checked[with_texts(variable, [value])] = number_of(value)
+        else:
+            checked[variable] = checked_value(variable, value)
     return checked
 
 

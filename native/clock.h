@@ -34,10 +34,13 @@ typedef struct Clock {
     int64_t by_fractions; /* whether the FMU takes and tells these times as fractions */
 } Clock;
 
+enum { NO_CLOCK = UINT32_MAX };
+
 /* An input that may be set only while a clock ticks. One with several clocks is there once for
- * each. */
+ * each. Arrays that may be set at any time are there, too, without a clock. */
 typedef struct Clocked {
-    uint32_t reference, clock; /* the latter is an index */
+    uint32_t reference, clock; /* the latter is an index, or NO_CLOCK */
+    uint32_t size;             /* the number of values */
 } Clocked;
 
 /* What is kept of a clock, and saved with the state. Its next tick is so many intervals after the

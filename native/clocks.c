@@ -301,7 +301,7 @@ bool clocks_own(const Solver *me, uint32_t reference) {
     bool own = false;
 
     for (size_t i = 0; i < s->number_of_clocked; i++) {
-        own |= s->clocked[i].reference == reference;
+        own |= s->clocked[i].reference == reference && s->clocked[i].clock != NO_CLOCK;
     }
     return own;
 }

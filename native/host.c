@@ -233,6 +233,12 @@ bool host_start(Host *host, const char *const *command, const char *const *envir
     return start(host, command, environment, error, size);
 }
 
+void host_end(Host *host) {
+    end_by_force(host->process);
+    forget(host);
+    host->deaths++;
+}
+
 void host_praise(Host *host) {
     host->deaths = 0;
 }

@@ -37,6 +37,8 @@ bool host_start(Host *host, const char *const *command, const char *const *envir
 /* Sends the packet, and waits for the answer while it passes on messages. If the process has ended or
  * takes too long, returns false, and the process is gone. */
 bool host_ask(Host *host, char code, int patience, char *answer);
+/* Ends a process that is of no use. */
+void host_end(Host *host);
 /* Notes that the process is of use. */
 void host_praise(Host *host);
 

@@ -82,6 +82,7 @@ static bool load(Host *host, const Component *part, char *error, size_t size) {
     TAKE(&host->in, opened);
     if (!opened) {
         snprintf(error, size, "%s", packet_take_text(&host->in));
+        host_end(host);
     }
     return opened;
 }

@@ -172,28 +172,48 @@ static bool is_repeated(LastSet *last, const uint32_t *references, size_t count,
     return false;
 }
 
-/* Sets some of the values that were last set, all of them scalars: those of inputs with this clock,
- * or, if there is no such clock, those of inputs without clocks. */
+/* How many values a reference stands for. */
+static size_t width_of(const Solving *s, uint32_t reference) {
+    for (size_t i = 0; i < s->number_of_clocked; i++) {
+        if (s->clocked[i].reference == reference) {
+            return s->clocked[i].size;
+        }
+    }
+    return 1;
+}
+
+static bool is_due(const Solver *me, uint32_t reference, size_t clock) {
+    const Solving *s = me->solving;
+    bool due = clock == SIZE_MAX && !clocks_own(me, reference);
+
+    for (size_t i = 0; i < s->number_of_clocked; i++) {
+        due |= s->clocked[i].clock == clock && s->clocked[i].reference == reference;
+    }
+    return due;
+}
+
+/* Sets some of the values that were last set: those of inputs with this clock, or, if there is no
+ * such clock, those of inputs without clocks. */
 static Status set_one_by_one(Solved *me, Type type, size_t clock) {
-    const Solving *s = me->solver.solving;
-    const Fmi *fmi = fmi_of(&me->solver);
+    const Solver *solver = &me->solver;
     const LastSet *last = &me->last[type];
-    const size_t size = value_size(fmi, type), count = last->references == NULL ? 0 : last->count;
+    const size_t size = value_size(fmi_of(solver), type);
+    const size_t count = last->references == NULL ? 0 : last->count;
+    size_t place = 0;
     Status status = STATUS_OK;
 
-    if (count > 0 && last->size != count * size) {
-        return solver_fail(&me->solver, "arrays cannot be set together with inputs that have clocks");
-    }
     for (size_t i = 0; i < count && good(status); i++) {
-        bool due = clock == SIZE_MAX && !clocks_own(&me->solver, last->references[i]);
-        for (size_t j = 0; j < s->number_of_clocked; j++) {
-            due |= s->clocked[j].clock == clock && s->clocked[j].reference == last->references[i];
+        const size_t width = width_of(solver->solving, last->references[i]);
+        if ((place + width) * size > last->size) {
+            return STATUS_ERROR;
         }
-        if (due) {
-            status = fmi->set(me->solver.library, me->solver.component, type, &last->references[i],
-                              1, last->bytes + i * size, 1);
-            floats_restore_if_seen(me->solver.floats);
+        if (is_due(solver, last->references[i], clock)) {
+            status = fmi_of(solver)->set(solver->library, solver->component, type,
+                                         &last->references[i], 1, last->bytes + place * size,
+                                         width);
+            floats_restore_if_seen(solver->floats);
         }
+        place += width;
     }
     return status;
 }

@@ -142,7 +142,8 @@ static Status read_source(const Beginning *b, const Route *route, double *values
 /* FMI forbids to set inputs with clocks in Initialization Mode: they get their values in steps. */
 static bool waits_for_clock(const Component *part, uint32_t reference) {
     for (size_t i = 0; i < part->solving.number_of_clocked; i++) {
-        if (part->solving.clocked[i].reference == reference) {
+        const Clocked *clocked = &part->solving.clocked[i];
+        if (clocked->reference == reference && clocked->clock != NO_CLOCK) {
             return true;
         }
     }

@@ -35,14 +35,26 @@ REALS = {
     "alarms": (38, 'causality="output" variability="discrete"'),
     "bad counter": (39, 'causality="parameter" variability="fixed" start="0"'),
 }
+ARRAYS = {
+    "commands": (40, 'causality="input" variability="discrete" clocks="0" start="0 0"'),
+    "samples": (41, 'causality="output" variability="discrete" clocks="0"'),
+    "plains": (42, 'causality="input" variability="continuous" start="0 0"'),
+}
+"""Of two elements each."""
+
 FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
 
 
-def clocks_fmu(path, interface="CoSimulation", event_mode=True, flags="", clocks=None):
-    """Write the FMU with one interface; if its clocks are ``FRACTIONS``, it takes no decimals."""
+def clocks_fmu(
+    path, interface="CoSimulation", event_mode=True, flags="", clocks=None, arrays=False
+):
+    """Write the FMU with one interface; if its clocks are ``FRACTIONS``, it takes no decimals.
+
+    If asked for, it has the arrays.
+    """
     clocks = CLOCKS if clocks is None else clocks
     files = {
-        "modelDescription.xml": _describe(interface, event_mode, flags, clocks),
+        "modelDescription.xml": _describe(interface, event_mode, flags, clocks, arrays),
         fmu_tools.library_name(3, "Clocks"): _library(clocks is not CLOCKS),
     }
     return fmu_tools.write_fmu(Path(path), files)
@@ -55,7 +67,7 @@ def _library(fractions):
     return building.library(source, flags=flags, stubs=stubs)
 
 
-def _describe(interface, event_mode, flags, kinds):
+def _describe(interface, event_mode, flags, kinds, arrays):
     extra = ' canHandleVariableCommunicationStepSize="true"' if interface == "CoSimulation" else ""
     extra += ' hasEventMode="true"' if event_mode and interface == "CoSimulation" else ""
     clocks = "".join(
@@ -68,6 +80,12 @@ def _describe(interface, event_mode, flags, kinds):
         f'<Float64 name="{name}" valueReference="{reference}" {kind}/>'
         for name, (reference, kind) in (REALS | _counts()).items()
     )
+    if arrays:
+        reals += "".join(
+            f'<Float64 name="{name}" valueReference="{reference}" {kind}><Dimension start="2"/>'
+            "</Float64>"
+            for name, (reference, kind) in ARRAYS.items()
+        )
     structure = '<ContinuousStateDerivative valueReference="31"/>'
     return (
         '<fmiModelDescription fmiVersion="3.0" modelName="Clocks" instantiationToken="{clocks}">'

@@ -35,12 +35,14 @@ both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelEx
 def fmu_path(tmp_path_factory):
     folder, made = tmp_path_factory.mktemp("clocks"), {}
 
-    def make(interface="CoSimulation", event_mode=True, building=contextlib.nullcontext):
-        key = interface, event_mode, building
+    def make(
+        interface="CoSimulation", event_mode=True, building=contextlib.nullcontext, arrays=False
+    ):
+        key = interface, event_mode, building, arrays
         if key not in made:
             path = folder / f"clocks{len(made)}.fmu"
             with building():
-                made[key] = clocks_tools.clocks_fmu(path, interface, event_mode)
+                made[key] = clocks_tools.clocks_fmu(path, interface, event_mode, arrays=arrays)
         return made[key]
 
     return make
@@ -51,13 +53,14 @@ def make_pool(request, fmu_path):
     made = []
 
     def make(kind, interface="CoSimulation", n=1, inputs=(), outputs=COUNTS, step=0.1, **spec):
+        arrays = any(name.endswith("]") for name in inputs)
         if kind == "native" and not pools.has_native_pool():
             pytest.skip("the C extension was not built")
         building = contextlib.nullcontext
         if kind == "wine":
             request.getfixturevalue("wine")
             building = wine_tools.building_for_windows
-        fmu = FMU(fmu_path(interface, building=building), probe_timeout=None)
+        fmu = FMU(fmu_path(interface, building=building, arrays=arrays), probe_timeout=None)
         spec = PoolSpec(
             inputs=tuple(map(fmu.variable, inputs)),
             outputs=tuple(map(fmu.variable, outputs)),
@@ -231,6 +234,23 @@ class TestClockedInputs:
         ends = 0.04 * (np.arange(12) + 1)
         held = [max([values[int(t // 0.04)] for t in ticks if t <= e], default=0) for e in ends]
         np.testing.assert_array_equal(found, held)
+
+    @all_kinds
+    @both_interfaces
+    def test_so_do_those_of_arrays(self, make_pool, kind, interface):
+        """Scalars and arrays, with and without clocks, in any order."""
+        inputs = ("plains[2]", "command", "commands[1]", "plain", "plains[1]", "commands[2]")
+        outputs = ("sample", "samples[1]", "samples[2]", "plains[1]", "plains[2]", "plain")
+        pool = make_pool(kind, interface, 2, inputs=inputs, outputs=outputs, step=0.04)
+        start(pool)
+        given = np.random.default_rng(3).uniform(-1, 1, (12, len(inputs), 2))
+        ticks = 0.05 + 0.1 * np.arange(10)
+        for index, values in enumerate(given):
+            found = step(pool, *values)
+            latest = [int(t // 0.04) for t in ticks if t <= 0.04 * (index + 1)]
+            held = given[latest[-1]][[1, 2, 5]] if latest else np.zeros((3, 2))
+            np.testing.assert_array_equal(found[:3], held)
+            np.testing.assert_array_equal(found[3:], values[[4, 0, 3]])
 
 
 class TestStates:

@@ -168,7 +168,7 @@ def test_an_fmu_of_another_exporter_without_derivatives(tmp_path):
 
 def test_an_fmu_that_declares_no_states(tmp_path):
     claim = {'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="1"'}
-    with pytest.raises(fmugym.ConfigError, match="declares no scalar derivatives of continuous"):
+    with pytest.raises(fmugym.ConfigError, match=r"Probe.*no derivatives of"):
         fmugym.linearize(probe_fmu(tmp_path, edits=claim))
 
 

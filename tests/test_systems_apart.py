@@ -253,13 +253,24 @@ class TestResults:
         assert len(set(rows)) == 3
         assert rows[:3] == rows[3:]
 
-    def test_clocks(self, make, tmp_path):
-        path = clocks_tools.clocks_fmu(tmp_path / "Clocks.fmu")
+    @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+    def test_clocks(self, make, tmp_path, interface):
+        """Those that tick by themselves, that the system lets tick, and that the FMU does."""
+        path = clocks_tools.clocks_fmu(tmp_path / "Clocks.fmu", interface)
         plan = system([Planned("c", path)], ())
-        outputs = ["c.x", "c.sample", "c.alarms"]
-        rows = play(make(plan, outputs, inputs=["c.plain"]), 20)
-        pool = make(apart(plan, "c"), outputs, inputs=["c.plain"])
-        assert play(pool, 20).tobytes() == rows.tobytes()
+        outputs = [f"c.count of {name}" for name in clocks_tools.CLOCKS]
+        outputs += ["c.x", "c.sample", "c.bell", "c.strike", "c.countdown"]
+        results = []
+        for one in (plan, apart(plan, "c")):
+            pool = make(one, outputs, inputs=["c.strike", "c.command", "c.pace"])
+            rng = np.random.default_rng(0)
+            assert not reset(pool).any(), pool.failure(0)
+            for _ in range(20):
+                inputs = rng.integers(0, 2, 2), rng.normal(size=2), rng.uniform(0.05, 0.6, 2)
+                assert not pool.step(np.array(inputs))[1].any(), pool.failure(0)
+                results.append(pool.outputs.copy())
+        assert all(np.ptp(row) > 0 for row in np.array(results[:20]).max(axis=2).T[:8])
+        assert np.array(results[:20]).tobytes() == np.array(results[20:]).tobytes()
 
     @pytest.mark.parametrize("version", [1, 2, 3])
     def test_strings_and_messages(self, make, tmp_path, caplog, version):
@@ -394,6 +405,24 @@ class TestFaults:
         play(pool, 2)
         with pytest.raises(SimulationError, match="another instance"):
             pool.restore(snapshot)
+
+    @on_linux
+    def test_a_library_that_is_gone_for_a_while(self, fmus, tmp_path):
+        fmu = SystemFMU(apart(masses([fmus[2], fmus[2]]), "first"))
+        spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
+        pool = local_pool(fmu, spec, 1, LOG, native=True)
+        pool.variable = fmu.variable
+        with contextlib.closing(pool):
+            rows = play(pool, 3)
+            library = fmu.parts[0].extract() / fmu.parts[0].library
+            library.rename(tmp_path / "away")
+            (worker,) = set(children()) - self.others
+            os.kill(worker, signal.SIGKILL)
+            assert pool.step()[1].tolist() == [4]
+            assert pool.reset((), np.zeros((0, 1)))[1].tolist() == [4]
+            assert library.name in pool.failure(0)
+            (tmp_path / "away").rename(library)
+            assert play(pool, 3).tobytes() == rows.tobytes()
 
     @pytest.fixture(autouse=True)
     def note_others(self):

@@ -5,6 +5,7 @@ as one FMU.
 """
 
 import logging
+import os
 import pickle
 from dataclasses import replace
 
@@ -33,7 +34,7 @@ from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import MASTERS, Control, Link, Loop
+from fmugym.systems.plan import MASTERS, Component, Control, Link, Loop
 
 LOG = logging.getLogger("fmugym.test")
 ENGINES = [pytest.param(False, id="python")]
@@ -169,6 +170,24 @@ class TestAgainstClosedForms:
             plan = controlled(replace(pendulums(), master="jacobi"), tolerance)
             errors.append(np.abs(run(plan, names, 0.02, 50) - fine).max())
         assert errors[1] < errors[0] / 3
+
+    @in_each_engine
+    def test_the_pendulum_in_two_parts_comes_near_the_whole(self, fmus, native):
+        """A damper of its own turns the pendulum without friction into the one with friction."""
+        starts, damping = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0)), 0.004
+        path, name = bundled_fmu("Pendulum"), "pendulum.theta_dot"
+        whole = Component("pendulum", path, starts=(*starts, ("b", damping)))
+        free = Component("pendulum", path, starts=(*starts, ("b", 0.0)))
+        damper = linear("damper", fmus[2], d=[[-damping, 0], [0, 0]])
+        links = (
+            Link("pendulum", "theta_dot", "damper", "u1"),
+            Link("damper", "y1", "pendulum", "tau"),
+        )
+        right = run(system([whole], ()), [name], 0.0025, 400, native)[::40]
+        plans = [controlled(system([free, damper], links), x) for x in (1e-3, 1e-5)]
+        errors = [np.abs(run(one, [name], 0.1, 10, native) - right).max() for one in plans]
+        assert np.abs(right).max() > 1.0
+        assert 5 < errors[0] / errors[1] < 20
 
 
 class TestBothEngines:
@@ -308,6 +327,17 @@ def two_houses(**options):
         step_size=600.0,
         **options,
     )
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components")
+@pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only")
+def test_components_in_processes_of_their_own(fmus):
+    """They save and restore states, too."""
+    plan = controlled(masses([fmus[2], fmus[2]]), 1e-4)
+    one, other = plan.components
+    apart = replace(plan, components=(one, replace(other, isolate=True)))
+    names = ("first.y1", *STATISTICS)
+    assert run(apart, names, 0.3, 5).tobytes() == run(plan, names, 0.3, 5).tobytes()
 
 
 class TestFaces:

@@ -13,11 +13,12 @@ import pytest
 import quirk_table
 from exchange_tools import exchange_fmu
 
-from fmugym import FMUSystem
+from fmugym import Component, FMUSystem
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
+from fmugym.tools import cli
 from fmugym.trial import opening
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.rungs import find_rungs
@@ -55,9 +56,12 @@ def trials(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
 
 
-def chain(fmu_of, *tokens, version=2):
-    """Components in a row, the first of which feels the second."""
-    paths = [fmu_of(token, version) for token in tokens]
+def chain(fmu_of, *tokens, version=2, isolate=""):
+    """Components in a row; some have processes of their own."""
+    paths = [
+        Component(fmu_of(token, version), isolate=name in isolate)
+        for name, token in zip(NAMES, tokens, strict=False)
+    ]
     return FMUSystem(
         dict(zip(NAMES, paths, strict=False)),
         [
@@ -177,6 +181,15 @@ class TestMethods:
         assert found[2].tobytes() != right.tobytes()
         assert found[2].tobytes() == found[1].tobytes() != found[0].tobytes()
 
+    @pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components")
+    @pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only")
+    def test_of_components_in_processes_of_their_own(self, fmu_of):
+        tokens = "well behaved", "reset does nothing", "well behaved"
+        methods = (RESTORE, INSTANCE, RESTORE)
+        one = episodes(chain(fmu_of, *tokens), True, methods)
+        other = episodes(chain(fmu_of, *tokens, isolate="bc"), True, methods)
+        assert [rows.tobytes() for rows in one] == [rows.tobytes() for rows in other]
+
     def test_both_engines_agree(self, fmu_of):
         if not has_native_pool():
             pytest.skip("no C extension was built")
@@ -295,6 +308,18 @@ class TestTrial:
         verdict = verdict_of(chain(fmu_of, *["well behaved"] * 3))
         assert verdict.reset_method is RESTORE
         assert verdict.components == ()
+
+    def test_info_tells_it(self, fmu_of, tmp_path, capsys):
+        system = chain(fmu_of, "well behaved", "reset does nothing")
+        archive = system.write(tmp_path / "chain.ssp")
+        system = FMUSystem.read(archive)
+        verdict_of(system)
+        assert cli.main(["info", str(archive)]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        (one,) = (line for line in lines if line.strip().startswith("a:"))
+        (other,) = (line for line in lines if line.strip().startswith("b:"))
+        assert "'restore'" in one
+        assert "'instance'" in other
 
     def test_a_verdict_is_kept(self, fmu_of):
         system = chain(fmu_of, "well behaved", "reset does nothing")

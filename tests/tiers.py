@@ -6,6 +6,7 @@ in the default run: of a test with many combinations of parameters, it takes eve
 """
 
 SLOW_MODULES = {
+    "test_array_derivatives",
     "test_benchmarks",
     "test_call_order",
     "test_cli_advice",
@@ -54,6 +55,7 @@ SLOW_MODULES = {
     "test_systems_control",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_linear_inputs",
     "test_systems_linearization",
     "test_systems_parts",
     "test_systems_resets",
@@ -81,6 +83,7 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_array_derivatives": 3,
     "test_compile": 3,
     "test_copies": 2,
     "test_declared_sensors": 5,

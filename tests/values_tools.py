@@ -26,16 +26,19 @@ TYPES = {1: _OLD, 2: _OLD, 3: _NEW}
 FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
 
 
-def state_space_fmu(path, interfaces=("ModelExchange", "CoSimulation"), fixed=False):
+def state_space_fmu(
+    path, interfaces=("ModelExchange", "CoSimulation"), fixed=False, derivatives=""
+):
     """Write an FMU of ``state_space.c``.
 
     Args:
         path: Its file.
         interfaces: The elements of those that it offers.
         fixed: Whether the sizes of its arrays are numbers instead of structural parameters.
+        derivatives: The kind that it says to provide: ``"Directional"`` or ``"Adjoint"``.
     """
     files = {
-        "modelDescription.xml": _describe_state_space(interfaces, fixed),
+        "modelDescription.xml": _describe_state_space(interfaces, fixed, derivatives),
         fmu_tools.library_name(3, "Model"): _library("state_space", 3),
     }
     return fmu_tools.write_fmu(Path(path), files)
@@ -52,8 +55,9 @@ def _library(model, version):
     return building.library(source, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
 
 
-def _describe_state_space(interfaces, fixed):
-    offers = "".join(f'<{name} modelIdentifier="Model" {FLAGS}/>' for name in interfaces)
+def _describe_state_space(interfaces, fixed, derivatives):
+    flags = f'{FLAGS} provides{derivatives}Derivatives="true"' if derivatives else FLAGS
+    offers = "".join(f'<{name} modelIdentifier="Model" {flags}/>' for name in interfaces)
     variables = '<Float64 name="time" valueReference="0" causality="independent"/>'
     references = {}
     for reference, (name, size) in enumerate(SIZES.items(), start=1):

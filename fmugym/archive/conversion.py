@@ -74,7 +74,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         fixed_internal_step_size=_time(offer, "fixedInternalStepSize"),
         capabilities=_capabilities(source, root, interface, offer),
         variables=variables,
-        state_derivatives=_state_derivatives(source),
+        derivatives=_derivatives(source),
         findings=_findings(source),
         error_categories=_error_categories(root),
         units=_units(root),
@@ -180,10 +180,10 @@ def _error_categories(root: Any) -> tuple[str, ...]:
     return tuple(name for name in chosen if name)[:_MOST_CATEGORIES]
 
 
-def _state_derivatives(source: Any) -> dict[str, str]:
+def _derivatives(source: Any) -> dict[str, str]:
     """Read the derivatives in ModelStructure, but for those that do not name their states."""
     derivatives = [unknown.variable for unknown in source.derivatives]
-    return {d.derivative.name: d.name for d in derivatives if d.derivative and not d.shape}
+    return {d.derivative.name: d.name for d in derivatives if d.derivative}
 
 
 def _interfaces(source: Any) -> tuple[str, ...]:

@@ -423,8 +423,8 @@ class ModelDescription:
             gives no usable value.
         tolerance: Of the default experiment; None where the FMU gives no usable value.
         variables: The variables by name, in the order of the XML.
-        state_derivatives: For each scalar continuous state that the FMU declares, the name of its
-            derivative.
+        derivatives: For each continuous state that the FMU declares, a scalar or an array, the name
+            of its derivative.
         findings: Rules of the standard that the file breaks, as texts.
         error_categories: The declared log categories of errors and warnings.
         units: The units that the XML defines, by name.
@@ -446,7 +446,7 @@ class ModelDescription:
     fixed_internal_step_size: float | None
     capabilities: Capabilities
     variables: Mapping[str, Variable]
-    state_derivatives: Mapping[str, str]
+    derivatives: Mapping[str, str]
     findings: tuple[str, ...]
     error_categories: tuple[str, ...] = ()
     units: Mapping[str, Unit] = field(default_factory=dict)
@@ -459,6 +459,21 @@ class ModelDescription:
     def fmi_major_version(self) -> int:
         """1, 2 or 3."""
         return int(self.fmi_version.split(".")[0])
+
+    @cached_property
+    def state_derivatives(self) -> Mapping[str, str]:
+        """For each continuous state, a scalar or an element, the name of its derivative.
+
+        Raises:
+            ConfigError: If an array of states has too many elements to name each.
+        """
+        pairs = ((self.variables[x], self.variables[d]) for x, d in self.derivatives.items())
+        return {
+            own.name: rate.name
+            for state, derivative in pairs
+            if state.shape == derivative.shape
+            for own, rate in zip(state.elements, derivative.elements, strict=True)
+        }
 
     @cached_property
     def strings(self) -> frozenset[str]:
@@ -491,6 +506,19 @@ class ModelDescription:
         known = {clock.value_reference for clock in self.clocks}
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
+
+    def can_interpolate(self, variable: Variable) -> bool:
+        """Whether an input may change linearly within a step; it must be a continuous Real, too."""
+        return self.capabilities.can_interpolate_inputs
+
+    @cached_property
+    def arrays_beside_clocked(self) -> tuple[Variable, ...]:
+        """The arrays that may be set in steps, but without clocks, where some inputs have these."""
+        if not self.clocked_inputs:
+            return ()
+        clocked = {variable.name for variable in self.clocked_inputs}
+        arrays = (v for v in self.variables.values() if v.shape and v.settable_in_step)
+        return tuple(v for v in arrays if v.name not in clocked)
 
     @property
     def has_reset(self) -> bool:

@@ -71,6 +71,8 @@ class ExchangeInstance(Instance):
             self._solver = Solver(equations, self._solving or Solving(), self._complain)
             inputs = self._description.clocked_inputs
             self._clocked = {v.value_reference: v.clocks for v in inputs}
+            arrays = (*inputs, *self._description.arrays_beside_clocked)
+            self._widths = {v.value_reference: v.size for v in arrays}
             self._last: dict[str, _LastSet] = {}
         return self._solver
 
@@ -165,10 +167,12 @@ class ExchangeInstance(Instance):
     def _set_some(self, c_type: str, wanted: Callable[[int], bool]) -> None:
         """Set those of the values that were last set whose references are wanted."""
         _, references, values = self._last[c_type]
+        place = 0
         for i, reference in enumerate(references.tolist()):
+            begin, place = place, place + self._widths.get(reference, 1)
             if wanted(reference):
-                one = slice(i, i + 1)
-                _, set_, arguments = super().prepare_access(c_type, references[one], values[one])
+                own = references[i : i + 1], values[begin:place]
+                _, set_, arguments = super().prepare_access(c_type, *own)
                 status = sane(set_(*arguments))
                 if status > Status.WARNING:
                     raise CallError(status)

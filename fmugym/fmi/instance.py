@@ -49,6 +49,41 @@ Initialize = Callable[[Span, Callable[[], None]], None]
 """Takes the span of the simulation and the function that sets the start values."""
 
 
+class _Moved(NamedTuple):
+    """Variables as FMI moves them: each array as a whole, and once.
+
+    Attributes:
+        references: The value references.
+        places: Where the value of each variable is among all values.
+        size: The number of these.
+    """
+
+    references: npt.NDArray[np.uint32]
+    places: list[int]
+    size: int
+
+    @classmethod
+    def of(cls, variables: Sequence[Variable]) -> _Moved:
+        """Find the places of variables."""
+        firsts: dict[Any, int] = {}
+        references, places, size = [], [], 0
+        for index, variable in enumerate(variables):
+            key = index if variable.array is None else variable.array
+            if key not in firsts:
+                firsts[key] = size
+                references.append(variable.value_reference)
+                size += variable.size
+            places.append(firsts[key] + variable.place)
+        return cls(np.array(references, np.uint32), places, size)
+
+    @property
+    def arguments(self) -> tuple[Any, ...]:
+        """The references and their number, for a call."""
+        return self.references.ctypes.data_as(ctypes.c_void_p), ctypes.c_size_t(
+            len(self.references)
+        )
+
+
 class Instance(ABC):
     """One instance of an FMU; made by ``Library.instantiate``.
 
@@ -393,8 +428,10 @@ class Instance(ABC):
         """Differentiate variables by others at the current communication point.
 
         Args:
-            unknowns: The variables to differentiate: outputs or derivatives, scalar reals.
-            knowns: The variables to differentiate by: continuous inputs or states, scalar reals.
+            unknowns: The variables to differentiate: outputs or derivatives, real scalars and
+                elements of arrays.
+            knowns: The variables to differentiate by: continuous inputs or states, of the same
+                kinds.
 
         Returns:
             The partial derivatives, shape (len(unknowns), len(knowns)), in the variables' units.
@@ -419,23 +456,25 @@ class Instance(ABC):
         self, kind: str, unknowns: Sequence[Variable], knowns: Sequence[Variable]
     ) -> npt.NDArray[np.float64]:
         """Differentiate all unknowns by one known, or, adjoint, one unknown by all knowns."""
-        seeded, other = (unknowns, knowns) if kind == "Adjoint" else (knowns, unknowns)
-        sensitivity, seed = np.zeros(len(other)), ctypes.c_double(1.0)
-        references = [
-            ((ctypes.c_uint32 * len(some))(*(v.value_reference for v in some)), len(some))
-            for some in (unknowns, knowns)
-        ]
+        seeded, others = (_Moved.of(some) for some in (unknowns, knowns))
+        if kind == "Directional":
+            seeded, others = others, seeded
+        seed, sensitivity = np.zeros(seeded.size), np.zeros(others.size)
+        seed[seeded.places] = 1.0
+        first, second = (seeded, others) if kind == "Adjoint" else (others, seeded)
         status = self._function(f"Get{kind}Derivative")(
             self._component,
-            *(part for array, n in references for part in (array, ctypes.c_size_t(n))),
-            ctypes.byref(seed),
-            *self._trailing_arguments(1),
+            *first.arguments,
+            *second.arguments,
+            seed.ctypes.data_as(ctypes.c_void_p),
+            *self._trailing_arguments(seeded.size),
             sensitivity.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(len(other)),
+            *self._trailing_arguments(others.size),
         )
         word = "of" if kind == "Adjoint" else "by"
-        self.check(f"the derivative {word} {seeded[0].name!r}", status)
-        return sensitivity
+        name = (unknowns if kind == "Adjoint" else knowns)[0].name
+        self.check(f"the derivative {word} {name!r}", status)
+        return sensitivity[others.places]
 
     # FMU state, where the FMU offers it (FMI 2.0 and 3.0).
 

@@ -57,7 +57,8 @@ _START_TIME: Final = 255
 """Stands for a type where the start time is meant; ``native/access.h`` has the same number."""
 
 _CLOCK: Final = struct.Struct("=IIdqqdqqq")
-_CLOCKED: Final = struct.Struct("=II")
+_CLOCKED: Final = struct.Struct("=III")
+_NO_CLOCK: Final = 2**32 - 1
 _NUMBER: Final = struct.Struct("=d")
 
 _OLD_NAMES: Final = {"Real": "Float64", "Integer": "Int32"}
@@ -160,6 +161,8 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
 
 def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
     """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    if isinstance(description, SystemDescription):  # its components have their own
+        return None
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
@@ -193,6 +196,8 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
         return 1
     if description.uses_event_mode:
         return 2
+    if isinstance(description, SystemDescription):
+        return 0
     return 3 if spec.ramped else 0
 
 
@@ -206,9 +211,13 @@ def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:
             for c in clocks
         ),
         b"".join(
-            _CLOCKED.pack(variable.value_reference, indices[reference])
+            _CLOCKED.pack(variable.value_reference, indices[reference], variable.size)
             for variable in description.clocked_inputs
             for reference in variable.clocks
+        )
+        + b"".join(
+            _CLOCKED.pack(variable.value_reference, _NO_CLOCK, variable.size)
+            for variable in description.arrays_beside_clocked
         ),
     )
 

@@ -76,6 +76,13 @@ class SystemDescription(ModelDescription):
         """See ``ModelDescription.components``."""
         return self.parts
 
+    def can_interpolate(self, variable: Variable) -> bool:
+        """See ``ModelDescription.can_interpolate``; all components behind the variable can."""
+        numbers = [end.part for end in self.ends[variable.value_reference]]
+        return all(
+            number != MASTER and self.parts[number].can_interpolate(variable) for number in numbers
+        )
+
     @cached_property
     def clocks(self) -> tuple[Variable, ...]:
         """The clocks of all components: outputs tell whether one ticked, and some inputs let it."""
@@ -134,7 +141,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         fixed_internal_step_size=None,
         capabilities=_capabilities(plan, parts),
         variables=variables,
-        state_derivatives=_state_derivatives(plan, parts),
+        derivatives=_derivatives(plan, parts),
         findings=plan.findings,
         error_categories=tuple(sorted({c for part in parts for c in part.error_categories})),
         units=_units(parts),
@@ -144,11 +151,11 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
     )
 
 
-def _state_derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, str]:
+def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, str]:
     return {
         f"{component.name}.{state}": f"{component.name}.{derivative}"
         for component, part in zip(plan.components, parts, strict=True)
-        for state, derivative in part.state_derivatives.items()
+        for state, derivative in part.derivatives.items()
     }
 
 

@@ -60,14 +60,16 @@ def overview_of_system(
         {"components": list(group.components), "is_loop": group.loop is not None}
         for group in system.order.groups
     ]
+    resets = (facts["trial"] or {}).get("component_resets", {})
     facts["system"] = {
         "components": [
-            _component(system, name) | {"runs": where}
+            _component(system, name) | {"runs": where, "begins_by": resets.get(name)}
             for name, where in fmu.whereabouts_by_name.items()
         ],
         "connections": [asdict(link) for link in system.links],
         "connectors": [asdict(connector) for connector in system.connectors],
         "master": system.master,
+        "error_tolerance": None if system.control is None else system.control.tolerance,
         "order": groups,
         "loops": [[asdict(link) for link in loop] for loop in system.order.loops],
     }
@@ -111,11 +113,17 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
         "file": facts["path"],
         "this machine": f"does NOT run here: {obstacles}" if obstacles else "runs here",
         "step": "not given" if step is None else f"{step:g} s",
-        "master": facts["system"]["master"],
+        "master": _master(facts["system"]),
         "order": " -> ".join(map(_group, facts["system"]["order"])),
     }
     for name, value in rows.items():
         yield f"  {name:<20}{plain(value)}"
+
+
+def _master(system: Mapping[str, Any]) -> str:
+    tolerance = system["error_tolerance"]
+    sizes = "" if tolerance is None else f", step sizes by an error tolerance of {tolerance:g}"
+    return f"{system['master']}{sizes}"
 
 
 def _group(group: Mapping[str, Any]) -> str:
@@ -133,7 +141,8 @@ def _parts(system: Mapping[str, Any]) -> Iterator[str]:
         text = f"{one['name']}: {Path(one['fmu']).name}, FMI {one['fmi_version']} {kind}"
         tool = f", by {one['generation_tool']}" if one["generation_tool"] else ""
         steps = f", {one['steps']} steps in one of the system" if one["steps"] > 1 else ""
-        yield f"  {plain(text + tool + steps + _WHEREABOUTS[one['runs']])}"
+        begins = f", episodes begin by {one['begins_by']!r}" if one["begins_by"] else ""
+        yield f"  {plain(text + tool + steps + _WHEREABOUTS[one['runs']] + begins)}"
     yield f"\nConnections ({len(system['connections'])})"
     for link in system["connections"]:
         yield f"  {plain(_link(link))}"

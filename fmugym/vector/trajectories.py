@@ -110,7 +110,8 @@ def linearize_along(
         snapshot: Of one environment, where the trajectory begins.
         actions: The nominal actions, shape (horizon, ...).
         states: Names of states; or the name of the start variable of each, such as
-            ``{"q": "q_0"}``, where that is another one. By default those that the FMU declares.
+            ``{"q": "q_0"}``, where that is another one. The name of an array stands for its
+            elements. By default those that the FMU declares.
         method: By default ``"directional"`` where the FMU offers it for these states, otherwise
             ``"differences"``.
         step: For differences: how far a state is moved, as a fraction of its largest magnitude in
@@ -174,11 +175,18 @@ def _states(env: FMUEnv, given: Any) -> dict[str, str]:
             f"expected names of states of {_name(env)}, or a dict with their start variables, got "
             f"{shown(given)}"
         )
-    found = dict(given) if isinstance(given, Mapping) else {name: name for name in given}
-    for name in found:
-        variable = description.variable(name)
-        if (variable.kind, variable.shape) != ("real", ()):
-            raise ConfigError(f"{name!r} cannot be a state: it is no scalar Real")
+    pairs = given.items() if isinstance(given, Mapping) else ((name, name) for name in given)
+    found: dict[str, str] = {}
+    for name, start in pairs:
+        states, starts = description.scalars(name), description.scalars(start)
+        if len(states) != len(starts):
+            raise ConfigError(
+                f"{start!r} has {len(starts)} elements, expected {len(states)} as {name!r}"
+            )
+        for variable, own in zip(states, starts, strict=True):
+            if variable.kind != "real":
+                raise ConfigError(f"{variable.name!r} cannot be a state: it is no Real")
+            found[variable.name] = own.name
     return found
 
 

@@ -19,13 +19,14 @@ enum { INSTANTIATED, INITIALIZING, EVENT, CONTINUOUS };
 /* Value references: clocks, their counts, the times of their last ticks, and others. */
 enum { CONSTANT, FIXED, CALCULATED, TUNABLE, CHANGING, COUNTDOWN, STRIKE, BELL, CLOCKS };
 enum { COUNT = 10, LAST = 20, X = 30, DER_X, PERIOD, PACE, COMMAND, SAMPLE, PLAIN, EAGER, ALARM, BAD };
+enum { COMMANDS = 40, SAMPLES, PLAINS, END_OF_ARRAYS, SIZE = 2 }; /* arrays */
 
 typedef struct {
     int mode;
     bool exchange, active[CLOCKS], counts_down;
     double time, x, next_alarm, countdown;
     double fixed_interval, period, pace, command, sample, plain, eager, alarms, bad_counter;
-    double count[CLOCKS], last[CLOCKS];
+    double count[CLOCKS], last[CLOCKS], commands[SIZE], samples[SIZE], plains[SIZE];
 } Model;
 
 #define REQUIRE(condition)                                                                         \
@@ -259,6 +260,7 @@ int fmi3UpdateDiscreteStates(Model *me, bool *again, bool *terminate, bool *nomi
     }
     if (me->active[CONSTANT]) {
         me->sample = me->command;
+        memcpy(me->samples, me->commands, sizeof me->samples);
     }
     if (me->active[COUNTDOWN]) {
         me->counts_down = false;
@@ -289,6 +291,9 @@ static double *place_of(Model *me, unsigned reference) {
     case EAGER: return &me->eager;
     case ALARM: return &me->alarms;
     case BAD: return &me->bad_counter;
+    case COMMANDS: return me->commands;
+    case SAMPLES: return me->samples;
+    case PLAINS: return me->plains;
     }
     if (reference >= COUNT && reference < COUNT + CLOCKS) {
         return &me->count[reference - COUNT];
@@ -299,27 +304,38 @@ static double *place_of(Model *me, unsigned reference) {
     return NULL;
 }
 
+static size_t size_of(unsigned reference) {
+    return reference >= COMMANDS && reference < END_OF_ARRAYS ? SIZE : 1;
+}
+
+static bool is_clocked(unsigned reference) {
+    return reference == COMMAND || reference == COMMANDS;
+}
+
 int fmi3GetFloat64(Model *me, const unsigned *references, size_t count, double *values,
                    size_t number_of_values) {
-    REQUIRE(count == number_of_values);
-    for (size_t i = 0; i < count; i++) {
+    size_t done = 0;
+
+    for (size_t i = 0; i < count; done += size_of(references[i++])) {
         const double *place = place_of(me, references[i]);
-        REQUIRE(place != NULL);
-        values[i] = *place;
+        REQUIRE(place != NULL && done + size_of(references[i]) <= number_of_values);
+        memcpy(values + done, place, size_of(references[i]) * sizeof *place);
     }
-    return OK;
+    return done == number_of_values ? OK : ERROR;
 }
 
 int fmi3SetFloat64(Model *me, const unsigned *references, size_t count, const double *values,
                    size_t number_of_values) {
-    REQUIRE(count == number_of_values && me->mode != CONTINUOUS);
-    for (size_t i = 0; i < count; i++) {
+    size_t done = 0;
+
+    REQUIRE(me->mode != CONTINUOUS);
+    for (size_t i = 0; i < count; done += size_of(references[i++])) {
         double *place = place_of(me, references[i]);
-        REQUIRE(place != NULL);
-        REQUIRE(references[i] != COMMAND || me->mode == INSTANTIATED || me->active[CONSTANT]);
-        *place = values[i];
+        REQUIRE(place != NULL && done + size_of(references[i]) <= number_of_values);
+        REQUIRE(!is_clocked(references[i]) || me->mode == INSTANTIATED || me->active[CONSTANT]);
+        memcpy(place, values + done, size_of(references[i]) * sizeof *place);
     }
-    return OK;
+    return done == number_of_values ? OK : ERROR;
 }
 
 /* Co-simulation */

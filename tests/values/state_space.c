@@ -298,6 +298,69 @@ int fmi3GetNominalsOfContinuousStates(Model *me, double *nominals, size_t count)
     return count == me->n ? OK : ERROR;
 }
 
+/* Derivatives */
+
+static size_t size_of(const Model *me, unsigned reference) {
+    return reference == U ? me->m : reference == Y ? me->r : me->n;
+}
+
+/* The derivative of an array by another one; NULL if there is none. */
+static const double *derivative(const Model *me, unsigned unknown, unsigned known) {
+    if ((unknown != Y && unknown != RATES) || (known != X && known != U)) {
+        return NULL;
+    }
+    return unknown == RATES ? (known == X ? me->a : me->b) : (known == X ? me->c : me->d);
+}
+
+static size_t sum_of_sizes(const Model *me, const unsigned *references, size_t count) {
+    size_t sum = 0;
+    for (size_t i = 0; i < count; i++) {
+        sum += size_of(me, references[i]);
+    }
+    return sum;
+}
+
+static int differentiate(const Model *me, bool adjoint, const unsigned *unknowns, size_t rows,
+                         const unsigned *knowns, size_t columns, const double *seed,
+                         size_t seed_size, double *values, size_t value_count) {
+    const size_t height = sum_of_sizes(me, unknowns, rows), width = sum_of_sizes(me, knowns, columns);
+    size_t top = 0;
+
+    if (seed_size != (adjoint ? height : width) || value_count != (adjoint ? width : height)) {
+        return ERROR;
+    }
+    memset(values, 0, value_count * sizeof *values);
+    for (size_t i = 0; i < rows; top += size_of(me, unknowns[i++])) {
+        size_t left = 0;
+        for (size_t j = 0; j < columns; left += size_of(me, knowns[j++])) {
+            const double *matrix = derivative(me, unknowns[i], knowns[j]);
+            const size_t n = size_of(me, unknowns[i]), m = size_of(me, knowns[j]);
+            for (size_t k = 0; matrix != NULL && k < n * m; k++) {
+                const size_t row = top + k / m, column = left + k % m;
+                values[adjoint ? column : row] += matrix[k] * seed[adjoint ? row : column];
+            }
+            if (matrix == NULL) {
+                return ERROR;
+            }
+        }
+    }
+    return OK;
+}
+
+int fmi3GetDirectionalDerivative(Model *me, const unsigned *unknowns, size_t rows,
+                                 const unsigned *knowns, size_t columns, const double *seed,
+                                 size_t seed_size, double *values, size_t value_count) {
+    return differentiate(me, false, unknowns, rows, knowns, columns, seed, seed_size, values,
+                         value_count);
+}
+
+int fmi3GetAdjointDerivative(Model *me, const unsigned *unknowns, size_t rows,
+                             const unsigned *knowns, size_t columns, const double *seed,
+                             size_t seed_size, double *values, size_t value_count) {
+    return differentiate(me, true, unknowns, rows, knowns, columns, seed, seed_size, values,
+                         value_count);
+}
+
 /* FMU states */
 
 int fmi3GetFMUState(Model *me, void **state) {
