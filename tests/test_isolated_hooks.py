@@ -76,8 +76,29 @@ class Sampled(fmugym.FMUEnv):
         return np.abs(self.state[2]) > 0.2
 
 
+class TwoPendulums(fmugym.FMUEnv):
+    """A system."""
+
+    def __init__(self):
+        pendulum = fmugym.bundled_fmu("Pendulum")
+        config = {
+            "model_input_names": "a.tau",
+            "model_output_names": ["a.theta", "b.theta"],
+            "model_parameters": {"a.theta_0": fmugym.Uniform(-0.1, 0.1), "b.theta_0": 0.3},
+            "bounds": {"a.tau": (-0.1, 0.1)},
+            "time_step": 0.02,
+            "max_episode_steps": 9,
+        }
+        super().__init__(fmugym.FMUSystem({"a": pendulum, "b": pendulum}, []), config)
+
+    def _is_done(self):
+        return np.abs(self.state[0]) > 3.0
+
+
 @each_mode
-@pytest.mark.parametrize("cls", [Short, CART_POLE, Sampled, Tracking, Delayed, Goal, Tables])
+@pytest.mark.parametrize(
+    "cls", [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables]
+)
 def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""
     isolated = make(cls, 70, autoreset_mode=mode)

@@ -55,6 +55,7 @@ SLOW_MODULES = {
     "test_systems_control",
     "test_systems_description",
     "test_systems_faces",
+    "test_systems_linear_inputs",
     "test_systems_linearization",
     "test_systems_parts",
     "test_systems_resets",

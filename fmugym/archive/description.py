@@ -507,6 +507,10 @@ class ModelDescription:
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
+    def can_interpolate(self, variable: Variable) -> bool:
+        """Whether an input may change linearly within a step; it must be a continuous Real, too."""
+        return self.capabilities.can_interpolate_inputs
+
     @cached_property
     def arrays_beside_clocked(self) -> tuple[Variable, ...]:
         """The arrays that may be set in steps, but without clocks, where some inputs have these."""

@@ -12,7 +12,7 @@ import struct
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -896,7 +896,7 @@ class SystemLibrary(Library):
         self.close = weakref.finalize(self, _close, self._instances, self._libraries, fmu)
         try:
             for part, known in zip(fmu.parts, layout.parts, strict=True):
-                self._libraries.append(_load(part, known.label, target, solving))
+                self._libraries.append(_load(part, known, target, solving))
         except BaseException:
             self.close()
             raise
@@ -932,16 +932,18 @@ class SystemLibrary(Library):
 
 
 def _load(
-    part: LoadableFMU, label: str, target: logging.Logger, solving: Solving | None
+    part: LoadableFMU, layout: PartLayout, target: logging.Logger, solving: Solving | None
 ) -> Library:
     if part.is_apart:
         raise FMULoadError(
-            f"{label}: it runs in a process of its own, which only the C extension can give it"
+            f"{layout.label}: it runs in a process of its own, which only the C extension can give "
+            "it"
         )
+    ramps = tuple(variable.value_reference for variable in layout.ramped)
     try:
-        return Library(part, target, solving)
+        return Library(part, target, None if solving is None else replace(solving, ramps=ramps))
     except FMULoadError as error:
-        raise FMULoadError(f"{label}: {error}") from None
+        raise FMULoadError(f"{layout.label}: {error}") from None
 
 
 def _instantiate(library: Library, label: str, hear_all: bool) -> Instance:
@@ -983,4 +985,7 @@ def open_library(
     description = fmu.description
     if not isinstance(description, SystemDescription):
         return Library(fmu, target, solving)
-    return SystemLibrary(fmu, Layout(description, inputs, outputs), target, solving, resets)
+    ramps = () if solving is None else solving.ramps
+    ramped = [variable for variable in inputs if variable.value_reference in ramps]
+    layout = Layout(description, inputs, outputs, ramped)
+    return SystemLibrary(fmu, layout, target, solving, resets)

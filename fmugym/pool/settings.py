@@ -161,6 +161,8 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
 
 def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
     """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    if isinstance(description, SystemDescription):  # its components have their own
+        return None
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
@@ -194,6 +196,8 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
         return 1
     if description.uses_event_mode:
         return 2
+    if isinstance(description, SystemDescription):
+        return 0
     return 3 if spec.ramped else 0
 
 

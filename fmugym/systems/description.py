@@ -76,6 +76,13 @@ class SystemDescription(ModelDescription):
         """See ``ModelDescription.components``."""
         return self.parts
 
+    def can_interpolate(self, variable: Variable) -> bool:
+        """See ``ModelDescription.can_interpolate``; all components behind the variable can."""
+        numbers = [end.part for end in self.ends[variable.value_reference]]
+        return all(
+            number != MASTER and self.parts[number].can_interpolate(variable) for number in numbers
+        )
+
     @cached_property
     def clocks(self) -> tuple[Variable, ...]:
         """The clocks of all components: outputs tell whether one ticked, and some inputs let it."""

@@ -181,15 +181,16 @@ class Interface:
             ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real.
         """
         names = self.config.ramped_inputs
-        if names and not self.description.capabilities.can_interpolate_inputs:
-            raise ConfigError(
-                f"config key 'input_interpolation': {self.description.model_name} "
-                f"(FMI {self.description.fmi_version}) cannot interpolate inputs, which is an "
-                "option of FMI 1.0 and 2.0 for co-simulation; its inputs can only hold"
-            )
         inputs = {variable.name: variable for variable in self.inputs}
         ramped = tuple(inputs[name] for name in names)
         for variable in ramped:
+            if not self.description.can_interpolate(variable):
+                raise ConfigError(
+                    f"config key 'input_interpolation': {self.description.model_name} "
+                    f"(FMI {self.description.fmi_version}) cannot interpolate inputs, "
+                    "which is an option of FMI 1.0 and 2.0 for co-simulation; "
+                    f"{variable.name!r} can only hold"
+                )
             found = variable.kind, variable.variability, variable.causality, variable.shape
             if found != ("real", "continuous", "input", ()):
                 raise ConfigError(

@@ -32,6 +32,7 @@ from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
+from fmugym.systems.fmu import SystemFMU
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     is_known_to_harm,
@@ -164,6 +165,20 @@ def _prepare_wine(
     except BaseException:
         fmu.close()
         raise
+
+
+def _prepare_components(fmu: FMU) -> None:
+    """Make Wine ready for components that need it: this may take longer than a trial waits.
+
+    Raises:
+        FMULoadError: If Wine is missing.
+    """
+    if isinstance(fmu, SystemFMU) and "wine" in fmu.whereabouts_by_name.values():
+        try:
+            Wine.ready()
+        except BaseException:
+            fmu.close()
+            raise
 
 
 def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
@@ -340,6 +355,7 @@ class _Plan:
         if self.reset_method not in (None, *ResetMethod):
             raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
         if not fmu.in_wine:
+            _prepare_components(fmu)
             return self
         _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
         return replace(self, native=True, threads=1, private_libraries=None, isolation="process")

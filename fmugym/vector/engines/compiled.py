@@ -313,14 +313,6 @@ class CompiledEngine(BatchEngine):
             self._find_done()
         return super().columns(indices)
 
-    def evaluate(
-        self, function: Callable[[Any], Sequence[Any]], actions: Any, indices: IndexArray
-    ) -> FloatArray:
-        """See ``Engine.evaluate``."""
-        if self._prepared:
-            self._find_done()
-        return super().evaluate(function, actions, indices)
-
     def call(
         self,
         name: str,

@@ -65,6 +65,7 @@ class PerEnvEngine(Engine):
         fits = shared.dtype == space.dtype and shared.shape[1:] == space.shape
         observes = is_default and fits
         self._observed_by_pool = stack if isinstance(stack, ArrayStack) and observes else None
+        self._observed = None if self._observed_by_pool is None else IN_POOL
 
     def close(self) -> None:
         """See ``Engine.close``."""
@@ -147,12 +148,13 @@ class PerEnvEngine(Engine):
         told = self._told() if self._together else repeat((0, ()))
         if self._observed_by_pool is not None:
             self._observed_by_pool.put_all(self._pool.observations)
-        for index, (env, action, one) in enumerate(zip(self._envs, items, told, strict=False)):
+        each = zip(self._envs, items, told, strict=False)
+        for index, (env, action, (status, outputs)) in enumerate(each):
             if idle[index]:
                 observation, info = self._reset(index, None, {})
                 reward, ended, cut_off = 0.0, False, False
             else:
-                result = self._stepped(index, env, action, *one)
+                result = self._stepped(index, env, action, status, outputs)
                 observation, reward, ended, cut_off, info = result
             if observation is not IN_POOL:
                 self._stack.put(index, observation)
@@ -195,8 +197,7 @@ class PerEnvEngine(Engine):
             if not self._together:
                 return env.step(action)
             env.step_count += 1
-            seen = None if self._observed_by_pool is None else IN_POOL
-            result = env._conclude(self._columns[index], status, outputs, seen)
+            result = env._conclude(self._columns[index], status, outputs, self._observed)
         except FMUGymError as error:
             raise _located(error, index) from error
         env._in_hooks = False
