@@ -143,8 +143,8 @@ def _require_chain(description: SystemDescription) -> None:
         if not parts[link.source].variable(link.output).is_scalar:
             raise ConfigError(
                 f"{plan.name} cannot be linearized: {link.source}.{link.output} -> "
-                f"{link.target}.{link.input} carries elements of arrays, and linear models take "
-                "scalars only"
+                f"{link.target}.{link.input} carries elements of arrays, and the chain rule is "
+                "applied to connections of scalars only"
             )
     if not description.state_derivatives:
         raise ConfigError(f"{plan.name} cannot be linearized: its components declare no states")

@@ -19,7 +19,7 @@ __all__ = ["Engine", "StepResult"]
 
 
 class StepResult(NamedTuple):
-    """The result of a step of N environments; all arrays are new."""
+    """The result of a step of N environments; no later step changes arrays that somebody holds."""
 
     observations: Any
     rewards: FloatArray
