@@ -2,11 +2,13 @@
 
 import pickle
 
+import foreign_talker
 import numpy as np
 import pytest
 import test_strings
 import values_tools
 import wine_tools
+from pythonfmu import FmuBuilder
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv
@@ -163,6 +165,19 @@ def test_components_of_a_system(feedthrough, version, options):
         env.step(0)
         assert env.state == (test_strings.SIZES[word], 2.0)
         assert (env.out["a.String_told"], env.out["b.String_told"]) == (word, "zz")
+    env.close()
+
+
+@pools
+def test_an_fmu_of_another_exporter(tmp_path, options):
+    path = FmuBuilder.build_FMU(foreign_talker.__file__, dest=tmp_path)
+    config = {"monitor_names": "said"}
+    config |= {"model_parameters": {"word": Choice(WORDS)}}
+    env = test_strings.Reading(path, **config, **options)
+    env.reset(seed=2)
+    for time in ("0.0", "0.1"):
+        env.step(0)
+        assert env.out["said"] == f"{test_strings.drawn_words(2, 1)[0]} at {time}"
     env.close()
 
 
