@@ -5,10 +5,11 @@ from functools import partial
 import fmu_tools
 import numpy as np
 import pytest
+import test_array_derivatives
 from test_derivatives import DT, HORIZON, Precise
 from test_linearization import POINTS
 from test_trajectories import STARTS, TORQUES, along
-from wine_tools import exchange_fmu, for_windows
+from wine_tools import building_for_windows, exchange_fmu, for_windows
 
 import fmugym
 from fmugym import SimulationError, bundled_fmu, linearize
@@ -66,6 +67,13 @@ class TestInWine:
         assert model.A.tolist() == expected
         assert model.f.tolist() == [-0.5, 3.0 * (1.0 - 1.5**2) * -0.5 - 1.5]
         assert linearize(path, states="x2").A.shape == (1, 1)
+
+    @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+    @pytest.mark.parametrize("kind", ["Directional", "Adjoint"])
+    def test_of_arrays(self, tmp_path, kind, interface):
+        with building_for_windows():
+            test_array_derivatives.test_the_matrices_come_out(tmp_path, kind, interface)
+            test_array_derivatives.test_some_elements(tmp_path, kind)
 
     def test_an_fmu_that_fails(self, tmp_path):
         flag = ' providesDirectionalDerivative="true"'
