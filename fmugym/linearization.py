@@ -12,9 +12,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.archive.texts import number_of, with_texts
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_option
 from fmugym.declared.devices import DEVICE_KEYS, IDEAL, Device, read_device
 from fmugym.declared.entries import Entry

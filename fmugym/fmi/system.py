@@ -18,8 +18,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.chain import chained_jacobian

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status

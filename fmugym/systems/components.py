@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fmugym.archive.description import INTERFACES, Variable, unlisted
+from fmugym.archive.description import INTERFACES
 from fmugym.archive.fmu import FMU
 from fmugym.archive.structure import Feedthrough
+from fmugym.archive.variable import Variable, unlisted
 from fmugym.checks import (
     check_count,
     check_flag,

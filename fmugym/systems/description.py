@@ -10,13 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive.description import (
-    MOST_ELEMENTS,
-    Capabilities,
-    ModelDescription,
-    Unit,
-    Variable,
-)
+from fmugym.archive.description import Capabilities, ModelDescription, Unit
+from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.plan import STATISTICS, Connector, End, SystemPlan
 

@@ -9,8 +9,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable, unlisted
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import with_texts
+from fmugym.archive.variable import Variable, unlisted
 from fmugym.checks import LARGEST_COUNT, check_number, integer_of, parts_of_array
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, is_distribution

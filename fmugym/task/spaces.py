@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task.interface import Interface, checked_value
 

@@ -15,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.fmi.status import Status

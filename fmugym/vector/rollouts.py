@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable, unlisted
+from fmugym.archive.variable import Variable, unlisted
 from fmugym.checks import check_mapping
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown

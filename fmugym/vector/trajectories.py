@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
