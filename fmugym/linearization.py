@@ -24,7 +24,7 @@ from fmugym.fmi.status import Status
 from fmugym.fmi.system import open_library
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
-from fmugym.task.interface import checked_value, start_values
+from fmugym.task.starting import checked_value, start_values
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
 

@@ -18,7 +18,8 @@ from fmugym.declared.values import number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
-from fmugym.task.interface import checked, input_variable, output_variable, spread
+from fmugym.task.roles import input_variable, output_variable
+from fmugym.task.starting import checked, spread
 
 __all__ = [
     "VARIABLE_KEYS",

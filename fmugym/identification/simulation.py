@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.task.interface import checked_value
+from fmugym.task.starting import checked_value
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Simulator"]

@@ -15,7 +15,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
-from fmugym.task.interface import checked_value
+from fmugym.task.starting import checked_value
 from fmugym.task.values import ParameterValues
 from fmugym.trial.rehearsal import Starts
 

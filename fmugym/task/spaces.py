@@ -22,7 +22,8 @@ from gymnasium import spaces
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
-from fmugym.task.interface import Interface, checked_value
+from fmugym.task.interface import Interface
+from fmugym.task.starting import checked_value
 
 __all__ = [
     "action_space",

@@ -22,8 +22,8 @@ from fmugym.errors import FMUGymError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
-from fmugym.task.interface import checked_value
 from fmugym.task.opening import PoolOpening
+from fmugym.task.starting import checked_value
 
 __all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
 
