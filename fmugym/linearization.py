@@ -21,7 +21,7 @@ from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
 from fmugym.task.starting import checked_value, start_values

@@ -22,7 +22,7 @@ from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence
