@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from process_tools import start_values
+from process_tools import faulty_fmu, start_values
 from system_tools import linear, linear_fmu, system
 
 import fmugym
@@ -25,6 +25,7 @@ from fmugym.systems.plan import Component as Planned
 from fmugym.systems.plan import Link
 
 LOG = logging.getLogger("fmugym.test")
+MASSES = ["first.y1", "second.y2"]
 
 where_they_run = [
     pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components"),
@@ -32,14 +33,21 @@ where_they_run = [
 ]
 
 
-def linear_fmus(folder):
-    """Write the FMU of linear equations; returns the paths by FMI version."""
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    """The FMU of linear equations by FMI version."""
+    folder = tmp_path_factory.mktemp("linear")
     return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
 
 
-@contextlib.contextmanager
+@pytest.fixture(scope="module", name="faulty")
+def compiled_faulty(tmp_path_factory):
+    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(name="make")
 def closing_pools():
-    """Make pools of plans that are closed afterwards."""
+    """Make pools of plans that are closed after the test."""
     with contextlib.ExitStack() as stack:
 
         def make(plan, outputs, count=2, inputs=(), time_step=0.1, threads=2, **options):
@@ -54,9 +62,6 @@ def closing_pools():
             return stack.enter_context(contextlib.closing(pool))
 
         yield make
-
-
-MASSES = ["first.y1", "second.y2"]
 
 
 def apart(plan, *names):

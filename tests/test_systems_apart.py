@@ -13,7 +13,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import values_tools
-from apart_tools import (
+from apart_tools import (  # noqa: F401
     LOG,
     MASSES,
     Chain,
@@ -21,8 +21,8 @@ from apart_tools import (
     chain,
     children,
     closing_pools,
+    compiled,
     episodes,
-    linear_fmus,
     play,
     reset,
     where_they_run,
@@ -47,17 +47,6 @@ from fmugym.tools import cli
 from fmugym.trial import opening
 
 pytestmark = where_they_run
-
-
-@pytest.fixture(scope="module", name="fmus")
-def fixture_fmus(tmp_path_factory):
-    return linear_fmus(tmp_path_factory.mktemp("linear"))
-
-
-@pytest.fixture(name="make")
-def fixture_make():
-    with closing_pools() as make:
-        yield make
 
 
 class TestResults:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from apart_tools import (
+from apart_tools import (  # noqa: F401
     LOG,
     MASSES,
     NAMES,
@@ -20,14 +20,14 @@ from apart_tools import (
     asking_for,
     children,
     closing_pools,
+    compiled,
+    compiled_faulty,
     is_running,
-    linear_fmus,
     play,
     reset,
     where_they_run,
     with_fault,
 )
-from process_tools import faulty_fmu
 from system_tools import masses
 
 from fmugym import (
@@ -41,22 +41,6 @@ from fmugym.systems.fmu import SystemFMU
 pytestmark = where_they_run
 
 on_linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="/proc lists processes")
-
-
-@pytest.fixture(scope="module", name="fmus")
-def fixture_fmus(tmp_path_factory):
-    return linear_fmus(tmp_path_factory.mktemp("linear"))
-
-
-@pytest.fixture(name="make")
-def fixture_make():
-    with closing_pools() as make:
-        yield make
-
-
-@pytest.fixture(scope="module", name="faulty")
-def compiled_faulty(tmp_path_factory):
-    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
 
 
 class TestFaults:

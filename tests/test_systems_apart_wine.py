@@ -7,21 +7,21 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
-from apart_tools import (
+from apart_tools import (  # noqa: F401
     MASSES,
     NAMES,
     Chain,
     asking_for,
     chain,
     closing_pools,
+    compiled,
+    compiled_faulty,
     episodes,
-    linear_fmus,
     play,
     reset,
     where_they_run,
     with_fault,
 )
-from process_tools import faulty_fmu
 from system_tools import masses, system
 
 import fmugym
@@ -34,28 +34,6 @@ from fmugym.systems.plan import Component as Planned
 from fmugym.tools import cli
 
 pytestmark = where_they_run
-
-
-@pytest.fixture(scope="module", name="fmus")
-def fixture_fmus(tmp_path_factory):
-    return linear_fmus(tmp_path_factory.mktemp("linear"))
-
-
-@pytest.fixture(name="make")
-def fixture_make():
-    with closing_pools() as make:
-        yield make
-
-
-@pytest.fixture(scope="module", name="faulty")
-def compiled_faulty(tmp_path_factory):
-    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
-
-
-@pytest.fixture(name="wine", scope="module")
-def fixture_wine():
-    if reason := wine_tools.why_not():
-        pytest.skip(reason)
 
 
 @pytest.mark.usefixtures("wine")
