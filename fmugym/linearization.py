@@ -131,7 +131,10 @@ def _require_derivatives(description: ModelDescription) -> None:
 
 
 def _require_chain(description: SystemDescription) -> None:
-    """Whether all components tell their derivatives, and no connection carries an array."""
+    """Refuse a system to which the chain rule does not apply.
+
+    All components must tell their derivatives, and no connection may carry an array.
+    """
     plan = description.plan
     for component, part in zip(plan.components, description.parts, strict=True):
         if not part.capabilities.provides_derivatives:

@@ -21,6 +21,7 @@ __all__ = [
     "UNKNOWN",
     "Interval",
     "Variable",
+    "unknown_rest",
     "unlisted",
 ]
 
@@ -289,6 +290,19 @@ def unlisted(variables: Sequence[Variable]) -> list[Variable]:
     listed = {variable.name for variable in variables}
     arrays = dict.fromkeys(v.array for v in variables if v.array is not None and not v.is_apart)
     return [one for array in arrays for one in array.elements if one.name not in listed]
+
+
+def unknown_rest(variables: Sequence[Variable]) -> tuple[Variable, Variable] | None:
+    """Find an unlisted element whose start value nobody knows, since its array was resized.
+
+    Returns:
+        The element and its array; None if there is no such element.
+    """
+    for missing in unlisted(variables):
+        array = missing.array
+        if array is not None and array.start is None and array.dimensions:
+            return missing, array
+    return None
 
 
 def _number(name: str, text: str) -> float:

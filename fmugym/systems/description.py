@@ -201,14 +201,14 @@ def _statistics(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Iterator
         )
     for reference, (name, text) in enumerate(STATISTICS.items()):
         unit = "s" if name == "step_size" else None
-        yield _own(f"master.{name}", reference, text, unit)
+        yield _statistic(f"master.{name}", reference, text, unit)
     sources = compared(plan, parts).values()
     for reference, (component, one) in enumerate(sources, len(STATISTICS)):
         text = "largest estimated error in the last step"
-        yield _own(f"master.error({component}.{one.name})", reference, text, one.unit)
+        yield _statistic(f"master.error({component}.{one.name})", reference, text, one.unit)
 
 
-def _own(name: str, reference: int, text: str, unit: str | None) -> Variable:
+def _statistic(name: str, reference: int, text: str, unit: str | None) -> Variable:
     kind = "Real", reference, "local", "discrete", "calculated"
     return Variable(name, *kind, unit=unit, description=text)
 

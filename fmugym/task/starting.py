@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.variable import Variable, unlisted
+from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import check_number, integer_of, parts_of_array
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -63,13 +63,13 @@ def check_rest_is_known(variables: Sequence[Variable]) -> None:
     Raises:
         ConfigError: If nobody knows these, because the array has a size of its own.
     """
-    for missing in unlisted(variables):
-        array = missing.array
-        if array is not None and array.start is None and array.dimensions:
-            raise ConfigError(
-                f"there is no value of {missing.name!r}: {array.name!r} has a size of its own, "
-                f"{array.shape}, for which the FMU has no start values; give all elements"
-            )
+    found = unknown_rest(variables)
+    if found is not None:
+        missing, array = found
+        raise ConfigError(
+            f"there is no value of {missing.name!r}: {array.name!r} has a size of its own, "
+            f"{array.shape}, for which the FMU has no start values; give all elements"
+        )
 
 
 def structural_values(description: ModelDescription, given: Mapping[str, Any]) -> dict[str, Any]:
