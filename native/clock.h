@@ -34,7 +34,7 @@ typedef struct Clock {
     int64_t by_fractions; /* whether the FMU takes and tells these times as fractions */
 } Clock;
 
-enum { NO_CLOCK = UINT32_MAX };
+#define NO_CLOCK UINT32_MAX
 
 /* An input that may be set only while a clock ticks. One with several clocks is there once for
  * each. Arrays that may be set at any time are there, too, without a clock. */
