@@ -184,11 +184,10 @@ class Interface:
         inputs = {variable.name: variable for variable in self.inputs}
         ramped = tuple(inputs[name] for name in names)
         for variable in ramped:
-            if not self.description.can_interpolate(variable):
+            unable = self.description.unable_to_interpolate(variable)
+            if unable is not None:
                 raise ConfigError(
-                    f"config key 'input_interpolation': {self.description.model_name} "
-                    f"(FMI {self.description.fmi_version}) cannot interpolate inputs, "
-                    "which is an option of FMI 1.0 and 2.0 for co-simulation; "
+                    f"config key 'input_interpolation': {unable} cannot interpolate inputs, which is an option of FMI 1.0 and 2.0 for co-simulation; "
                     f"{variable.name!r} can only hold"
                 )
             found = variable.kind, variable.variability, variable.causality, variable.shape
@@ -365,7 +364,7 @@ def start_values(
     for name, value in given.items():
         scalars = description.scalars(name)
         for variable, own in zip(scalars, spread(name, scalars, value), strict=True):
-            _check_start(variable, own)
+            _check_start(description, variable, own)
             pair = variable, checked(variable, own)
             found.setdefault(variable.name, pair)
             if variable.name == name:
@@ -441,9 +440,19 @@ def _check_input(description: ModelDescription, variable: Variable) -> None:
     _require_numeric(variable, "an input")
     _require_known_clock(description, variable, "an input")
     if not variable.settable_in_step:
+        _require_not_driven(description, variable, "be an input")
         raise ConfigError(
             f"{variable.name!r} cannot be an input: it is a {variable.variability} "
             f"{variable.causality}; only inputs and tunable parameters may be set between steps"
+        )
+
+
+def _require_not_driven(description: ModelDescription, variable: Variable, what: str) -> None:
+    source = description.what_drives(variable)
+    if source is not None:
+        raise ConfigError(
+            f"{variable.name!r} cannot {what}: it gets its value from {source!r}, which the system "
+            "connects with it"
         )
 
 
@@ -516,11 +525,11 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
             value.
     """
     variable = description.variable(name)
-    _check_start(variable, value)
+    _check_start(description, variable, value)
     return variable
 
 
-def _check_start(variable: Variable, value: Any) -> None:
+def _check_start(description: ModelDescription, variable: Variable, value: Any) -> None:
     name = variable.name
     if variable.ticking:
         raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
@@ -530,6 +539,7 @@ def _check_start(variable: Variable, value: Any) -> None:
             "'model_parameters' of the config"
         )
     if not variable.settable_at_start:
+        _require_not_driven(description, variable, "be set")
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
             f"with initial={variable.initial!r}"
