@@ -200,7 +200,7 @@ class TestComponents:
             Component(HOUSE, interface="cosimulation")
 
     def test_unknown_arguments_are_refused_with_the_nearest_name(self):
-        with pytest.raises(ArgumentError, match="FMUSystem.*'error_tolerence'.*'error_tolerance'"):
+        with pytest.raises(ArgumentError, match=r"FMUSystem.*'error_tolerence'.*'error_tolerance'"):
             FMUSystem({"h": HOUSE}, error_tolerence=1e-3)
 
     def test_a_pickled_system_is_the_same(self):

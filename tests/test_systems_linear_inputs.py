@@ -154,5 +154,5 @@ def test_components_that_cannot_are_refused(fmus):
         {"a": fmus[2], "p": pendulum},
         [Connection("push", "a.u"), Connection("push", "p.tau", convert_units=False)],
     )
-    with pytest.raises(ConfigError, match="component 'p'.*'push'"):
+    with pytest.raises(ConfigError, match=r"component 'p'.*'push'"):
         Env(both)

@@ -62,8 +62,8 @@ class FMUSystem(WiredSystem):
         times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
 
     Raises:
-        ConfigError: If an argument does not fit, a name is unknown, two connections have one target,
-            or units or types do not fit.
+        ConfigError: If an argument does not fit, a name is unknown, two connections have one
+            target, or units or types do not fit.
         ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
         FMULoadError: If an FMU cannot be read.
     """

@@ -187,7 +187,8 @@ class Interface:
             unable = self.description.unable_to_interpolate(variable)
             if unable is not None:
                 raise ConfigError(
-                    f"config key 'input_interpolation': {unable} cannot interpolate inputs, which is an option of FMI 1.0 and 2.0 for co-simulation; "
+                    f"config key 'input_interpolation': {unable} cannot interpolate "
+                    "inputs, which is an option of FMI 1.0 and 2.0 for co-simulation; "
                     f"{variable.name!r} can only hold"
                 )
             found = variable.kind, variable.variability, variable.causality, variable.shape
