@@ -12,18 +12,19 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.archive.texts import number_of, with_texts
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
-from fmugym.task.interface import checked_value, start_values
+from fmugym.task.starting import checked_value, start_values
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
 
@@ -130,7 +131,10 @@ def _require_derivatives(description: ModelDescription) -> None:
 
 
 def _require_chain(description: SystemDescription) -> None:
-    """Whether all components tell their derivatives, and no connection carries an array."""
+    """Refuse a system to which the chain rule does not apply.
+
+    All components must tell their derivatives, and no connection may carry an array.
+    """
     plan = description.plan
     for component, part in zip(plan.components, description.parts, strict=True):
         if not part.capabilities.provides_derivatives:

@@ -25,8 +25,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
 from fmugym.archive.units import conversion_between
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
 from fmugym.declared import Task
 from fmugym.env import FMUEnv

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import values_tools
 from scipy.linalg import expm
-from test_value_types import LARGER, STEP, Env
+from values_tools import LARGER, STEP, Env
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv

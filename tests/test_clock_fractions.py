@@ -15,7 +15,7 @@ from fmpy.fmi3 import FMU3Model
 
 from fmugym import FMU, FMULoadError
 from fmugym import pool as pools
-from fmugym.archive.description import Interval
+from fmugym.archive.variable import Interval
 from fmugym.fmi.clocks import Ticks
 from fmugym.pool import PoolSpec
 from fmugym.trial import opening

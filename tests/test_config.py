@@ -8,7 +8,8 @@ import pytest
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
 from fmugym import FMU, Choice, ConfigError, EnvConfig, Uniform
-from fmugym.task.interface import checked_value, resolve
+from fmugym.task.interface import resolve
+from fmugym.task.starting import checked_value
 
 
 def resolved(path, **changes):

@@ -4,7 +4,7 @@ import fuzz_driver
 import fuzz_systems
 import pytest
 
-from fmugym.fmi import system
+from fmugym.fmi import parts
 from fmugym.pool import has_native_pool
 
 
@@ -21,6 +21,6 @@ def test_a_difference_is_reported(monkeypatch):
     def scaled(gain, offset, value):
         return value if gain == 1.0 and offset == 0.0 else (gain * value + offset) * (1 + 2**-50)
 
-    monkeypatch.setattr(system, "_scaled", scaled)
+    monkeypatch.setattr(parts, "scaled", scaled)
     failures = fuzz_driver.run(fuzz_systems.program, 20, seed="tests").failures
     assert any("step" in failure for failure in failures)

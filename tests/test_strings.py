@@ -6,19 +6,11 @@ import numpy as np
 import pytest
 import values_tools
 from gymnasium import spaces
+from values_tools import VERSIONS, pools, versions
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
 
-POOLS = {
-    "native": {},
-    "python": {"backend": "python"},
-    "isolated": {"isolation": "process"},
-    "isolated python": {"isolation": "process", "backend": "python"},
-}
-pools = pytest.mark.parametrize("options", POOLS.values(), ids=POOLS)
-VERSIONS = (1, 2, 3)
-versions = pytest.mark.parametrize("version", VERSIONS)
 WORDS = ("a", "ünter", "longest of all", "")
 CHOICE = Choice(WORDS)
 SIZES = {word: len(word.encode()) for word in WORDS}

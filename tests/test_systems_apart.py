@@ -1,45 +1,44 @@
-"""Components of a system in processes of their own: isolated ones, and those for Windows in Wine.
+"""Components of a system in processes of their own, isolated ones: what they compute.
 
 What a system computes does not depend on where its components run.
 """
 
 import contextlib
-import logging
-import os
 import pickle
-import shutil
-import signal
-import subprocess
-import sys
-import textwrap
-import time
 from dataclasses import replace
-from pathlib import Path
 
-import building
 import clocks_tools
 import exchange_tools
 import fmu_tools
 import numpy as np
 import pytest
 import values_tools
-import wine_tools
-from process_tools import faulty_fmu, start_values
-from system_tools import linear, linear_fmu, masses, system
+from apart_tools import (  # noqa: F401
+    LOG,
+    MASSES,
+    Chain,
+    apart,
+    chain,
+    children,
+    closing_pools,
+    compiled,
+    episodes,
+    play,
+    reset,
+    where_they_run,
+)
+from system_tools import linear, masses, system
 
 import fmugym
 from fmugym import (
     Component,
     ConfigError,
-    Connection,
     FMULoadError,
     FMUSystem,
-    SimulationError,
     bundled_fmu,
 )
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
-from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import Component as Planned
@@ -47,69 +46,7 @@ from fmugym.systems.plan import Connector, End, Link, Loop
 from fmugym.tools import cli
 from fmugym.trial import opening
 
-LOG = logging.getLogger("fmugym.test")
-
-pytestmark = [
-    pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components"),
-    pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only"),
-]
-
-
-@pytest.fixture(scope="module", name="fmus")
-def compiled(tmp_path_factory):
-    """The FMU of linear equations by FMI version."""
-    folder = tmp_path_factory.mktemp("linear")
-    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
-
-
-@pytest.fixture(scope="module", name="faulty")
-def compiled_faulty(tmp_path_factory):
-    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
-
-
-@pytest.fixture(name="make")
-def closing_pools():
-    """Make pools of plans that are closed after the test."""
-    with contextlib.ExitStack() as stack:
-
-        def make(plan, outputs, count=2, inputs=(), time_step=0.1, threads=2, **options):
-            private = options.pop("private_libraries", False)
-            fmu = SystemFMU(plan)
-            variables = tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs))
-            spec = PoolSpec(*variables, time_step, **options)
-            pool = local_pool(
-                fmu, spec, count, LOG, native=True, threads=threads, private_libraries=private
-            )
-            pool.variable = fmu.variable
-            return stack.enter_context(contextlib.closing(pool))
-
-        yield make
-
-
-def apart(plan, *names):
-    """The same plan with these components in processes of their own."""
-    components = tuple(replace(c, isolate=c.name in names) for c in plan.components)
-    return replace(plan, components=components)
-
-
-def reset(pool, names=(), values=None):
-    variables = tuple(map(pool.variable, names))
-    values = np.zeros((0, pool.num_instances)) if values is None else np.array(values, float)
-    return pool.reset(variables, values)[1]
-
-
-def play(pool, steps=10):
-    """Reset and step; the outputs, shape (steps + 1, k, N)."""
-    assert not reset(pool).any(), pool.failure(0)
-    rows = [pool.outputs.copy()]
-    for _ in range(steps):
-        outputs, statuses = pool.step()
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs.copy())
-    return np.array(rows)
-
-
-MASSES = ["first.y1", "second.y2"]
+pytestmark = where_they_run
 
 
 class TestResults:
@@ -295,234 +232,6 @@ class TestResults:
         assert len(children()) >= 3
 
 
-def children():
-    """The processes that this one has started and that run workers of components."""
-    found = []
-    for process in Path("/proc").iterdir():
-        with contextlib.suppress(OSError):
-            if process.name.isdigit():
-                status = (process / "status").read_text()
-                command = (process / "cmdline").read_bytes()
-                if f"PPid:\t{os.getpid()}\n" in status and b"serve_component" in command:
-                    found.append(int(process.name))
-    return found
-
-
-def is_running(process):
-    """Whether there is such a process, and it is more than a note that it has ended."""
-    try:
-        return "\nState:\tZ" not in Path(f"/proc/{process}/status").read_text()
-    except OSError:
-        return False
-
-
-on_linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="/proc lists processes")
-
-
-def with_fault(fmus, faulty, *, isolate=True):
-    """A component of which every fault can be asked for, after a sound one."""
-    parts = (
-        linear("sound", fmus[2], (1.0, 0.0), a=[[-1, 0], [0, 0]], c=np.eye(2)),
-        Planned("bad", faulty, isolate=isolate),
-    )
-    return system(parts, [Link("sound", "y1", "bad", "u")])
-
-
-NAMES = [f"bad.{name}" for name in start_values()]
-
-
-def asking_for(*faults, stage="step"):
-    """One column of start values for each instance."""
-    return np.array([list(start_values(one, stage).values()) for one in faults], float).T
-
-
-class TestFaults:
-    OUTPUTS = ("bad.y", "sound.y1")
-
-    @pytest.mark.parametrize(
-        ("fault", "cause"),
-        [
-            ("crash", "signal SIGSEGV"),
-            ("abort", "signal SIGABRT"),
-            ("exit", "exit status 0"),
-            ("hang", "call_timeout"),
-        ],
-    )
-    def test_one_ends_the_systems_of_its_worker(self, make, fmus, faulty, fault, cause):
-        timeout = 1.0 if fault == "hang" else 60.0
-        plan = with_fault(fmus, faulty)
-        pool = make(plan, self.OUTPUTS, 4, time_step=0.5, call_timeout=timeout)
-        assert not reset(pool, NAMES, asking_for(fault, "none", "none", "none")).any()
-        pool.step()
-        before = pool.outputs.copy()
-        _, statuses = pool.step()
-        assert statuses.tolist() == [4, 4, 0, 0]
-        assert pool.outputs[:, :2].tobytes() == before[:, :2].tobytes()
-        for text in ("component 'bad'", cause, "this is fault"):
-            assert text in pool.failure(0)
-        assert cause in pool.failure(1)
-        assert "this is fault" not in pool.failure(1)
-        mask = np.array([True, True, False, False])
-        pool.reset(tuple(map(pool.variable, NAMES)), asking_for(*["none"] * 4), mask)
-        assert not pool.step()[1].any()
-        assert pool.outputs[0, 0] == pool.outputs[0, 1] == before[0, 0]
-
-    def test_a_crash_in_an_initialization_harms_no_other_system(self, make, fmus, faulty):
-        pool = make(with_fault(fmus, faulty), self.OUTPUTS, 3, time_step=0.5, threads=1)
-        statuses = reset(pool, NAMES, asking_for("crash", "none", "none", stage="initialize"))
-        assert statuses.tolist() == [4, 0, 0]
-        assert "signal SIGSEGV" in pool.failure(0)
-        assert not pool.step()[1][1:].any()
-
-    def test_a_reset_without_the_fault_begins_anew(self, make, fmus, faulty):
-        """The others of its worker get a new worker, too, and begin where they should."""
-        pool = make(with_fault(fmus, faulty), self.OUTPUTS, 2, time_step=0.5, threads=1)
-        reset(pool, NAMES, asking_for("none", "none"))
-        expected = [pool.step()[0].copy() for _ in range(3)]
-        reset(pool, NAMES, asking_for("crash", "none"))
-        for _ in range(2):
-            pool.step()
-        assert not reset(pool, NAMES, asking_for("none", "none")).any()
-        for row in expected:
-            assert pool.step()[0].tobytes() == row.tobytes()
-
-    def test_it_is_given_up_after_five_deaths_in_a_row(self, make, fmus, faulty):
-        pool = make(with_fault(fmus, faulty), self.OUTPUTS, 1, time_step=0.5)
-        for _ in range(5):
-            assert reset(pool, NAMES, asking_for("crash", stage="initialize")).all()
-        assert reset(pool, NAMES, asking_for("none")).all()
-        assert "5 deaths in a row" in pool.failure(0)
-
-    @on_linux
-    def test_a_snapshot_is_lost_with_its_process(self, make, fmus):
-        pool = make(apart(masses([fmus[2], fmus[2]]), "first"), MASSES, 1)
-        play(pool, 2)
-        snapshot = pool.save()
-        (worker,) = set(children()) - self.others
-        os.kill(worker, signal.SIGKILL)
-        assert pool.step()[1].tolist() == [4]
-        assert "signal SIGKILL" in pool.failure(0)
-        play(pool, 2)
-        with pytest.raises(SimulationError, match="another instance"):
-            pool.restore(snapshot)
-
-    @on_linux
-    def test_a_library_that_is_gone_for_a_while(self, fmus, tmp_path):
-        fmu = SystemFMU(apart(masses([fmus[2], fmus[2]]), "first"))
-        spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
-        pool = local_pool(fmu, spec, 1, LOG, native=True)
-        pool.variable = fmu.variable
-        with contextlib.closing(pool):
-            rows = play(pool, 3)
-            library = fmu.parts[0].extract() / fmu.parts[0].library
-            library.rename(tmp_path / "away")
-            (worker,) = set(children()) - self.others
-            os.kill(worker, signal.SIGKILL)
-            assert pool.step()[1].tolist() == [4]
-            assert pool.reset((), np.zeros((0, 1)))[1].tolist() == [4]
-            assert library.name in pool.failure(0)
-            (tmp_path / "away").rename(library)
-            assert play(pool, 3).tobytes() == rows.tobytes()
-
-    @pytest.fixture(autouse=True)
-    def note_others(self):
-        self.others = set(children()) if Path("/proc/self").exists() else set()
-
-    @on_linux
-    def test_workers_end_with_their_pool(self, make, fmus):
-        pool = make(apart(masses([fmus[2], fmus[2]]), "first"), MASSES, 4, threads=2)
-        play(pool, 2)
-        assert len(set(children()) - self.others) == 2
-        pool.close()
-        assert not set(children()) - self.others
-
-    @on_linux
-    @pytest.mark.parametrize("stage", ["nowhere", "step"])
-    def test_workers_end_with_a_process_that_is_killed(self, fmus, faulty, stage):
-        """Also if the FMU hangs."""
-        script = f"""
-            import numpy as np
-            from test_systems_apart import *
-            plan = with_fault({dict(fmus)!r}, {str(faulty)!r})
-            fmu = SystemFMU(plan)
-            spec = PoolSpec((), (fmu.variable("bad.y"),), 0.5)
-            pool = local_pool(fmu, spec, 1, LOG, native=True)
-            names = tuple(map(fmu.variable, NAMES))
-            pool.reset(names, asking_for("hang", stage={stage!r}))
-            print(*children(), flush=True)
-            for _ in range(10**9):
-                pool.step()
-        """
-        script = textwrap.dedent(script).replace("PosixPath", "Path")
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-        with subprocess.Popen(
-            [sys.executable, "-c", script], stdout=subprocess.PIPE, env=environment
-        ) as parent:
-            worker = int(parent.stdout.readline())
-            time.sleep(0.3)
-            parent.kill()
-        deadline = time.monotonic() + 20
-        while is_running(worker):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-
-    @on_linux
-    @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-    def test_a_fork_gets_workers_of_its_own(self, make, fmus):
-        pool = make(apart(masses([fmus[2], fmus[2]]), "first"), MASSES, 1)
-        rows = play(pool, 5)
-        child = os.fork()
-        if child == 0:
-            try:
-                lost = pool.step()[1].tolist() == [4] and "forked" in pool.failure(0)
-                os._exit(0 if lost and play(pool, 5).tobytes() == rows.tobytes() else 1)
-            finally:
-                os._exit(2)
-        assert os.waitpid(child, 0)[1] == 0
-        assert not pool.step()[1].any()
-
-    def test_a_library_that_cannot_be_loaded(self, fmus):
-        from fmugym import _native
-
-        fmu = SystemFMU(apart(masses([fmus[2], fmus[2]]), "second"))
-        part = fmu.parts[1]
-        shutil.copy(_native.__file__, part.extract() / part.library)
-        with pytest.raises(FMULoadError, match="'second': it does not export fmi2"):
-            local_pool(fmu, PoolSpec((), (), 0.1), 1, LOG, native=True)
-
-
-class Chain(fmugym.FMUEnv):
-    """Pushes the first pendulum of a chain."""
-
-    def __init__(self, source, **options):
-        config = {
-            "model_input_names": ["a.tau"],
-            "model_output_names": ["a.theta", "b.theta"],
-            "model_parameters": {"b.q_0": fmugym.Uniform(-0.2, 0.2)},
-            "time_step": 0.02,
-            "bounds": {"a.tau": (-1, 1)},
-            "max_episode_steps": 20,
-        }
-        super().__init__(source, config, **options)
-
-    def _is_done(self):
-        return abs(self.out["b.theta"]) > 10
-
-
-def chain(first, second=None, **options):
-    """Two pendulums, of which the first drives the second."""
-    components = {"a": Component(first, **options), "b": second or bundled_fmu("Pendulum")}
-    connection = Connection("a.theta", "b.tau", gain=0.5, convert_units=False)
-    return FMUSystem(components, [connection], step_size=0.02)
-
-
-def episodes(env, seed=3):
-    """The observations of a vector environment over the end of its episodes."""
-    env.action_space.seed(seed)
-    first, _ = env.reset(seed=seed)
-    return np.array([first, *(env.step(env.action_space.sample())[0] for _ in range(30))])
-
-
 class Telling(fmugym.FMUEnv):
     """Reads a text that an FMU gives."""
 
@@ -623,81 +332,3 @@ class TestWhereAnFMUStands:
         cli.main(["validate", str(task)])
         told = capsys.readouterr().out
         assert "'a' runs in a process of its own" in told
-
-
-@pytest.fixture(name="wine", scope="module")
-def fixture_wine():
-    if reason := wine_tools.why_not():
-        pytest.skip(reason)
-
-
-@pytest.mark.usefixtures("wine")
-class TestInWine:
-    def test_linear_equations_are_equal_to_the_last_bit(self, make, fmus, tmp_path):
-        """The same source, compiled for Windows."""
-        path = linear_for_windows(fmus[2], tmp_path)
-        plan = masses([fmus[2], fmus[3]])
-        rows = play(make(plan, MASSES))
-        mixed = masses([path, fmus[3]])
-        assert SystemFMU(mixed).whereabouts_by_name == {"first": "wine", "second": "here"}
-        assert play(make(mixed, MASSES)).tobytes() == rows.tobytes()
-
-    @pytest.mark.parametrize("version", [1, 2, 3])
-    def test_model_exchange(self, make, tmp_path, version):
-        """x' = -k x from 1: the closed form."""
-        path = wine_tools.exchange_fmu(tmp_path / "Model.fmu", "dahlquist", version)
-        pool = make(system([Planned("d", path)], ()), ["d.x"], tolerance=1e-8)
-        assert not reset(pool, ["d.k"], [[1.0, 2.0]]).any(), pool.failure(0)
-        for _ in range(10):
-            assert not pool.step()[1].any()
-        np.testing.assert_allclose(pool.outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
-
-    def test_a_pendulum_beside_a_native_one(self, tmp_path):
-        """The libraries differ in their sine and cosine by rounding."""
-        windows = wine_tools.for_windows(bundled_fmu("Pendulum"), tmp_path)
-        results = []
-        for source in map(chain, (bundled_fmu("Pendulum"), windows)):
-            env = fmugym.FMUVectorEnv(lambda s=source: Chain(s), 2)
-            with contextlib.closing(env):
-                results.append(episodes(env))
-        np.testing.assert_allclose(*results, rtol=1e-6, atol=1e-9)
-
-    @pytest.mark.parametrize(
-        ("fault", "cause"), [("crash", "Windows error 0xc0000005"), ("hang", "call_timeout")]
-    )
-    def test_a_death_is_told_with_last_words(self, make, fmus, faulty, tmp_path, fault, cause):
-        path = wine_tools.for_windows(faulty, tmp_path)
-        plan = with_fault(fmus, path, isolate=False)
-        timeout = 2.0 if fault == "hang" else 60.0
-        pool = make(plan, ["bad.y"], 2, time_step=0.5, call_timeout=timeout)
-        assert not reset(pool, NAMES, asking_for(fault, "none")).any()
-        pool.step()
-        assert pool.step()[1].tolist() == [4, 0]
-        for text in ("component 'bad'", cause, "this is fault"):
-            assert text in pool.failure(0)
-        assert not reset(pool, NAMES, asking_for("none", "none")).any()
-
-    def test_preload_is_refused_by_name(self, tmp_path):
-        windows = wine_tools.for_windows(bundled_fmu("Pendulum"), tmp_path)
-        first = fmugym.FMU(windows, preload=["libm.so.6"])
-        with pytest.raises(FMULoadError, match=r"component 'a'.*libm"):
-            Chain(chain(first))
-
-    def test_info_says_so(self, tmp_path, capsys):
-        windows = wine_tools.for_windows(bundled_fmu("Pendulum"), tmp_path)
-        archive = chain(windows).write(tmp_path / "chain.ssp")
-        assert cli.main(["info", str(archive)]) == 0
-        assert "in Wine" in capsys.readouterr().out
-
-
-def linear_for_windows(path, folder):
-    """Copy the FMU of linear equations, of FMI 2.0, with a library for Windows only."""
-    shim = "zoo/fmi2.c"
-    library = wine_tools.windows_library(
-        *("zoo/linear.c", "zoo/usual.c", shim),
-        flags=("-DFMI_VERSION=2",),
-        stubs=fmu_tools.stubs(2, "fmi2", building.HERE / shim),
-    )
-    description = fmu_tools.read_fmu(path)["modelDescription.xml"]
-    files = {"modelDescription.xml": description, "binaries/win64/Zoo.dll": library}
-    return fmu_tools.write_fmu(folder / "linear.fmu", files)

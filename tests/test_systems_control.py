@@ -4,7 +4,6 @@ The reference are closed forms of coupled masses and of a tank with a controller
 as one FMU.
 """
 
-import logging
 import os
 import pickle
 from dataclasses import replace
@@ -14,9 +13,12 @@ import pytest
 from system_tools import (
     COUPLING,
     DAMPING,
+    LOG,
     MASS,
     POSITIONS,
     STIFFNESS,
+    by_each_master,
+    in_each_engine,
     linear,
     linear_fmu,
     masses,
@@ -36,12 +38,6 @@ from fmugym.pool.local import local_pool
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS, Component, Control, Link, Loop
 
-LOG = logging.getLogger("fmugym.test")
-ENGINES = [pytest.param(False, id="python")]
-if has_native_pool():
-    ENGINES.append(pytest.param(True, id="native"))
-in_each_engine = pytest.mark.parametrize("native", ENGINES)
-by_each_master = pytest.mark.parametrize("master", MASTERS)
 STATISTICS = ("master.steps", "master.rejected_steps", "master.step_size", "master.error")
 
 

@@ -9,7 +9,7 @@ from system_tools import linear_fmu
 
 from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
 from fmugym.fmi.access import Access
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 
 MASS, LENGTH, GRAVITY, FRICTION = 0.5, 0.4, 9.81, 0.03
 ANGLES = (0.3, -0.8)

@@ -1,7 +1,9 @@
 """Values of FMUs that have only a library for Windows: the tests of other FMUs, in Wine."""
 
 import pytest
-import test_value_types as values
+import test_value_arrays as arrays
+import test_value_sizes as sizes
+import test_value_types as types
 import values_tools
 from wine_tools import building_for_windows
 
@@ -32,10 +34,10 @@ class TestInWine:
     @pytest.mark.parametrize(
         "test",
         [
-            values.test_numbers_of_every_type_come_out_as_they_went_in,
-            values.test_enumerations_are_discrete,
-            values.test_some_elements_are_inputs,
-            values.test_strings_are_set,
+            types.test_numbers_of_every_type_come_out_as_they_went_in,
+            types.test_enumerations_are_discrete,
+            arrays.test_some_elements_are_inputs,
+            types.test_strings_are_set,
         ],
     )
     def test_values(self, feedthrough, version, test):
@@ -44,21 +46,21 @@ class TestInWine:
     @pytest.mark.parametrize("version", VERSIONS)
     def test_an_fmu_reads_a_file_of_its_resources(self, wine, tmp_path, version):
         with building_for_windows():
-            values.test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, {})
+            types.test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, {})
 
     @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
     @pytest.mark.parametrize("probe", [None, 60.0])
     def test_arrays(self, state_space, sized, interface, probe):
         options = {"interface": interface, "tolerance": 1e-9}
-        values.test_arrays_follow_the_closed_form(state_space, options)
-        values.test_structural_parameters_give_arrays_their_sizes(sized, options, probe)
+        arrays.test_arrays_follow_the_closed_form(state_space, options)
+        sizes.test_structural_parameters_give_arrays_their_sizes(sized, options, probe)
 
     @pytest.mark.parametrize(
         "test",
         [
-            values.test_one_element,
-            values.test_vector_environments_do_as_single_ones,
-            values.test_snapshots,
+            arrays.test_one_element,
+            arrays.test_vector_environments_do_as_single_ones,
+            arrays.test_snapshots,
         ],
     )
     def test_elements(self, state_space, test):
@@ -67,10 +69,10 @@ class TestInWine:
     @pytest.mark.parametrize(
         "test",
         [
-            values.test_each_environment_has_its_own_array,
-            values.test_hooks_on_arrays_of_environments,
-            values.test_parameters_of_one_episode,
-            values.test_rollouts,
+            arrays.test_each_environment_has_its_own_array,
+            arrays.test_hooks_on_arrays_of_environments,
+            arrays.test_parameters_of_one_episode,
+            arrays.test_rollouts,
         ],
     )
     def test_faces(self, state_space, test):

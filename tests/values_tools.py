@@ -1,9 +1,13 @@
-"""FMUs of the models in ``values``, with variables of all types and arrays."""
+"""FMUs of the models in ``values``, with variables of all types and arrays, and environments."""
 
 from pathlib import Path
 
 import building
 import fmu_tools
+import pytest
+from gymnasium import spaces
+
+import fmugym
 
 SIZES = {"m": 1, "n": 2, "r": 3}
 MATRICES = {
@@ -189,3 +193,70 @@ def _document(version, variables):
     else:
         inside = f'<CoSimulation modelIdentifier="Model" {flags}/>{inside}<ModelStructure/>'
     return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
+
+
+STEP = 0.1
+
+POOLS = {
+    "native": {},
+    "python": {"backend": "python"},
+    "isolated": {"isolation": "process"},
+    "isolated python": {"isolation": "process", "backend": "python"},
+}
+
+pools = pytest.mark.parametrize("options", POOLS.values(), ids=POOLS)
+
+VERSIONS = (1, 2, 3)
+
+versions = pytest.mark.parametrize("version", VERSIONS)
+
+WAYS = [
+    options | {"interface": interface, "tolerance": 1e-9}
+    for options in POOLS.values()
+    for interface in ("co_simulation", "model_exchange")
+]
+
+ways = pytest.mark.parametrize(
+    "options", WAYS, ids=lambda options: " ".join(map(str, options.values()))
+)
+
+LARGER = {
+    "n": 3,
+    "m": 2,
+    "r": 1,
+    "A": [[-1, 0.5, 0], [0, -2, 1], [0.1, 0, -3]],
+    "B": [[1, 0], [0, 1], [1, 1]],
+    "C": [[1, 1, 1]],
+    "D": [[0.5, 0]],
+    "x_0": [1, 2, 3],
+}
+
+
+class Env(fmugym.FMUEnv):
+    """An FMU without a task."""
+
+    def __init__(self, path, backend=None, isolation=None, **config):
+        defaults = {"time_step": STEP, "probe_timeout": None}
+        super().__init__(path, defaults | config, backend=backend, isolation=isolation)
+
+    def _is_done(self):
+        return self.out["y"][0] > 1e9 if "y" in self.out else False
+
+
+class Writing(Env):
+    """Writes the same inputs in each step, whatever the action."""
+
+    def __init__(self, path, given, **config):
+        self.given = given
+        super().__init__(path, **config)
+
+    def _get_action_space(self):
+        return spaces.Discrete(2)
+
+    def _get_inputs(self):
+        return self.given
+
+
+def state_space_env(path, **changes):
+    config = {"model_input_names": "u", "model_output_names": ["y", "x"]}
+    return Env(path, **(config | changes))

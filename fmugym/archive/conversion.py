@@ -11,17 +11,13 @@ from typing import Any, Final
 from fmpy.validation import validate_model_description
 
 from fmugym.archive.description import (
-    CLOCK_KINDS,
     INTERFACES,
-    MOST_FRACTIONS,
-    UNKNOWN,
     Capabilities,
-    Interval,
     ModelDescription,
     ModelExchange,
     Unit,
-    Variable,
 )
+from fmugym.archive.variable import CLOCK_KINDS, MOST_FRACTIONS, UNKNOWN, Interval, Variable
 from fmugym.errors import FMULoadError, reason
 
 __all__ = ["convert"]

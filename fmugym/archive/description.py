@@ -1,327 +1,43 @@
 """What an FMU says of itself, in one form for the three FMI versions.
 
-These types hold the rules for which variable may be set when. ``fmugym.archive.reading`` makes them
-from an FMU's XML.
+``fmugym.archive.reading`` makes these types from an FMU's XML.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import fmpy
 
+from fmugym.archive.variable import Variable
 from fmugym.checks import integer_of
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
-    "CLOCK_KINDS",
     "INTERFACES",
-    "MOST_ELEMENTS",
-    "UNKNOWN",
     "Capabilities",
-    "Interval",
     "ModelDescription",
     "ModelExchange",
     "Unit",
-    "Variable",
-    "unlisted",
 ]
 
 INTERFACES = ("co_simulation", "model_exchange")
 """The interfaces by which an FMU may be run, the preferred one first."""
 
 
-_KINDS = {
-    "Real": "real",
-    "Float32": "real",
-    "Float64": "real",
-    "Boolean": "boolean",
-    "Enumeration": "enumeration",
-    "String": "string",
-    "Binary": "binary",
-    "Clock": "boolean",
-    "StartTime": "real",  # no type of FMI; see ``fmugym.pool.spec.START_TIME``
-}
-_INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
-
-
-MOST_ELEMENTS: Final = 100_000
-"""How many elements an array may have of which elements are named."""
-
 _LARGEST_SIZE: Final = 2**31 - 1
 
 _ELEMENT: Final = re.compile(r"(.+)\[(\d{1,9}(?:, ?\d{1,9})*)\]")
 """The name of an element: that of its array, and its indices."""
 
-CLOCK_KINDS = (
-    "constant",
-    "fixed",
-    "calculated",
-    "tunable",
-    "changing",
-    "countdown",
-    "triggered",
-)
-"""The interval variabilities of clocks. Those before the last one have ticks of their own."""
-
-MOST_FRACTIONS: Final = 2**52
-"""The largest counter and resolution of an interval: float64 can hold a few of them exactly."""
-
-
-class Interval(NamedTuple):
-    """A time between two ticks of a clock, or before the first one.
-
-    Attributes:
-        seconds: NaN where only the FMU knows.
-        counter: The same in units of a second divided by the resolution, which is exact.
-        resolution: 0 where the time is no such fraction.
-    """
-
-    seconds: float
-    counter: int = 0
-    resolution: int = 0
-
-    @classmethod
-    def of_fraction(cls, counter: int, resolution: int) -> Interval:
-        """Make one from a fraction of a second; both numbers are at most ``MOST_FRACTIONS``."""
-        return cls(counter / resolution, counter, resolution)
-
-
-UNKNOWN: Final = Interval(math.nan)
-"""Only the FMU knows the interval."""
-
-
-@dataclass(frozen=True, eq=False)
-class Variable:
-    """One variable of the model description, in the terms of the FMI standard.
-
-    Attributes:
-        type: The standard's own name: ``Real``, ``Float64``, ``Int32``, ...
-        start: The start value as the XML has it.
-        minimum, maximum: Infinite where neither the variable nor its declared type gives a number.
-        nominal: None where neither the variable nor its declared type gives a finite number.
-        items: Names and values of an enumeration. Of a String, the texts that it may get and their
-            numbers; see ``fmugym.archive.texts``.
-        shape: The shape of an array (FMI 3.0); () for a scalar.
-        dimensions: Of an array, for each dimension the structural parameter that gives its length;
-            "" for a fixed length.
-        array: Of an element of an array, the array; None for other variables.
-        place: Of an element, its place in the array, in row-major order. 0 in systems.
-        driven: Of an array of a system, the places of the elements that something else drives;
-            None for arrays of FMUs. FMUs get and set arrays as a whole; in systems each element has
-            a value reference of its own, the first one that of the array.
-        clocks: The value references of the clocks that must tick whenever the value changes.
-        ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
-        interval, shift: Of a clock: the time between its ticks and that before the first one.
-        by_fractions: Of a clock: whether the FMU takes and tells these times as fractions.
-    """
-
-    name: str
-    type: str
-    value_reference: int
-    causality: str
-    variability: str
-    initial: str | None
-    start: str | None = None
-    unit: str | None = None
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    nominal: float | None = None
-    description: str = ""
-    items: tuple[tuple[str, int], ...] = ()
-    shape: tuple[int, ...] = ()
-    dimensions: tuple[str, ...] = ()
-    array: Variable | None = None
-    place: int = 0
-    driven: frozenset[int] | None = None
-    clocks: tuple[int, ...] = ()
-    ticking: str = ""
-    interval: Interval = UNKNOWN
-    shift: Interval = UNKNOWN
-    by_fractions: bool = False
-
-    @property
-    def kind(self) -> str:
-        """One of real, integer, boolean, enumeration, string and binary.
-
-        A clock is a Boolean: whether it ticks.
-        """
-        return _KINDS.get(self.type, "integer")
-
-    @property
-    def is_scalar(self) -> bool:
-        """Whether it is neither an array nor an element of one."""
-        return not self.shape and self.array is None
-
-    @property
-    def numeric(self) -> bool:
-        """Whether a float64 can hold it: a scalar real, integer, Boolean or enumeration.
-
-        A clock has no value between its ticks.
-        """
-        return self.is_number and not self.shape and not self.ticking
-
-    @property
-    def is_number(self) -> bool:
-        """Whether float64 can hold its value, or those of its elements."""
-        return self.kind in {"real", "integer", "boolean", "enumeration"}
-
-    @property
-    def is_structural(self) -> bool:
-        """Whether it is a structural parameter: arrays get their sizes by it."""
-        return self.causality == "structuralParameter"
-
-    @property
-    def settable_at_start(self) -> bool:
-        """Whether a value may be set between instantiation and initialization."""
-        if self.variability == "constant" or self.ticking:
-            return False
-        return self.causality == "input" or self.initial in {"exact", "approx"}
-
-    @property
-    def settable_in_step(self) -> bool:
-        """Whether a value may be set between two steps."""
-        tunable = self.causality == "parameter" and self.variability == "tunable"
-        if self.ticking:
-            return self.causality == "input" and self.ticking == "triggered"
-        return self.causality == "input" or tunable
-
-    @property
-    def number(self) -> int:
-        """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
-        is_output = self.ticking == "triggered" and self.causality != "input"
-        return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
-
-    @property
-    def start_number(self) -> float:
-        """The start value of a numeric scalar or element; 0 if the FMU gives none.
-
-        Raises:
-            ConfigError: If it is not a finite number.
-        """
-        return _number(self.name, "0" if self.start is None else self.start)
-
-    @cached_property
-    def start_numbers(self) -> tuple[float, ...]:
-        """The start values of the elements of a numeric array, in row-major order.
-
-        A single start value is that of all elements; without any they are 0.
-
-        Raises:
-            ConfigError: If there is another number of them, or one is not a finite number.
-        """
-        return tuple(element.start_number for element in self.elements)
-
-    @property
-    def size(self) -> int:
-        """The number of values that FMI moves when it moves this variable; 1 for a scalar."""
-        if self.array is None or self.is_apart:
-            return math.prod(self.shape)
-        return math.prod(self.array.shape)
-
-    @property
-    def is_apart(self) -> bool:
-        """Whether it is an element that is got and set by itself, as those of systems are."""
-        return self.array is not None and self.array.driven is not None
-
-    @cached_property
-    def elements(self) -> tuple[Variable, ...]:
-        """The elements of an array in row-major order: ``y[1,1]``, ``y[1,2]``, ...
-
-        A scalar is its own only element.
-
-        Raises:
-            ConfigError: If there are too many to name each.
-        """
-        if not self.shape:
-            return (self,)
-        if self.size > MOST_ELEMENTS:
-            raise ConfigError(
-                f"{self.name!r} is an array of {self.size} elements, at most {MOST_ELEMENTS} can "
-                "be used"
-            )
-        places = list(product(*map(range, self.shape)))
-        starts = self._starts_of(len(places))
-        elements = (
-            replace(
-                self,
-                name=f"{self.name}[{_index(place)}]",
-                shape=(),
-                dimensions=(),
-                array=self,
-                place=number,
-                start=starts[number],
-                driven=None,
-            )
-            for number, place in enumerate(places)
-        )
-        return tuple(elements if self.driven is None else map(self._apart, elements))
-
-    def _apart(self, element: Variable) -> Variable:
-        """The element of an array of a system. What something else drives cannot be set."""
-        assert self.driven is not None
-        reference = self.value_reference + element.place
-        alone = replace(element, value_reference=reference, place=0)
-        if element.place not in self.driven:
-            return alone
-        return replace(alone, causality="local", initial=None)
-
-    def _starts_of(self, count: int) -> list[str | None]:
-        """The start value of each element; all of them where their number is wrong."""
-        texts = (self.start or "").split()
-        return [*texts] if len(texts) == count else [self.start] * count
-
-    def resized(self, sizes: Mapping[str, int]) -> Variable:
-        """The same variable with these values of structural parameters.
-
-        The start values of an array of another size are those of the FMU, and not known.
-        """
-        if self.name in sizes:
-            return replace(self, start=str(sizes[self.name]))
-        pairs = zip(self.dimensions, self.shape, strict=True) if self.dimensions else ()
-        shape = tuple(sizes.get(name, length) for name, length in pairs)
-        if not self.dimensions or shape == self.shape:
-            return self
-        return replace(self, shape=shape, start=None)
-
-    @property
-    def integer_limits(self) -> tuple[int, int]:
-        """The range of the C type of an integer or enumeration."""
-        if self.type.startswith("UInt"):
-            return 0, 2 ** int(self.type[4:]) - 1
-        bits = _INTEGER_BITS[self.type]
-        return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
-
-
-def unlisted(variables: Sequence[Variable]) -> list[Variable]:
-    """Find what is missing of arrays of which only some elements are listed.
-
-    FMI moves whole arrays only. Elements that are not listed keep their start values.
-    """
-    listed = {variable.name for variable in variables}
-    arrays = dict.fromkeys(v.array for v in variables if v.array is not None and not v.is_apart)
-    return [one for array in arrays for one in array.elements if one.name not in listed]
-
 
 def _whole(value: Any) -> int | None:
     """Return a number as an int if it is whole, also if it is a float, as those of files are."""
     return int(value) if isinstance(value, float) and value.is_integer() else integer_of(value)
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        number = float({"true": "1", "false": "0"}.get(text, text))
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ConfigError(f"the start value of {name!r} is {text!r}, expected a finite number")
-    return number
 
 
 def _place(array: Variable, index: str) -> int | None:
@@ -334,11 +50,6 @@ def _place(array: Variable, index: str) -> int | None:
     for number, size in zip(numbers, array.shape, strict=True):
         place = place * size + number
     return place
-
-
-def _index(place: tuple[int, ...]) -> str:
-    """The index of an element as Modelica writes it: the first one is 1."""
-    return ",".join(str(number + 1) for number in place)
 
 
 @dataclass(frozen=True)

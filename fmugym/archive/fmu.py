@@ -22,7 +22,7 @@ import fmpy
 
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
-from fmugym.archive.description import INTERFACES, ModelDescription, Variable
+from fmugym.archive.description import INTERFACES, ModelDescription
 from fmugym.archive.executable import check_library
 from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
@@ -30,6 +30,7 @@ from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine

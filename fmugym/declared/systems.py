@@ -17,7 +17,7 @@ from fmugym.declared.quantities import duration
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, shown, unknown_name
 from fmugym.systems import Component, Connection, FMUSystem
-from fmugym.task.interface import structural_values
+from fmugym.task.starting import structural_values
 
 __all__ = ["describe", "fmu_of", "system_of"]
 

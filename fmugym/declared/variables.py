@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_option
 from fmugym.declared.devices import DEVICE_KEYS, IDEAL, Device, read_device
 from fmugym.declared.entries import Entry
@@ -17,7 +18,8 @@ from fmugym.declared.values import number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
-from fmugym.task.interface import checked, input_variable, output_variable, spread
+from fmugym.task.roles import input_variable, output_variable
+from fmugym.task.starting import checked, spread
 
 __all__ = [
     "VARIABLE_KEYS",

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
 from fmugym.export.agent import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines

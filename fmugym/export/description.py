@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 from xml.etree import ElementTree
 
-from fmugym.archive.description import Unit, Variable
+from fmugym.archive.description import Unit
+from fmugym.archive.variable import Variable
 from fmugym.export.agent import Agent
 
 __all__ = ["Port", "kind_of", "model_description", "ports_of"]

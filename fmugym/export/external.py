@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.declared import TaskEnv
 from fmugym.declared.declarations import Declarations
 from fmugym.env import FMUEnv

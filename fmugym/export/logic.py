@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.external import found_in

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable, unlisted
 from fmugym.archive.texts import number_of, text_among
+from fmugym.archive.variable import Variable, unlisted
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status, sane
 

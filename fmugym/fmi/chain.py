@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.systems.description import PartVariable
 from fmugym.systems.layout import Layout, Route
 

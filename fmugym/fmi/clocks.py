@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from fmugym.archive.description import CLOCK_KINDS, MOST_FRACTIONS, Interval, Variable
+from fmugym.archive.variable import CLOCK_KINDS, MOST_FRACTIONS, Interval, Variable
 from fmugym.fmi.status import Status
 
 __all__ = ["TICKS_SIZE", "CallError", "ClockCalls", "Qualifier", "Ticks", "Timetable"]

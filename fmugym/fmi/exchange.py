@@ -14,7 +14,7 @@ from fmpy.fmi1 import FMU1Model, fmi1EventInfo
 from fmpy.fmi2 import FMU2Model, fmi2EventInfo
 from fmpy.fmi3 import FMU3Model
 
-from fmugym.archive.description import Interval, Variable
+from fmugym.archive.variable import Interval, Variable
 from fmugym.fmi.clocks import CallError, Qualifier
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance

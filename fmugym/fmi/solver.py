@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.fmi.clocks import TICKS_SIZE, CallError, ClockCalls, Ticks, Timetable
 from fmugym.fmi.methods import METHODS, State
 from fmugym.fmi.status import Status

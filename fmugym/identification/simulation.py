@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.task.interface import checked_value
+from fmugym.task.starting import checked_value
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Simulator"]

@@ -26,7 +26,7 @@ from fmugym.lab.presets import Options
 from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
 from fmugym.pool import Pool, PoolSpec
-from fmugym.task.interface import checked_value, start_variable
+from fmugym.task.starting import checked_value, start_variable
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Cell", "checked_parameters"]

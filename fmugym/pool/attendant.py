@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import LicenceError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError, printable
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors

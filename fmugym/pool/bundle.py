@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.archive.texts import text_among
+from fmugym.archive.variable import Variable
 from fmugym.pool.spec import START_TIME
 
 __all__ = ["Bundle", "Copies", "Record", "SaveMethod", "joined"]

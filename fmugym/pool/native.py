@@ -24,9 +24,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (

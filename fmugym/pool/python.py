@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray

@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.variable import Variable
 from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
 from fmugym.fmi.words import quoted, unpacked

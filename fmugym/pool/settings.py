@@ -16,8 +16,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import ModelDescription, Variable, unlisted
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, text_of, with_texts
+from fmugym.archive.variable import Variable, unlisted
 from fmugym.pool.bundle import Record
 from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
 from fmugym.systems.description import SystemDescription

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, SimulationError, printable
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import SavedState

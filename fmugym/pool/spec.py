@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, with_texts
+from fmugym.archive.variable import Variable
 from fmugym.fmi.methods import METHODS
 from fmugym.fmi.solver import Solving
 

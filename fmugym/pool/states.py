@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool.attendant import AttendedPool, Attending, InitialState, Reset
 from fmugym.pool.base import FloatArray, MaskArray

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool

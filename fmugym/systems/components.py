@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fmugym.archive.description import INTERFACES, Variable, unlisted
+from fmugym.archive.description import INTERFACES
 from fmugym.archive.fmu import FMU
 from fmugym.archive.structure import Feedthrough
+from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import (
     check_count,
     check_flag,
@@ -127,13 +128,13 @@ class OpenComponent:
 
     def _require_rest(self) -> None:
         """FMI sets whole arrays, and the FMU does not tell the start values of a new size."""
-        for missing in unlisted([self.variable(name) for name, _ in self.starts]):
-            array = missing.array
-            if array is not None and array.start is None and array.dimensions:
-                raise ConfigError(
-                    f"there is no value of {missing.name!r} of the component {self.name!r}: "
-                    f"{array.name!r} has a size of its own, {array.shape}; give all elements"
-                )
+        found = unknown_rest([self.variable(name) for name, _ in self.starts])
+        if found is not None:
+            missing, array = found
+            raise ConfigError(
+                f"there is no value of {missing.name!r} of the component {self.name!r}: "
+                f"{array.name!r} has a size of its own, {array.shape}; give all elements"
+            )
 
     def variable(self, name: str) -> Variable:
         """Find a variable, or an element of an array, by its name in the component.

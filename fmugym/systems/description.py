@@ -10,13 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive.description import (
-    MOST_ELEMENTS,
-    Capabilities,
-    ModelDescription,
-    Unit,
-    Variable,
-)
+from fmugym.archive.description import Capabilities, ModelDescription, Unit
+from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.plan import STATISTICS, Connector, End, SystemPlan
 
@@ -206,14 +201,14 @@ def _statistics(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Iterator
         )
     for reference, (name, text) in enumerate(STATISTICS.items()):
         unit = "s" if name == "step_size" else None
-        yield _own(f"master.{name}", reference, text, unit)
+        yield _statistic(f"master.{name}", reference, text, unit)
     sources = compared(plan, parts).values()
     for reference, (component, one) in enumerate(sources, len(STATISTICS)):
         text = "largest estimated error in the last step"
-        yield _own(f"master.error({component}.{one.name})", reference, text, one.unit)
+        yield _statistic(f"master.error({component}.{one.name})", reference, text, one.unit)
 
 
-def _own(name: str, reference: int, text: str, unit: str | None) -> Variable:
+def _statistic(name: str, reference: int, text: str, unit: str | None) -> Variable:
     kind = "Real", reference, "local", "discrete", "calculated"
     return Variable(name, *kind, unit=unit, description=text)
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
 from fmugym.systems.description import MASTER, PartVariable, SystemDescription, compared
 from fmugym.systems.plan import STATISTICS, Component, Evaluation, Group, Link

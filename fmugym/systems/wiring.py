@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from fmugym.archive.description import MOST_ELEMENTS, Unit, Variable
+from fmugym.archive.description import Unit
 from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
+from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection

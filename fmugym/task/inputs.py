@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs

@@ -21,7 +21,7 @@ from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.systems import FMUSystem
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.interface import structural_values
+from fmugym.task.starting import structural_values
 from fmugym.trial.opening import make_pool
 
 __all__ = ["PoolOpening", "deferred_pools", "env_numbers", "open_fmu", "pools_are_deferred"]

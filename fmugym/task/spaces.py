@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
-from fmugym.task.interface import Interface, checked_value
+from fmugym.task.interface import Interface
+from fmugym.task.starting import checked_value
 
 __all__ = [
     "action_space",

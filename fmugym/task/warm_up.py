@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.attendant import InitialState

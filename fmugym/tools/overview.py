@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.archive.packages import missing_tool, source_of
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, printable
 from fmugym.trial.known import known_verdict
 

@@ -14,8 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
 from fmugym.errors import ConfigError
 from fmugym.tools.overview import plain

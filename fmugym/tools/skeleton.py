@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
 from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value

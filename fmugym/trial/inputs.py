@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import PoolSpec
 

@@ -113,10 +113,7 @@ def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> No
     An FMU that is found to harm its process counts as harmful with every other config, too.
     """
     verdict = with_harm(verdict, candidate)
-    for key in (
-        verdict_key(candidate, spec, starts),
-        content_key(candidate),
-    ):
+    for key in (verdict_key(candidate, spec, starts), content_key(candidate)):
         remember(key, verdict.to_text())
 
 

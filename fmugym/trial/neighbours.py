@@ -15,14 +15,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Status
-from fmugym.fmi.system import open_library
+from fmugym.fmi.system_library import open_library
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.patience import licence_errors, require_licence

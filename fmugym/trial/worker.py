@@ -21,8 +21,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status

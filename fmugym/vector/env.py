@@ -20,9 +20,9 @@ from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray, Pool
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.task.interface import checked_column, spread
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
+from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import (
     UnknownAttributeError,
     autoreset_mode_of,

@@ -13,8 +13,8 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.spec import START_TIME
-from fmugym.task.interface import checked_value
 from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
+from fmugym.task.starting import checked_value
 from fmugym.vector.env import FMUVectorEnv
 from fmugym.vector.sensitivities import float_box, moved_both_ways
 

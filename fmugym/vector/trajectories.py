@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
-from fmugym.task.interface import start_variable
 from fmugym.task.snapshot import Snapshot, checked_snapshot
+from fmugym.task.starting import start_variable
 from fmugym.vector.env import FMUVectorEnv
 from fmugym.vector.perturbations import Matrices, differentiate_by_starts
 from fmugym.vector.sensitivities import (

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import Variable
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import text_among
+from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import Status

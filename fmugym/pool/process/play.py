@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.description import Variable
+from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray, MaskArray, available_processors
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.native import prepare

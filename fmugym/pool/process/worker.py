@@ -22,10 +22,11 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.description import ModelDescription, Variable
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU, ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.texts import text_of
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec

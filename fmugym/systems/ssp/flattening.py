@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-from fmugym.archive.description import ModelDescription, Unit, Variable
+from fmugym.archive.description import ModelDescription, Unit
 from fmugym.archive.units import IDENTITY, conversion_of_link
+from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMULoadError, shown
 from fmugym.systems.connections import Connection
 from fmugym.systems.ssp.elements import Element, OwnConnector, Scaling, SystemElement, Wire

@@ -10,8 +10,9 @@ from typing import Any, Final
 
 from lxml import etree
 
-from fmugym.archive.description import Unit, Variable
+from fmugym.archive.description import Unit
 from fmugym.archive.units import definition_of
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, reason
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection

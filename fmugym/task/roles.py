@@ -1,0 +1,119 @@
+"""Which variables may be inputs and outputs of an environment."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.variable import Variable
+from fmugym.errors import ConfigError
+
+__all__ = [
+    "check_input",
+    "check_output",
+    "check_readable",
+    "input_variable",
+    "output_variable",
+    "require_numeric",
+]
+
+_CURES: Final = {
+    "String": ". A scalar String can be given a text in 'model_parameters', and hooks can read it "
+    "if it is in 'monitor_names'; to observe one, let the FMU tell the same by a number or an "
+    "Enumeration",
+    "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
+    "numbers",
+}
+
+
+def input_variable(description: ModelDescription, name: str) -> Variable:
+    """Find a variable that can be written before every step.
+
+    Raises:
+        ConfigError: If no variable has this name, or it must not be written before a step.
+    """
+    variable = description.variable(name)
+    check_input(description, variable)
+    return variable
+
+
+def check_input(description: ModelDescription, variable: Variable) -> None:
+    """Check that a variable can be written before every step.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    require_numeric(variable, "an input")
+    _require_known_clock(description, variable, "an input")
+    if not variable.settable_in_step:
+        raise ConfigError(
+            f"{variable.name!r} cannot be an input: it is a {variable.variability} "
+            f"{variable.causality}; only inputs and tunable parameters may be set between steps"
+        )
+
+
+def output_variable(description: ModelDescription, name: str) -> Variable:
+    """Find a variable that can be read after every step.
+
+    Raises:
+        ConfigError: If no variable has this name, or a float cannot hold its value.
+    """
+    variable = description.variable(name)
+    check_output(description, variable)
+    return variable
+
+
+def check_output(description: ModelDescription, variable: Variable) -> None:
+    """Check that a variable can be read after every step, and observed.
+
+    Raises:
+        ConfigError: If it cannot.
+    """
+    require_numeric(variable, "an output")
+    _require_known_clock(description, variable, "an output")
+
+
+def check_readable(description: ModelDescription, variable: Variable) -> None:
+    """Do what ``check_output`` does, but allow scalar Strings, too.
+
+    Raises:
+        ConfigError: If it can be neither observed nor read.
+    """
+    if variable.kind != "string" or variable.shape or variable.array is not None:
+        check_output(description, variable)
+
+
+def _require_known_clock(description: ModelDescription, variable: Variable, role: str) -> None:
+    if not variable.ticking:
+        return
+    if variable not in description.clocks:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock, and {description.model_name} has "
+            "no event mode in co-simulation"
+        )
+    if role == "an input" and not variable.settable_in_step:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is a clock of "
+            f"causality={variable.causality!r} and intervalVariability={variable.ticking!r}, which "
+            "ticks by itself; only triggered input clocks may be set"
+        )
+
+
+def require_numeric(variable: Variable, role: str) -> None:
+    """Check that a variable is a number, or a clock.
+
+    Raises:
+        ConfigError: If it is not; the message names the role that it should have.
+    """
+    if variable.numeric or variable.ticking:
+        return
+    if variable.is_number:
+        raise ConfigError(
+            f"{variable.name!r} cannot be {role}: it is an array; name its elements, as in "
+            f"'{variable.name}[1]'"
+        )
+    element = "" if variable.array is None else "an element of an array "
+    raise ConfigError(
+        f"{variable.name!r} cannot be {role}: it is {element}of type {variable.type}; "
+        f"expected a Real, Integer, Boolean or Enumeration{_CURES.get(variable.type, '')}"
+    )
