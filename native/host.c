@@ -160,6 +160,9 @@ static void lose(Host *host, Arrival arrival, int patience) {
 
 /* Both ends stay out of other programs that this process starts. */
 static bool connect_ends(int ends[2]) {
+#if defined SOCK_CLOEXEC /* other threads start programs meanwhile */
+    return socketpair(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0, ends) == 0;
+#else
     if (socketpair(AF_UNIX, SOCK_STREAM, 0, ends) != 0) {
         return false;
     }
@@ -167,6 +170,7 @@ static bool connect_ends(int ends[2]) {
         fcntl(ends[i], F_SETFD, FD_CLOEXEC);
     }
     return true;
+#endif
 }
 
 /* In a process group of its own, so that Ctrl-C is for this process alone. */

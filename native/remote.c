@@ -202,6 +202,7 @@ static Status get_string(const Library *library, void *component, uint32_t refer
     status = far_ask(me, ASK_GET_STRING);
     if (status <= STATUS_WARNING) {
         *text = text_with(text_number(packet_take_text(&me->host->in))); /* the packet changes */
+        status = *text == NULL ? STATUS_ERROR : status; /* no room for another one */
     }
     far_end(me);
     return status;

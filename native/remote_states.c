@@ -51,9 +51,9 @@ Status far_get_state(const Library *library, void *component, void **state) {
         TAKE(&me->host->in, other);
     }
     far_end(me);
-    if (number >= 0 && (old == NULL || other)) {
-        *state = new_state(me, number);
-        free(*state == NULL ? NULL : old);
+    if (other) {
+        *state = number < 0 ? NULL : new_state(me, number);
+        free(old);
     }
     return *state == NULL && status <= STATUS_WARNING ? STATUS_ERROR : status;
 }

@@ -119,6 +119,9 @@ static void answer_instantiate(void) {
     TAKE(&served.in, identity.logging);
     me->component = served.fmi->instantiate(&served.library, &identity);
     const bool made = me->component != NULL;
+    if (!made) {
+        free(me->name);
+    }
     floats_restore_if_seen(&served.floats);
     packet_clear(&served.out);
     PUT(&served.out, made);

@@ -35,9 +35,12 @@ void serving_get_state(Instance *me) {
     const Status status = served.fmi->get_state(&served.library, me->component, &state);
     const bool other = state != before;
     if (again) {
-        served.states[number] = state;
+        served.states[number] = state; /* if there is none now, the number is free */
     } else if (state != NULL) {
         number = (int64_t)place_of_state(state);
+    }
+    if (state == NULL) {
+        number = -1;
     }
     serving_answer(status);
     PUT(&served.out, number);

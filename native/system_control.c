@@ -4,6 +4,7 @@
  * twice: at once, and again from a saved state as two of half the size, whose results stay. Both
  * masters are of order 1, so that the difference is about the error of the two small steps. */
 
+#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -12,6 +13,7 @@
 
 static const double SAFETY = 0.9, SHRINK = 0.2, GROWTH = 2.0;
 static const double ROUNDING = 1e-9; /* what counts as the same step size */
+static const double RESOLUTION = 16.0 * DBL_EPSILON; /* of times */
 static const double PARTS = 1024.0;  /* the most steps in one of the system, unless told otherwise */
 
 /* A step, and what came of it. */
@@ -171,9 +173,17 @@ static Status advance(Composite *me, double time, double rest, double smallest, 
     return status;
 }
 
-Status system_step_controlled(Composite *me, double time, double step) {
+/* A step that the time does not show would be repeated for ever. */
+static double smallest_step(const Composite *me, double time, double step) {
     const double told = me->system->control.smallest;
     const double smallest = told > 0.0 && told < step ? told : step / PARTS;
+    const double shown = RESOLUTION * (fabs(time) + step);
+
+    return smallest > shown ? smallest : shown;
+}
+
+Status system_step_controlled(Composite *me, double time, double step) {
+    const double smallest = smallest_step(me, time, step);
     double done = 0.0, size = 0.0;
     Status status = STATUS_OK;
 

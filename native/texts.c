@@ -81,9 +81,23 @@ double text_number(const char *text) {
     return found;
 }
 
-const char *text_with(double number) {
+void texts_before_fork(void) {
     mutex_lock(&lock);
-    const char *found = room == 0 ? NULL : place_of(table, room, number)->text;
+}
+
+void texts_after_fork_in_parent(void) {
+    mutex_unlock(&lock);
+}
+
+void texts_after_fork_in_child(void) {
+    mutex_reset(&lock);
+}
+
+const char *text_with(double number) {
+    const bool may_be_one = number >= 0.0 && number < (double)((uint64_t)1 << BITS);
+
+    mutex_lock(&lock);
+    const char *found = may_be_one && room > 0 ? place_of(table, room, number)->text : NULL;
     mutex_unlock(&lock);
     return found;
 }

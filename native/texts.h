@@ -11,4 +11,9 @@ double text_number(const char *text);
 /* The text with this number, or NULL if text_number has not returned it. */
 const char *text_with(double number);
 
+/* Fork. The lock is held during a fork, so that the child finds no unfinished change. */
+void texts_before_fork(void);
+void texts_after_fork_in_parent(void);
+void texts_after_fork_in_child(void);
+
 #endif

@@ -1,6 +1,12 @@
 """Strings that FMUs give: monitored, so that hooks read them as texts."""
 
+import contextlib
+import logging
+import os
 import pickle
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import foreign_talker
 import numpy as np
@@ -12,7 +18,10 @@ from pythonfmu import FmuBuilder
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv
+from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
+from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool.local import local_pool
 from fmugym.series import RecordSeries
 
 WORDS = test_strings.WORDS
@@ -118,6 +127,38 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     assert env.out["String_told"] == word
     env.close()
     envs.close()
+
+
+@pytest.mark.skipif(not has_native_pool() or not hasattr(os, "fork"), reason="needs C and forks")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_fork_while_a_pool_reads_texts(feedthrough):
+    """A lock that another thread holds would stay locked in the child."""
+    from fmugym import _native
+
+    fmu = FMU(feedthrough[3])
+    told = tuple(fmu.description.variables[name] for name in ("String_told", "String_out"))
+    spec = PoolSpec((), told * 20, 0.1)
+    pool = local_pool(fmu, spec, 1000, logging.getLogger("fmugym.test"), native=True, threads=1)
+    done = threading.Event()
+
+    def step():
+        while not done.is_set():
+            assert not pool.step()[1].any()
+
+    with contextlib.closing(pool), ThreadPoolExecutor(1) as executor:
+        pool.reset((), np.zeros((0, 1000)))
+        steps = executor.submit(step)
+        try:
+            for _ in range(30):
+                child = os.fork()
+                if child == 0:
+                    signal.alarm(5)  # ends the process if it hangs
+                    _native.text_with(1.0)
+                    os._exit(0)
+                assert os.waitpid(child, 0)[1] == 0
+        finally:
+            done.set()
+        steps.result()
 
 
 @pytest.mark.usefixtures("wine")

@@ -300,6 +300,16 @@ class TestLimits:
         assert status == Status.DISCARD
         assert "component 'first'" in text
 
+    @in_each_engine
+    def test_steps_that_the_time_would_not_show_are_not_tried(self, fmus, native):
+        """They would go on for ever."""
+        parts = masses([fmus[2], fmus[2]])
+        first = replace(parts.components[0], starts=(*parts.components[0].starts, ("limit", 1e-19)))
+        plan = replace(parts, components=(first, parts.components[1]))
+        for smallest in (1e-20, 1e-310):
+            status = run(controlled(plan, 1e6, smallest), STATISTICS, 0.4, 3, native, stop=True)[1]
+            assert status == Status.DISCARD
+
     def test_who_cannot_save_its_state_is_named(self, fmus):
         with pytest.raises(ConfigError, match=r"component 'second'.* FMU state"):
             SystemFMU(controlled(masses([fmus[2], fmus[1]]), 1e-4))

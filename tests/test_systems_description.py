@@ -5,10 +5,10 @@ from itertools import pairwise
 
 import pytest
 
-from fmugym import Component, Connection, FMUSystem, bundled_fmu
+from fmugym import Component, Connection, FMUEnv, FMUSystem, bundled_fmu
 from fmugym.archive.structure import Feedthrough
 from fmugym.archive.units import conversion_of_link
-from fmugym.errors import ConfigError, FMULoadError
+from fmugym.errors import ArgumentError, ConfigError, FMULoadError
 from fmugym.systems.order import order_of, strong_components
 from fmugym.systems.plan import Link, Loop
 
@@ -127,6 +127,33 @@ def logic(tmp_path_factory):
     return FmuBuilder.build_FMU(folder / "logic.py", dest=folder)
 
 
+class Env(FMUEnv):
+    def __init__(self, system, **changes):
+        config = {"model_input_names": "a.u", "model_output_names": "b.T_air", "time_step": 60.0}
+        super().__init__(system, config | changes)
+
+    def _is_done(self):
+        return False
+
+
+class TestDrivenVariables:
+    """What a connection drives cannot be set otherwise; the message says what drives it."""
+
+    @pytest.mark.parametrize(
+        ("config", "facts"),
+        [
+            ({"model_input_names": "b.Q_int"}, ("'b.Q_int'", "'a.Q_em'")),
+            ({"model_parameters": {"b.Q_int": 1.0}}, ("'b.Q_int'", "'a.Q_em'")),
+            ({"model_parameters": {"a.A_f": 120.0}}, ("'a.A_f'", "'area'")),
+        ],
+    )
+    def test_their_source_is_named(self, config, facts):
+        system = houses("a.Q_em -> b.Q_int", "area -> a.A_f", "area -> b.A_f")
+        with pytest.raises(ConfigError) as caught:
+            Env(system, **config)
+        assert all(fact in str(caught.value) for fact in facts)
+
+
 class TestComponents:
     def test_start_values_are_checked_against_the_fmu(self):
         system = FMUSystem({"h": Component(HOUSE, {"A_f": 100, "solver": "rk4"})})
@@ -171,6 +198,10 @@ class TestComponents:
             Component(HOUSE, steps=0)
         with pytest.raises(ConfigError):
             Component(HOUSE, interface="cosimulation")
+
+    def test_unknown_arguments_are_refused_with_the_nearest_name(self):
+        with pytest.raises(ArgumentError, match=r"FMUSystem.*'error_tolerence'.*'error_tolerance'"):
+            FMUSystem({"h": HOUSE}, error_tolerence=1e-3)
 
     def test_a_pickled_system_is_the_same(self):
         system = houses("a.Q_em -> b.Q_int", "T -> a.T_out", units={"T": "degC"}, step_size=60)

@@ -148,11 +148,11 @@ def test_components_that_cannot_are_refused(fmus):
     pendulum = bundled_fmu("Pendulum")
     system = FMUSystem({"a": fmus[2], "p": pendulum}, ["push -> a.u"])
     Env(system).close()
-    with pytest.raises(ConfigError, match=r"'p\.tau'"):
+    with pytest.raises(ConfigError, match=r"component 'p'.*FMI 2\.0.*'p\.tau'"):
         Env(system, "p.tau")
     both = FMUSystem(
         {"a": fmus[2], "p": pendulum},
         [Connection("push", "a.u"), Connection("push", "p.tau", convert_units=False)],
     )
-    with pytest.raises(ConfigError, match="'push'"):
+    with pytest.raises(ConfigError, match=r"component 'p'.*'push'"):
         Env(both)

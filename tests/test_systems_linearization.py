@@ -5,6 +5,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+import wine_tools
 from system_tools import linear_fmu
 
 from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
@@ -103,6 +104,18 @@ class TestRefusals:
         path = linear_fmu(tmp_path / "linear.fmu")
         with pytest.raises(ConfigError, match=r"component 'plain'.*none"):
             linearize(FMUSystem({"house": HOUSE, "plain": path}))
+
+    def test_a_component_in_a_process_of_its_own_is_named(self):
+        system = FMUSystem({"here": HOUSE, "there": Component(HOUSE, isolate=True)})
+        with pytest.raises(ConfigError, match=r"'there'.*isolate=True"):
+            linearize(system)
+
+    def test_a_component_in_wine_is_named(self, tmp_path):
+        if why := wine_tools.why_not():
+            pytest.skip(why)
+        windows = wine_tools.for_windows(HOUSE, tmp_path)
+        with pytest.raises(ConfigError, match=r"'there'.*Windows"):
+            linearize(FMUSystem({"here": HOUSE, "there": windows}))
 
     def test_states_of_other_names(self):
         with pytest.raises(ConfigError, match=r"a\.T_air"):

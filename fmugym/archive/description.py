@@ -218,9 +218,14 @@ class ModelDescription:
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
-    def can_interpolate(self, variable: Variable) -> bool:
-        """Whether an input may change linearly within a step; it must be a continuous Real, too."""
-        return self.capabilities.can_interpolate_inputs
+    def unable_to_interpolate(self, variable: Variable) -> str | None:
+        """Name the FMU that cannot let an input change linearly within a step; None if it can."""
+        able = self.capabilities.can_interpolate_inputs
+        return None if able else f"{self.model_name} (FMI {self.fmi_version})"
+
+    def what_drives(self, variable: Variable) -> str | None:
+        """In a system: the output or the name of the system that sets a variable; or None."""
+        return None
 
     @cached_property
     def arrays_beside_clocked(self) -> tuple[Variable, ...]:

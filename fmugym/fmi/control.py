@@ -6,6 +6,7 @@ This is the arithmetic of ``native/system_control.c``, operation by operation.
 from __future__ import annotations
 
 import math
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Final
@@ -22,6 +23,7 @@ _SAFETY: Final = 0.9
 _SHRINK: Final = 0.2
 _GROWTH: Final = 2.0
 _ROUNDING: Final = 1e-9
+_RESOLUTION: Final = 16.0 * sys.float_info.epsilon
 _PARTS: Final = 1024.0
 _STEPS, _REJECTED, _NEXT, _WORST, _FIRST = range(5)
 
@@ -72,8 +74,7 @@ class StepControl:
             time: The current communication point, in seconds.
             step: The step size, in seconds.
         """
-        told = self._control.min_step_size or 0.0
-        smallest = told if 0.0 < told < step else step / _PARTS
+        smallest = self._smallest_step(time, step)
         self._begin(step)
         done, status = 0.0, int(Status.OK)
         while status == Status.OK and done < step:
@@ -82,6 +83,13 @@ class StepControl:
             done = done + size if size < rest else step
             self.statistics[_NEXT] = _clamped(float(self.statistics[_NEXT]), smallest, step)
         return status
+
+    def _smallest_step(self, time: float, step: float) -> float:
+        """A step that the time does not show would be repeated for ever."""
+        told = self._control.min_step_size or 0.0
+        smallest = told if 0.0 < told < step else step / _PARTS
+        shown = _RESOLUTION * (abs(time) + step)
+        return smallest if smallest > shown else shown
 
     def _begin(self, step: float) -> None:
         self.statistics[_WORST] = 0.0

@@ -71,12 +71,26 @@ class SystemDescription(ModelDescription):
         """See ``ModelDescription.components``."""
         return self.parts
 
-    def can_interpolate(self, variable: Variable) -> bool:
-        """See ``ModelDescription.can_interpolate``; all components behind the variable can."""
-        numbers = [end.part for end in self.ends[variable.value_reference]]
-        return all(
-            number != MASTER and self.parts[number].can_interpolate(variable) for number in numbers
-        )
+    def unable_to_interpolate(self, variable: Variable) -> str | None:
+        """See ``ModelDescription.unable_to_interpolate``; the first component that cannot."""
+        for end in self.ends[variable.value_reference]:
+            unable = self.parts[end.part].unable_to_interpolate(variable)
+            if unable is not None:
+                return f"component {self.plan.components[end.part].name!r}, {unable},"
+        return None
+
+    def what_drives(self, variable: Variable) -> str | None:
+        """See ``ModelDescription.what_drives``."""
+        sources = {
+            f"{link.target}.{link.input}": f"{link.source}.{link.output}"
+            for link in self.plan.links
+        }
+        for connector in self.plan.connectors:
+            if connector.causality != "output":
+                ends = (f"{end.component}.{end.variable}" for end in connector.ends)
+                sources |= dict.fromkeys(ends, connector.name)
+        array = () if variable.array is None else (variable.array,)
+        return next((sources[one.name] for one in (variable, *array) if one.name in sources), None)
 
     @cached_property
     def clocks(self) -> tuple[Variable, ...]:

@@ -62,9 +62,9 @@ class FMUSystem(WiredSystem):
         times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
 
     Raises:
-        ConfigError: If an argument does not fit, a name is unknown, a component cannot repeat
-            steps as ``error_tolerance`` needs it, two connections have one
+        ConfigError: If an argument does not fit, a name is unknown, two connections have one
             target, or units or types do not fit.
+        ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
         FMULoadError: If an FMU cannot be read.
     """
 
@@ -118,6 +118,8 @@ class FMUSystem(WiredSystem):
             probe_timeout: See ``FMU``.
 
         Raises:
+            ConfigError: If a component cannot repeat steps, and a loop or ``error_tolerance`` needs
+                it; or with ``error_tolerance``, a component is named ``master``.
             FMULoadError: If an FMU of a component cannot be read any more.
         """
         return SystemFMU(self.plan, probe_timeout=probe_timeout)

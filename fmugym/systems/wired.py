@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Never
 
 from fmugym.archive.description import Unit
 from fmugym.checks import check_count, check_mapping, check_number, check_option, check_text
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, unknown_argument
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import Connection
 from fmugym.systems.order import Order, order_of
@@ -50,7 +51,10 @@ class WiredSystem:
         unit_definitions: Mapping[str, Unit] | None = None,
         findings: Sequence[str] = (),
         file: Path | None = None,
+        **unknown: Never,
     ) -> None:
+        for argument in unknown:
+            raise unknown_argument(type(self).__name__, argument, _ARGUMENTS)
         given = check_mapping("components", components)
         if not given:
             raise ConfigError("a system needs at least one component")
@@ -165,6 +169,13 @@ class WiredSystem:
             if (size := one.fmu.description.step_size) is not None
         ]
         return min(steps, default=None)
+
+
+_ARGUMENTS: Final = tuple(
+    name
+    for name in inspect.signature(WiredSystem.__init__).parameters
+    if name not in ("self", "unknown")
+)
 
 
 def _listed(connections: Any) -> Sequence[Any]:

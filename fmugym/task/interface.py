@@ -180,11 +180,11 @@ class Interface:
         inputs = {variable.name: variable for variable in self.inputs}
         ramped = tuple(inputs[name] for name in names)
         for variable in ramped:
-            if not self.description.can_interpolate(variable):
+            unable = self.description.unable_to_interpolate(variable)
+            if unable is not None:
                 raise ConfigError(
-                    f"config key 'input_interpolation': {self.description.model_name} "
-                    f"(FMI {self.description.fmi_version}) cannot interpolate inputs, "
-                    "which is an option of FMI 1.0 and 2.0 for co-simulation; "
+                    f"config key 'input_interpolation': {unable} cannot interpolate "
+                    "inputs, which is an option of FMI 1.0 and 2.0 for co-simulation; "
                     f"{variable.name!r} can only hold"
                 )
             found = variable.kind, variable.variability, variable.causality, variable.shape

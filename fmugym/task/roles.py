@@ -14,6 +14,7 @@ __all__ = [
     "check_readable",
     "input_variable",
     "output_variable",
+    "require_not_driven",
     "require_numeric",
 ]
 
@@ -46,9 +47,29 @@ def check_input(description: ModelDescription, variable: Variable) -> None:
     require_numeric(variable, "an input")
     _require_known_clock(description, variable, "an input")
     if not variable.settable_in_step:
+        require_not_driven(description, variable, "be an input")
         raise ConfigError(
             f"{variable.name!r} cannot be an input: it is a {variable.variability} "
             f"{variable.causality}; only inputs and tunable parameters may be set between steps"
+        )
+
+
+def require_not_driven(description: ModelDescription, variable: Variable, what: str) -> None:
+    """Check that no connection of a system gives a variable its values.
+
+    Args:
+        description: That of the FMU or the system.
+        variable: One of its variables.
+        what: What the variable cannot do if it is driven, for the message.
+
+    Raises:
+        ConfigError: If something drives it.
+    """
+    source = description.what_drives(variable)
+    if source is not None:
+        raise ConfigError(
+            f"{variable.name!r} cannot {what}: the system connects it with {source!r}, which gives "
+            "it its value"
         )
 
 

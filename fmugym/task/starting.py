@@ -13,7 +13,7 @@ from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import check_number, integer_of, parts_of_array
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.task.roles import require_numeric
+from fmugym.task.roles import require_not_driven, require_numeric
 
 __all__ = [
     "check_rest_is_known",
@@ -48,7 +48,7 @@ def start_values(
     for name, value in given.items():
         scalars = description.scalars(name)
         for variable, own in zip(scalars, spread(name, scalars, value), strict=True):
-            _check_start(variable, own)
+            _check_start(description, variable, own)
             pair = variable, checked(variable, own)
             found.setdefault(variable.name, pair)
             if variable.name == name:
@@ -117,11 +117,11 @@ def start_variable(description: ModelDescription, name: str, value: Any) -> Vari
             value.
     """
     variable = description.variable(name)
-    _check_start(variable, value)
+    _check_start(description, variable, value)
     return variable
 
 
-def _check_start(variable: Variable, value: Any) -> None:
+def _check_start(description: ModelDescription, variable: Variable, value: Any) -> None:
     name = variable.name
     if variable.ticking:
         raise ConfigError(f"{name!r} cannot be set at the start: it is a clock")
@@ -131,6 +131,7 @@ def _check_start(variable: Variable, value: Any) -> None:
             "'model_parameters' of the config"
         )
     if not variable.settable_at_start:
+        require_not_driven(description, variable, "be set")
         raise ConfigError(
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
             f"with initial={variable.initial!r}"

@@ -27,7 +27,7 @@ typedef struct {
 } Made;
 
 enum {
-    MOST_DIMENSIONS = 8,
+    MOST_DIMENSIONS = 64, /* more than that numpy has none */
     ROUNDS = 2 /* callers often hold the arrays of one step while they take the next */
 };
 
@@ -279,11 +279,11 @@ static PyObject *provide(const Results *r, Maker *maker, char **memory) {
         return new.array;
     }
     Made *place = &maker->made[maker->oldest];
-    PyObject *before = place->array;
+    PyObject *before = place->array, *array = Py_NewRef(new.array);
     maker->oldest = (maker->oldest + 1) % ROUNDS;
     *place = new;
-    Py_XDECREF(before);
-    return Py_NewRef(new.array);
+    Py_XDECREF(before); /* may call back, and another step then replaces the new array */
+    return array;
 }
 
 bool results_provide(Results *r, StepArrays *a) {
