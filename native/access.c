@@ -7,7 +7,6 @@
 
 #include "floats.h"
 #include "platform.h"
-#include "texts.h"
 
 static Atomic next_id;
 

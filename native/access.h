@@ -4,6 +4,7 @@
 #define FMUGYM_ACCESS_H
 
 #include "fmi.h"
+#include "texts.h"
 
 /* What stands in a list of variables in the place of a type, where the value is no variable's but the
  * start time of the episode. */
@@ -22,12 +23,6 @@ typedef struct {
     uint32_t *positions; /* in the list */
     uint32_t *places;    /* in the FMU's memory */
 } Part;
-
-/* A text, and the number that stands for it in a list; see fmugym/archive/texts.py. */
-typedef struct {
-    double number;
-    const char *text;
-} Text;
 
 /* The variables of one C type. An array is moved as a whole, so there is one value reference for
  * all of its elements. */

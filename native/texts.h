@@ -4,6 +4,12 @@
 #ifndef FMUGYM_TEXTS_H
 #define FMUGYM_TEXTS_H
 
+/* A text, and the number that stands for it; see fmugym/archive/texts.py. */
+typedef struct {
+    double number;
+    const char *text;
+} Text;
+
 /* Keeps a text of this process for good, and returns its number; -1 if there is no memory, if there
  * are too many texts, or if another text has this number. NULL counts as empty. */
 double text_number(const char *text);

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import tempfile
 
 import numpy as np
 import pytest
@@ -20,8 +21,9 @@ def test_nothing_grows():
     assert done.stdout.count("\n") == 2 + len(soak.SOAKS)
 
 
-def test_what_grows_is_found(monkeypatch):
+def test_what_grows_is_found(monkeypatch, tmp_path):
     """The reference is able to fail."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # others use the common one
     monkeypatch.setattr(soak, "SAMPLES", 40)
     kept, descriptors = [], []
 

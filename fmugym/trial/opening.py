@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
+from fmugym.checks import check_number
 from fmugym.errors import (
     ConfigError,
     FMULoadError,
@@ -115,7 +116,9 @@ def make_pool(
     native = _is_native(backend)
     plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
     plan = plan.checked(fmu, backend)
-    spec = _with_locks(fmu, spec)
+    spec, timeout = _with_locks(fmu, spec), math.inf
+    if call_timeout is not None:
+        timeout = check_number("call_timeout", call_timeout, positive=True)
 
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
@@ -126,7 +129,6 @@ def make_pool(
         def note_crash(how: str) -> None:
             _note_crash(fmu, spec, starts, verdict, how, log)
 
-        timeout = math.inf if call_timeout is None else float(call_timeout)
         actual = replace(spec, blind_start=verdict.blind_start, call_timeout=timeout)
         _tell_of_reading(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
