@@ -234,7 +234,7 @@ class TestEnvironments:
 
     def test_what_drives_a_name_is_the_only_one(self):
         """An input behind a name of the system is set by that name alone."""
-        with pytest.raises(ConfigError, match=r"east\.T_out.*local"):
+        with pytest.raises(ConfigError, match=r"east\.T_out.*'outside'"):
             Open(
                 two_houses(),
                 {"model_input_names": ["east.T_out"], "model_output_names": ["warmth"]},
