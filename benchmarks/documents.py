@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 
 import cart_poles
@@ -45,12 +45,22 @@ def _vector(effort: Effort) -> list[Table]:
     """The table of docs/vector.md."""
     sizes = SIZES[:2] if effort.quick else SIZES
     title = "Processor time of a call of step on one thread in us, compiled / on arrays"
-    table = Table(title, ["environments", *map(str, sizes)])
+    return [_of_tasks(title, "environments", sizes, _two_ways, effort)]
+
+
+def _of_tasks(
+    title: str,
+    corner: str,
+    sizes: Sequence[int],
+    cell: Callable[[tasks.Task, int, Effort], str],
+    effort: Effort,
+) -> Table:
+    """A table with a row for each task and a column for each size."""
+    table = Table(title, [corner, *map(str, sizes)])
     known = {task.name: task for task in tasks.TASKS}
-    for title, name in TASKS.items():
-        cells = [_two_ways(known[name], size, effort) for size in sizes]
-        table.rows.append([title, *cells])
-    return [table]
+    for shown, name in TASKS.items():
+        table.rows.append([shown, *(cell(known[name], size, effort) for size in sizes)])
+    return table
 
 
 def _two_ways(task: tasks.Task, size: int, effort: Effort) -> str:
@@ -85,12 +95,7 @@ def _per_env(effort: Effort) -> Table:
     """What hooks cost that are called one environment at a time."""
     sizes = PER_ENV_SIZES[:1] if effort.quick else PER_ENV_SIZES
     title = "Processor time of a step per environment in us, all / hooks and FMUs alone"
-    table = Table(title, ['hooks="per_env"', *map(str, sizes)])
-    known = {task.name: task for task in tasks.TASKS}
-    for title, name in TASKS.items():
-        cells = [_all_and_hooks(known[name], size, effort) for size in sizes]
-        table.rows.append([title, *cells])
-    return table
+    return _of_tasks(title, 'hooks="per_env"', sizes, _all_and_hooks, effort)
 
 
 def _all_and_hooks(task: tasks.Task, size: int, effort: Effort) -> str:

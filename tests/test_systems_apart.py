@@ -13,7 +13,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import values_tools
-from apart_tools import (  # noqa: F401
+from apart_tools import (  # noqa: F401  # some are fixtures
     LOG,
     MASSES,
     Chain,

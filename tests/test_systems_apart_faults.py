@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from apart_tools import (  # noqa: F401
+from apart_tools import (  # noqa: F401  # some are fixtures
     LOG,
     MASSES,
     NAMES,

@@ -7,7 +7,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
-from apart_tools import (  # noqa: F401
+from apart_tools import (  # noqa: F401  # some are fixtures
     MASSES,
     NAMES,
     Chain,

@@ -9,7 +9,12 @@ from fmpy import extract, read_model_description
 from fmpy.fmi3 import FMU3Slave
 from gymnasium import spaces
 from scipy.linalg import expm
-from system_tools import by_each_master, closing_pools, in_each_engine, play  # noqa: F401
+from system_tools import (
+    by_each_master,
+    closing_pools,  # noqa: F401  # the fixture "make"
+    in_each_engine,
+    play,
+)
 
 import fmugym
 from fmugym import (

@@ -4,7 +4,11 @@ import gymnasium
 import numpy as np
 import pytest
 import values_tools
-from system_tools import closing_pools, in_each_engine, play  # noqa: F401
+from system_tools import (
+    closing_pools,  # noqa: F401  # the fixture "make"
+    in_each_engine,
+    play,
+)
 
 from fmugym import Component, ConfigError, Connection, FMUEnv, FMUSystem, FMUVectorEnv
 from fmugym.tools import cli
