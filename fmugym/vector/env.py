@@ -221,6 +221,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if self.closed or self._background.is_pending:
             self._open_pool("reset")
+        if seed is None and self._is_ready:
+            try:
+                result = self._engine.reset_by(options)
+            except BaseException:
+                self._interrupt()
+                raise
+            if result is not None:
+                return result
         remaining, mask = split_options(options, self.num_envs)
         if not self._is_ready and not mask.all():
             when = "reset after an exception" if self._started else "first reset"
