@@ -429,15 +429,13 @@ PyObject *results_of_step(const Results *r, const ResultArrays *a) {
 
 /* A dict that calls a function, with these arguments, when somebody reads or writes it. */
 static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
-    PyObject *arguments = PyTuple_Pack(3, t->plan, drawn, mask);
-    PyObject *filling = arguments == NULL ? NULL : PyTuple_Pack(2, t->fill, arguments);
+    PyObject *filling = PyTuple_Pack(4, t->fill, t->plan, drawn, mask);
     PyObject *dict = filling == NULL ? NULL : t->make(t->class, t->no_arguments, NULL);
 
     if (dict != NULL && (PyObject_SetAttr(dict, t->slot, filling) < 0 ||
                          PyDict_SetItem(dict, t->unfilled, Py_None) < 0)) {
         Py_CLEAR(dict);
     }
-    Py_XDECREF(arguments);
     Py_XDECREF(filling);
     return dict;
 }

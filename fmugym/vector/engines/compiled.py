@@ -85,7 +85,7 @@ class CompiledEngine(BatchEngine):
         """Give the pool everything it needs for a step, if it can draw the episodes."""
         plan, streams = self.env._plan, self._streams
         self._task = task
-        self._prepared = self._resets_at_once = False
+        self._prepared = self._resets_at_once = self._is_whole = False
         if task is None or not _can_draw(task, plan):
             return
         self._left = task.left
@@ -101,6 +101,7 @@ class CompiledEngine(BatchEngine):
         self._make_rows(task)
         layout = Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
+        self._is_whole = layout.divided is None and not task.left
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
@@ -120,6 +121,7 @@ class CompiledEngine(BatchEngine):
             self._start = self._pool.start_of_play()
             self._reset_by = self._pool.reset_of_play()
         self._prepared = True
+        self._not_drawn = np.empty(self._drawn_shape)
 
     def _make_rows(self, task: TracedTask) -> None:
         """Make the arrays that stay in place: variables, and what hooks read of the step before."""
@@ -258,12 +260,15 @@ class CompiledEngine(BatchEngine):
         """See ``Engine.reset_by``."""
         if not self._resets_at_once or self._any_foreign:
             return None
-        self.has_moved = True  # unless it has to be done otherwise
-        done = self._reset_by(options)
+        try:
+            done = self._reset_by(options)
+        except BaseException:
+            self.has_moved = True
+            raise
         if done is None:
             return None
         result, troubled, self.any_ended = done
-        if self._divided is None and not troubled and not self._left:
+        if self._is_whole and not troubled:
             return result
         return self._started(*result, result[1]["_drawn"], troubled)
 
@@ -345,6 +350,14 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
+        if resetting is None and self._is_whole and not (self._any_foreign or self.starts_at_ends):
+            self.has_moved = True  # unless the call refuses its arguments
+            try:
+                result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
+            except _REFUSALS as error:
+                return self.step(self._converted(actions, error), None)
+            self.any_ended = ended > 0
+            return self._completed(result, troubled, None, None) if troubled else result
         warms_up = resetting is not None and self.env._warm_ups is not None
         if self._any_foreign or not self._prepared or warms_up:
             return self._step_on_arrays(actions, resetting)
