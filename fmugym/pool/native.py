@@ -531,8 +531,8 @@ class NativePool(SavingPool):
                 each input the number of a start value, or -1 and a constant. ``results``, None if
                 only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
                 tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
-                empty one); the shape and type of each array: float32 observations, or those
-                that the second program stores, then rewards, terminated and truncated of a step, and
+                empty one); the shape and type of each array: float32 observations, or those that
+                the second program stores, then rewards, terminated and truncated of a step, and
                 mask and drawn values (draws, N) of a reset; and the parts of a reset's infos: the
                 names of the drawn values and of the mask, and what ``LateDict.parts`` returns.
 

@@ -350,6 +350,7 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
+        result: StepResult
         if resetting is None and self._is_whole and not (self._any_foreign or self.starts_at_ends):
             self.has_moved = True  # unless the call refuses its arguments
             try:
@@ -363,7 +364,6 @@ class CompiledEngine(BatchEngine):
             return self._step_on_arrays(actions, resetting)
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
-        result: StepResult
         drawn, last, started = self._spare or self._make_spare()
         drawn = drawn if resetting is None else self._draw_ahead(resetting)
         play = self._play if resetting is started is None else self._play_with_resets
