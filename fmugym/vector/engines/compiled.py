@@ -350,20 +350,25 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
+        if resetting is not None or not self._is_whole or self._any_foreign or self.starts_at_ends:
+            return self._step_in_parts(actions, resetting)
         result: StepResult
-        if resetting is None and self._is_whole and not (self._any_foreign or self.starts_at_ends):
-            self.has_moved = True  # unless the call refuses its arguments
-            try:
-                result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
-            except _REFUSALS as error:
-                return self.step(self._converted(actions, error), None)
-            self.any_ended = ended > 0
-            return self._completed(result, troubled, None, None) if troubled else result
+        self.has_moved = True  # unless the call refuses its arguments
+        try:
+            result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
+        except _REFUSALS as error:
+            return self.step(self._converted(actions, error), None)
+        self.any_ended = ended > 0
+        return self._completed(result, troubled, None, None) if troubled else result
+
+    def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """Do a step for which one call of the pool may not be all."""
         warms_up = resetting is not None and self.env._warm_ups is not None
         if self._any_foreign or not self._prepared or warms_up:
             return self._step_on_arrays(actions, resetting)
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
+        result: StepResult
         drawn, last, started = self._spare or self._make_spare()
         drawn = drawn if resetting is None else self._draw_ahead(resetting)
         play = self._play if resetting is started is None else self._play_with_resets
