@@ -28,7 +28,7 @@ from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_mapping, check_option, check_path
+from fmugym.checks import KnownArguments, check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
@@ -53,7 +53,7 @@ class StandsForFMU(Protocol):
         """Open it, with a temporary folder of its own."""
 
 
-class FMU(LoadableFMU):
+class FMU(LoadableFMU, KnownArguments):
     """An FMU archive and the temporary folder it is extracted to.
 
     Args:
@@ -78,6 +78,7 @@ class FMU(LoadableFMU):
 
     Raises:
         ConfigError: If an argument does not fit.
+        ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
         FMULoadError: If the file is missing, not a sound FMU archive, or lacks the interface.
     """
 
