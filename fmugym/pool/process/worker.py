@@ -23,7 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import FMU, ExtractedFMU
+from fmugym.archive.fmu import FMU
+from fmugym.archive.loadable import ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.texts import text_of
 from fmugym.archive.variable import Variable
