@@ -263,8 +263,8 @@ class Pool(ABC):
     def plays_alone(self) -> bool:
         """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
 
-        Then it also offers ``roll_out``, ``prepare_single`` and ``start_of_play``, and starts
-        episodes within the steps in which others end.
+        Then it also offers ``roll_out`` and ``start_of_play``, and starts episodes within the steps
+        in which others end.
         """
         return False
 
@@ -297,7 +297,7 @@ class Pool(ABC):
         """Make the functions that do whole steps of a single environment; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
+            SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 

@@ -16,7 +16,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from fmugym.pool.base import (
     FloatArray,
     MaskArray,
     PoolSpec,
+    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -45,6 +46,9 @@ from fmugym.pool.process.supervisor import Supervisor
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+
+if TYPE_CHECKING:
+    from fmugym.pool.process.play import PlayAround
 
 __all__ = ["ProcessPool"]
 
@@ -251,11 +255,19 @@ class ProcessPool(SavingPool):
 
     def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
         """See ``Pool.prepare_play``."""
+        return self._around().prepare(*parts, **named)
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """See ``Pool.prepare_single``."""
+        return self._around().prepare_single(self.step_own, groups)
+
+    def _around(self) -> PlayAround:
+        """Make what runs compiled hooks around the workers' steps."""
         if not self.can_play:
             raise SimulationError("compiled hooks need the native pool")
         from fmugym.pool.process.play import PlayAround
 
-        return PlayAround(self._setup, self._arrays, self._advance).prepare(*parts, **named)
+        return PlayAround(self._setup, self._arrays, self._advance)
 
     def _advance(
         self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray
