@@ -20,10 +20,11 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.chain import chained_jacobian
 from fmugym.fmi.control import Repeatable, StepControl
 from fmugym.fmi.initialization import Initialization
-from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.master import Master
 from fmugym.fmi.parts import FailedError, Memory, Part, Parts, scaled
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Phase, Status, failed_call
 from fmugym.systems.description import MASTER, PartVariable, SystemDescription
 from fmugym.systems.layout import Layout

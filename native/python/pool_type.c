@@ -539,6 +539,8 @@ static PyMethodDef methods[] = {
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
      METH_VARARGS | METH_KEYWORDS, NULL},
     FAST("step_single", py_step_single),
+    FAST("before_single", py_before_single),
+    {"after_single", py_after_single, METH_O, NULL},
     {"begin_single", py_begin_single, METH_O, NULL},
     {"actions_of_single", py_actions_of_single, METH_NOARGS, NULL},
     FAST("start", py_start),
