@@ -263,10 +263,15 @@ class Pool(ABC):
     def plays_alone(self) -> bool:
         """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
 
-        Then it also offers ``roll_out`` and ``start_of_play``, and starts episodes within the steps
-        in which others end.
+        Then it also offers ``start_of_play``, and starts episodes within the steps in which others
+        end.
         """
         return False
+
+    @property
+    def rolls_out(self) -> bool:
+        """Whether ``roll_out`` does many steps of compiled hooks in one call."""
+        return self.plays_alone
 
     def prepare_play(
         self,
@@ -289,7 +294,7 @@ class Pool(ABC):
         """Do many steps of the prepared play in one call; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
+            SimulationError: If the pool does not support it; see ``rolls_out``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 

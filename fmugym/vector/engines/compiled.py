@@ -382,7 +382,7 @@ class CompiledEngine(BatchEngine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if not self._prepared or self._left or not self._pool.plays_alone:
+        if not self._prepared or self._left or not self._pool.rolls_out:
             return None
         horizon = len(actions)
         shape = horizon, self._n
