@@ -542,6 +542,8 @@ class TestFaults:
         _, status = pool.restore(pool.save())
         assert status.tolist() == [Status.ERROR]
         assert "restoring the FMU state returned Error" in pool.failure(0)
+        assert step(pool)[1].tolist() == [Status.ERROR]
+        assert "needs a reset" in pool.failure(0)
         self.assert_sound(pool)
 
     @with_state
