@@ -169,6 +169,7 @@ def actions_of(n):
 def surroundings(pool):
     return {
         "kept": np.zeros_like(pool.outputs),
+        "done": None,
         "reads_kept": False,
         "copies": (),
         "drawn_variables": (),
@@ -316,6 +317,8 @@ class TestPrograms:
             {"variable_starts": ((np.zeros(3), b"1"),)},
             {"input_starts": ()},
             {"kept": np.zeros((1, 1))},
+            {"done": np.zeros(1, np.bool_)},
+            {"done": np.zeros(6)},
         ],
         ids=str,
     )

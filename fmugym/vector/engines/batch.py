@@ -285,7 +285,6 @@ class BatchEngine(Engine):
         env.previous_state[:, indices] = env.state[:, indices]
         no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
         env.action[..., indices] = env.previous_action[..., indices] = no_action
-        env.done = env.done.copy()  # the caller holds this array
         env.done[indices] = False
         for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
             row[indices] = (
@@ -500,6 +499,7 @@ class BatchEngine(Engine):
         wrong = not_finite(observations)
         if resetting is not None and wrong is not None:
             self._require_finite_start(observations, resetting)
+        env.done = terminated.copy()  # the caller may change what it gets
         self._handle_faults(result, statuses, has_faults, wrong)
         self.note_ends(terminated, truncated)
         return result
@@ -613,6 +613,7 @@ class BatchEngine(Engine):
         result.rewards[faulty] = results.rewards(env._fault_reward(), self._n)[faulty]
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
+        env.done[faulty] = result.terminated[faulty]
 
     def _undo(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
