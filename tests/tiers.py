@@ -177,6 +177,7 @@ SLOW_TESTS = (
     "test_model_exchange.py::TestEnvironments::test_a_solver",
     "test_model_exchange.py::TestPools",
     "test_model_exchange.py::TestSolvers::test_the_stiff",
+    "test_native_guards.py::TestRecords::test_are_each_of_their_own_episode",
     "test_native_guards.py::test_want_of_memory",
     "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
