@@ -181,9 +181,8 @@ class Initialization:
         part.started = True
         part.instance.exchange = exchange
         try:
-            part.instance.initialize(*span, lambda: self._set_starts(index, values))
-        except SimulationError:
-            raise FailedError(self._parts.status_of(part), part.label) from None
+            with self._parts.blaming(index):
+                part.instance.initialize(*span, lambda: self._set_starts(index, values))
         finally:
             part.instance.exchange = None
 
