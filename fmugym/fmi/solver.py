@@ -47,6 +47,7 @@ class Solving:
         max_step: The longest step in seconds; infinite for no limit.
         ramps: The value references of inputs that change linearly, in co-simulation.
         ramp_duration: How long each change takes, in seconds.
+        watched: The outputs that the FMU is to tell in intermediate updates.
     """
 
     solver: str = "dormand_prince"
@@ -54,6 +55,7 @@ class Solving:
     max_step: float = math.inf
     ramps: tuple[int, ...] = ()
     ramp_duration: float = 1.0
+    watched: tuple[Variable, ...] = ()
 
 
 _MEMORY: Final = struct.Struct("=dddqq")
