@@ -22,6 +22,7 @@ struct Updates {
     double begin, end; /* of the FMU's step */
     double least;      /* no later update of this step may be before this time */
     bool asked;        /* whether the FMU has asked for inputs in this step */
+    bool strayed;      /* whether it has made an update for another instance */
     bool busy;         /* whether an update is being answered */
     Status status;     /* the worst of this step */
     bool collects;     /* whether any step has begun since updates_clear */
@@ -245,8 +246,12 @@ void updates_answer(void *environment, double time, bool set_requested, bool get
     if (early_return_time != NULL) {
         *early_return_time = time;
     }
-    if (me == NULL || me->solver->environment != number) {
+    if (me == NULL) {
         atomic_set(stray_of(number), number);
+        return;
+    }
+    if (me->solver->environment != number) {
+        me->strayed = true;
         return;
     }
     if (me->busy || !good(me->status)) {
@@ -268,7 +273,7 @@ static void begin(Updates *me, double time, double size) {
     atomic_replace(stray_of(own), &own, 0);
     me->begin = me->least = time;
     me->end = time + size;
-    me->asked = false;
+    me->asked = me->strayed = false;
     me->status = STATUS_OK;
     if (!me->collects) {
         me->collects = true;
@@ -280,7 +285,7 @@ static void begin(Updates *me, double time, double size) {
 
 static bool has_strayed(const Updates *me) {
     uint64_t own = me->solver->environment;
-    return atomic_replace(stray_of(own), &own, 0);
+    return atomic_replace(stray_of(own), &own, 0) || me->strayed;
 }
 
 /* The worse of both statuses. */

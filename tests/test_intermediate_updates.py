@@ -3,7 +3,9 @@
 import logging
 import math
 import re
+from contextlib import closing
 
+import clocks_tools
 import numpy as np
 import pytest
 import updates_tools
@@ -12,9 +14,11 @@ from fmpy import extract
 from fmpy.fmi3 import FMU3Slave, fmi3ValueReference
 from updates_tools import MISCHIEFS, updating_fmu
 
-from fmugym import FMU
+import fmugym
+from fmugym import FMU, ConfigError
 from fmugym import pool as pools
 from fmugym.pool import PoolSpec
+from fmugym.pool.local import local_pool
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -24,6 +28,7 @@ OPTIONS = {
     "process": {"backend": "auto", "isolation": "process", "workers": 1},
 }
 all_kinds = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
+all_but_wine = pytest.mark.parametrize("kind", list(OPTIONS))
 both_backends = pytest.mark.parametrize("kind", ["python", "native"])
 H, INNER = 0.1, 0.03
 SAMPLINGS = ("mean", "integral", "min", "max", "last")
@@ -248,3 +253,147 @@ def test_without_points_the_end_of_the_substep_counts(make_pool, kind):
         lows, highs = halves.min(axis=0), halves.max(axis=0)
         sums = halves.sum(axis=0) * (H / 2)
         np.testing.assert_array_equal(step(pool, u), [means, sums, lows, highs, halves[1]])
+
+
+@all_but_wine
+def test_points_of_smaller_steps_count_after_a_discarded_one(tmp_path, make_pool, kind):
+    hesitant = updating_fmu(tmp_path / "hesitant.fmu", more=("-DLONGEST=0.06",))
+    pool = make_pool(kind, 1, at=hesitant, fault_retries=1)
+    begin(pool, (2.0,))
+    first = updates_tools.simulate(1.0, 2.0, lambda _: 1.0, 0.0, H / 2)
+    second = updates_tools.simulate(first[1][-1], 2.0, lambda _: 1.0, H / 2, H / 2)
+    times, xs = np.concatenate([first, second], axis=1)[:2]
+    mean = updates_tools.mean(0.0, times, xs)
+    assert step(pool, 1.0)[:2, 0] == pytest.approx([mean, H * mean], rel=1e-12)
+    assert pool.info()["retries"].tolist() == [1]
+
+
+@all_but_wine
+def test_an_early_return_changes_nothing(tmp_path, make_pool, kind):
+    """The FMU returns at its third internal step, and then goes on."""
+    hasty = updating_fmu(tmp_path / "hasty.fmu", more=("-DEARLY=0.06",))
+    pool = make_pool(kind, 1, at=hasty, linear=True)
+    begin(pool, (2.0,))
+    found = [step(pool, u)[:, 0] for u in ACTIONS[:, 0]]
+    by_numpy = expected(2.0, ACTIONS[:, 0], line=True)
+    np.testing.assert_allclose(found, by_numpy, rtol=1e-12)
+
+
+@all_but_wine
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_event_mode(tmp_path, make_pool, kind, substeps):
+    """The FMU, whose x is the time, tells the middle and the end of its steps between events."""
+    place = clocks_tools.clocks_fmu(tmp_path / "clocks.fmu", flags=updates_tools.PROVIDES)
+    fmu = FMU(place, probe_timeout=None)
+    spec = PoolSpec((), (fmu.variable("x"),), 0.13, samplings=("mean",), substeps=substeps)
+    events = np.union1d(0.05 + 0.1 * np.arange(30), 0.25 * np.arange(12))  # of the first clocks
+    with closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS[kind])) as pool:
+        pool.reset((), np.zeros((0, 1)))
+        plain = [pool.step(np.zeros((0, 1)))[0][0, 0] for _ in range(8)]
+        assert not pool.statuses.any(), pool.failure(0)
+    starts = 0.13 * np.arange(8)
+    # the mean of the time but for the first half of the first step, where its end counts
+    below = np.array(plain) - (starts + 0.065)
+    assert (below > 0).all()
+    longest = np.diff(events).max() / 2
+    assert (below <= 0.5 * longest**2 / (0.13 / substeps) + 1e-12).all()
+
+
+class Env(fmugym.FMUEnv):
+    def _is_done(self):
+        return False
+
+
+CONFIG = {
+    "model_input_names": ["u"],
+    "model_output_names": ["x"],
+    "monitor_names": ["y"],
+    "bounds": {"u": (-10, 10)},
+    "time_step": H,
+    "model_parameters": {"k": 2.0},
+    "samplings": {"x": "mean", "y": "max"},
+    "input_interpolation": "linear",
+}
+
+
+def test_environments(path):
+    isolated = CONFIG | {"isolation": "process"}
+    with (
+        closing(Env(path, CONFIG)) as env,
+        closing(Env(path, isolated)) as apart,
+        closing(fmugym.FMUVectorEnv(lambda: Env(path, CONFIG), num_envs=3)) as envs,
+        closing(fmugym.FMUVectorEnv(lambda: Env(path, isolated), num_envs=3)) as envs_apart,
+    ):
+        for one in (env, apart, envs, envs_apart):
+            one.reset(seed=1)
+        means = expected(2.0, ACTIONS[:, 0], line=True)[:, 0]
+        for action, mean in zip(ACTIONS[:, 0], means, strict=True):
+            u = np.array([action], np.float32)
+            seen = env.step(u)[0]
+            assert seen == pytest.approx([mean], rel=1e-6)
+            assert np.array_equal(apart.step(u)[0], seen)
+            many = np.tile(u, (3, 1))
+            for each in (envs, envs_apart):
+                assert np.array_equal(each.step(many)[0], np.tile(seen, (3, 1)))
+        snapshot = env.save_state()
+        first = env.step(np.array([1.0]))[0]
+        env.restore_state(snapshot)
+        assert env.step(np.array([1.0]))[0] == first
+
+
+@pytest.mark.parametrize(
+    ("changes", "facts"),
+    [
+        ({"flags": ""}, ["'u'", "providesIntermediateUpdate"]),
+        ({"updated": ("x", "y")}, ["'u'", "intermediateUpdate"]),
+    ],
+)
+def test_inputs_that_cannot_be_linear_are_named(tmp_path, changes, facts):
+    place = updating_fmu(tmp_path / "updating.fmu", **changes)
+    with pytest.raises(ConfigError) as caught:
+        Env(place, CONFIG)
+    assert all(fact in str(caught.value) for fact in facts)
+
+
+def test_inputs_in_event_mode_cannot_be_linear(tmp_path):
+    place = clocks_tools.clocks_fmu(tmp_path / "clocks.fmu", flags=updates_tools.PROVIDES)
+    config = {"model_input_names": "plain", "model_output_names": "x", "time_step": H}
+    config |= {"input_interpolation": "linear", "bounds": {"plain": (0, 1)}}
+    with pytest.raises(ConfigError, match=r"'plain'|event mode"):
+        Env(place, config)
+
+
+@both_backends
+@pytest.mark.parametrize("changes", [{"flags": ""}, {"updated": ("u",)}])
+def test_fmus_that_tell_nothing_are_not_asked(tmp_path, make_pool, kind, changes):
+    """Otherwise this FMU would tell: its ``calls`` count updates that anybody wants."""
+    place = updating_fmu(tmp_path / "updating.fmu", **changes)
+    pool = make_pool(kind, 1, at=place)
+    begin(pool, (2.0,))
+    last = expected(2.0, [1.0])[0, -1]
+    assert step(pool, 1.0)[:, 0] == pytest.approx([last, H * last, last, last, last], rel=1e-12)
+
+
+@both_backends
+def test_components_of_systems_have_linear_inputs(path, kind):
+    if kind == "native" and not pools.has_native_pool():
+        pytest.skip("the C extension was not built")
+    fmu = fmugym.FMUSystem({"a": path}).as_fmu()
+    u = fmu.variable("a.u")
+    outputs = (fmu.variable("a.x"), fmu.variable("a.x"))
+    spec = PoolSpec((u,), outputs, H, samplings=("mean", "last"), substeps=2, ramped=(u,))
+    with closing(local_pool(fmu, spec, 1, LOG, native=kind == "native")) as pool:
+        pool.reset((fmu.variable("a.k"),), np.array([[2.0]]))
+        found = np.array([step(pool, action)[:, 0] for action in ACTIONS[:, 0]])
+    x, before = 1.0, 0.0
+    for number, (row, action) in enumerate(zip(found, ACTIONS[:, 0], strict=True)):
+        ends = []
+        for part in (0, 0.5):
+
+            def line(time, number=number, first=before, last=action):
+                return first + (last - first) * (time - number * H) / H
+
+            x = updates_tools.simulate(x, 2.0, line, (number + part) * H, H / 2)[1][-1]
+            ends.append(x)
+        assert row == pytest.approx([np.mean(ends), x], rel=1e-12)
+        before = action

@@ -198,7 +198,7 @@ int core_set_slopes(Model *me, const unsigned *references, size_t count, const i
     return OK;
 }
 
-/* Does no more of a step than EARLY seconds. */
+/* Does no more of a step than EARLY seconds, and breaks off one that is longer than LONGEST. */
 int core_do_step(Model *me, double time, double step) {
     const double until = time + fmin(step, EARLY);
 
@@ -206,6 +206,9 @@ int core_do_step(Model *me, double time, double step) {
     me->time = me->step_begin = time;
     me->step_end = time + step;
     while (me->time < until - 1e-12) {
+        if (step > LONGEST && me->time > time + 0.5 * step) {
+            return DISCARD;
+        }
         if (step_once(me, until)) {
             me->stops = true;
             return DISCARD;

@@ -18,6 +18,10 @@ enum { MOST = 32 };
 #define EARLY INFINITY
 #endif
 
+#ifndef LONGEST
+#define LONGEST INFINITY
+#endif
+
 typedef struct {
     double v[MOST]; /* the variables */
     double slope[MOST]; /* of inputs, in co-simulation */

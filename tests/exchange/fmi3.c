@@ -63,7 +63,7 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     *early = !me->stops && me->time < time + step - 1e-9;
     *terminate = me->stops;
     *last = me->time;
-    return status == DISCARD ? OK : status;
+    return status == DISCARD && me->stops ? OK : status;
 }
 
 int fmi3EnterEventMode(Model *me) {
