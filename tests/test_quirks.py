@@ -61,13 +61,7 @@ class QuirkEnv(fmugym.FMUEnv):
 
 @pytest.fixture(scope="module")
 def make_fmu(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("quirks")
-
-    @functools.cache
-    def make(token, version=2):
-        return quirk_table.quirk_fmu(folder / f"{token} {version}", version, token)
-
-    return make
+    return quirk_table.making_quirks(tmp_path_factory.mktemp("quirks"))
 
 
 @pytest.fixture(autouse=True)

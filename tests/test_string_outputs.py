@@ -17,7 +17,7 @@ import wine_tools
 from pythonfmu import FmuBuilder
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv
+from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
 from fmugym.pool import PoolSpec, has_native_pool
@@ -247,6 +247,26 @@ def test_a_backend_gives_texts(feedthrough):
     assert env.out["String_told"] == "abc 0"
     env.step(0)
     assert env.out["String_told"] == "abc 1"
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        ({"String_told": 3.0}, "'String_told'.*String.*3.0"),
+        ({"String_told": None}, "'String_told'.*String.*None"),
+        ({"length": "one"}, "'one'"),
+    ],
+)
+def test_a_backend_that_mixes_texts_and_numbers_fails(feedthrough, given, facts):
+    class Mixed(Rig):
+        def outputs(self):
+            return super().outputs() | given
+
+    changes = {"words": "abc", "monitor_names": ["String_told"]}
+    env = test_strings.Reading(feedthrough[3], backend=Mixed(), **changes)
+    with pytest.raises(SimulationError, match=facts):
+        env.reset()
     env.close()
 
 

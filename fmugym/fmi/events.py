@@ -10,8 +10,10 @@ from fmpy.fmi3 import FMU3Slave
 
 from fmugym.fmi.access import Access
 from fmugym.fmi.clocks import CallError
-from fmugym.fmi.exchange import ExchangeInstance, FMI3Events
+from fmugym.fmi.exchange import ExchangeInstance
+from fmugym.fmi.exchange_calls import FMI3Events, SetClocked
 from fmugym.fmi.fmi3 import FMI3Instance
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import Status
 
 __all__ = ["FMI3EventsInstance"]
@@ -22,8 +24,8 @@ class _Steps(FMI3Events):
 
     steps_by_itself = True
 
-    def __init__(self, instance: ExchangeInstance) -> None:
-        self._begin(instance)
+    def __init__(self, instance: Instance, set_clocked: SetClocked) -> None:
+        self._begin(instance, set_clocked)
         self.number_of_states = self.number_of_indicators = 0
         self.completes = False
         self._updates = instance.updates

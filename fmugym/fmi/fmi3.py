@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback, fmi3ValueReference
 
-from fmugym.fmi.instance import Initialize, Instance, Span
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import MessageLog, catching, fmi3_log_message
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status
 from fmugym.fmi.updates import Updates, decline
 
