@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
+from fmugym.archive.variable import Variable
 from fmugym.fmi.clocks import TICKS_SIZE, CallError, Ticks, Timetable
 from fmugym.fmi.crossings import Bracket, crosses
 from fmugym.fmi.equations import Equations

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -19,10 +19,7 @@ from fmugym.fmi.clocks import CallError
 from fmugym.fmi.log import catching
 from fmugym.fmi.status import Status
 
-if TYPE_CHECKING:
-    from fmugym.fmi.access import Access
-
-__all__ = ["Course", "Updates", "decline"]
+__all__ = ["Course", "Outputs", "Updates", "decline"]
 
 _EPSILON: Final = sys.float_info.epsilon
 
@@ -39,6 +36,15 @@ def decline(time: float, requested: Any, early_return_time: Any) -> None:
         requested[0] = False
     if early_return_time:
         early_return_time[0] = time
+
+
+class Outputs(Protocol):
+    """What ``fmugym.fmi.access.Access`` is, which needs instances."""
+
+    values: npt.NDArray[np.float64]
+
+    def get(self) -> int:
+        """Read the values; return the status."""
 
 
 class Course:
@@ -87,7 +93,7 @@ class Updates:
         moves: Whether any input changes in this step.
     """
 
-    access: Access
+    access: Outputs
     set_inputs: Callable[[float], int]
     moves: Callable[[], bool]
 
