@@ -179,6 +179,7 @@ SLOW_TESTS = (
     "test_model_exchange.py::TestEnvironments::test_a_solver",
     "test_model_exchange.py::TestPools",
     "test_model_exchange.py::TestSolvers::test_the_stiff",
+    "test_native_guards.py::TestRecords::test_are_each_of_their_own_episode",
     "test_isolated_rollouts.py::test_a_hang",
     "test_isolated_rollouts.py::test_a_new",
     "test_isolated_rollouts.py::test_a_rollout",
