@@ -203,7 +203,7 @@ SLOW_TESTS = (
     "test_neighbours.py::TestOneInitializationAtATime::test_is_told",
     "test_neighbours.py::TestOneInitializationAtATime::test_serves_a_vector",
     "test_process_pool.py::TestChoice",
-    "test_process_pool.py::TestEndOfParent",
+    "test_process_ends.py::TestEndOfParent",
     "test_quirks.py::TestVerdict::test_a_damaged_cache",
     "test_rehearsals.py::test_a_spare",
     "test_rehearsals.py::test_a_rehearsal_is_put_off",
