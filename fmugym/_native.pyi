@@ -387,6 +387,9 @@ class Pool:
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
 
+    def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
+        """Do a whole reset with a mask; see ``NativePool.reset_of_play``."""
+
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""
 

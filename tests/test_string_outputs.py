@@ -1,6 +1,7 @@
 """Strings that FMUs give: monitored, so that hooks read them as texts."""
 
 import contextlib
+import importlib.util
 import logging
 import os
 import pickle
@@ -289,6 +290,16 @@ def test_numbers_of_texts():
     """Those of FNV-1a, folded: the published hashes of two texts of its authors."""
     fold = [(h >> 53) ^ (h % 2**53) for h in (0xCBF29CE484222325, 0x85944171F73967E8)]
     assert [number_of(""), number_of("foobar")] == fold
+
+
+def test_nobody_is_asked_for_an_empty_text():
+    """A question to worker processes would take its time in each step."""
+    spec = importlib.util.find_spec("fmugym.archive.texts")
+    fresh, asked = importlib.util.module_from_spec(spec), []
+    spec.loader.exec_module(fresh)
+    fresh.ask_for_texts(asked.append)
+    assert [fresh.text_of(number_of(text)) for text in ("", "never met")] == ["", ""]
+    assert asked == [number_of("never met")]
 
 
 ALL = ("String_told", "String_out", "String_parameter", "length")

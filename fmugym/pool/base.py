@@ -263,8 +263,8 @@ class Pool(ABC):
     def plays_alone(self) -> bool:
         """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
 
-        Then it also offers ``start_of_play``, and starts episodes within the steps in which others
-        end.
+        Then it also offers ``start_of_play`` and ``reset_of_play``, and starts episodes within the
+        steps in which others end.
         """
         return False
 
@@ -320,6 +320,16 @@ class Pool(ABC):
 
     def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes outside of a step; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``plays_alone``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
+
+    def reset_of_play(
+        self,
+    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
+        """The function that does whole resets with a mask; see ``NativePool``.
 
         Raises:
             SimulationError: If the pool does not support it; see ``plays_alone``.

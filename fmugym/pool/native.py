@@ -144,7 +144,8 @@ class NativePool(SavingPool):
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
-        self._reset_of_play = self.watched(self._pool.start)
+        self._start_of_play = self.watched(self._pool.start)
+        self._reset_of_play = self.watched(self._pool.reset_by)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
@@ -527,8 +528,10 @@ class NativePool(SavingPool):
                 each input the number of a start value, or -1 and a constant. ``results``, None if
                 only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
                 tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
-                empty one); and the shape and type of each array: float32 observations, or those
-                that the second program stores, then rewards, terminated and truncated.
+                empty one); the shape and type of each array: float32 observations, or those that
+                the second program stores, then rewards, terminated and truncated of a step, and
+                mask and drawn values (draws, N) of a reset; and the parts of a reset's infos: the
+                names of the drawn values and of the mask, and what ``LateDict.parts`` returns.
 
         Returns:
             A function of actions, drawn values (draws, N), last observations and started
@@ -599,6 +602,20 @@ class NativePool(SavingPool):
             A function of a mask, observations and drawn values (draws, N). It fills all of the
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
             many instances had trouble, and whether any episode of another one has ended.
+        """
+        return self._start_of_play
+
+    def reset_of_play(
+        self,
+    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
+        """The function that does whole resets with a mask after ``prepare_play``.
+
+        Returns:
+            A function of the options of a reset. If they are a dict of nothing but
+            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
+            it starts these episodes and returns the result of the reset, and the numbers that the
+            function of ``start_of_play`` returns. Otherwise it does nothing and returns None. The
+            arrays of the result are new, or those of an earlier call that nobody holds any more.
         """
         return self._reset_of_play
 

@@ -544,6 +544,7 @@ static PyMethodDef methods[] = {
     {"begin_single", py_begin_single, METH_O, NULL},
     {"actions_of_single", py_actions_of_single, METH_NOARGS, NULL},
     FAST("start", py_start),
+    {"reset_by", py_reset_by, METH_O, NULL},
     {"save", py_save, METH_NOARGS, NULL},
     FAST("restore", py_restore),
     FAST("read", py_read),
