@@ -236,6 +236,7 @@ SLOW_TESTS = (
     "test_trajectories.py::TestDirectional::test_error",
     "test_trajectories.py::TestModelExchange",
     "test_trajectories.py::TestRefusals::test_of_an_",
+    "test_trajectories.py::TestTimeDependentFMU::test_with",
     "test_trial.py::TestDeath::test_a_hang",
     "test_trial.py::TestDeath::test_before_a_vector",
     "test_trial.py::TestDeath::test_of_a_second",
