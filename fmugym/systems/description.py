@@ -74,9 +74,9 @@ class SystemDescription(ModelDescription):
     def unable_to_interpolate(self, variable: Variable) -> str | None:
         """See ``ModelDescription.unable_to_interpolate``; the first component that cannot."""
         for end in self.ends[variable.value_reference]:
-            unable = self.parts[end.part].unable_to_interpolate(variable)
+            unable = self.parts[end.part].unable_to_interpolate(end.variable)
             if unable is not None:
-                return f"component {self.plan.components[end.part].name!r}, {unable},"
+                return f"component {self.plan.components[end.part].name!r}, {unable}"
         return None
 
     def what_drives(self, variable: Variable) -> str | None:
@@ -347,7 +347,7 @@ def _joined(array: Variable, texts: Iterable[str | None]) -> str:
 
 def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -> Variable:
     """What something else drives cannot be set from outside."""
-    variable = replace(own, name=name, value_reference=reference)
+    variable = replace(own, name=name, value_reference=reference, updated=False)
     places = [place for place, one in enumerate(own.elements) if one.name in driven]
     if own.shape:
         variable = replace(variable, driven=frozenset(places))
@@ -382,6 +382,7 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         own,
         name=connector.name,
         value_reference=reference,
+        updated=False,
         array=None,
         place=0,
         driven=frozenset() if own.shape else None,
