@@ -98,6 +98,8 @@ EVERY_IN_CI = {
     "test_examples_planners": 4,
     "test_input_interpolation": 5,
     "test_intermediate_updates": 3,
+    "test_isolated_rollouts": 3,
+    "test_isolated_single": 4,
     "test_nested_fmus": 5,
     "test_quirks": 4,
     "test_reference_models": 17,

@@ -168,6 +168,8 @@ def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
     strings = env.fmu.description.strings
     places = {name: place for place, name in enumerate(env.out) if name in strings}
     given = tuple(name for name in env._interface.parameters if name in strings)
+    if not places and not given:
+        return quantities
 
     def read(env: Any) -> Sequence[Any]:
         drawn = env.parameters

@@ -261,13 +261,13 @@ class Constructed(Pictured):
         if not isinstance(hook, _StopTime):
             vars(self)["_is_truncated"] = _StopTime(self, hook)
 
-    def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
+    def _plan_of_reset(self, options: Mapping[str, Any] | None, *also_known: str) -> EpisodePlan:
         if options is None:
             return self._plan
         options = check_mapping("the options of reset", options)
         for name in options:
             if name not in self.reset_options:
-                raise unknown_name("reset option", name, self.reset_options)
+                raise unknown_name("reset option", name, (*self.reset_options, *also_known))
         if not options:
             return self._plan
         parameters = self._get_episode_parameters(options)

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.tools.agents import agent_policy
 from fmugym.tools.overview import plain
 from fmugym.tools.simulation import Policy, action_of, policy_of
@@ -31,6 +31,7 @@ __all__ = [
     "note",
     "only_player",
     "players_of",
+    "require_folder",
     "say",
     "say_json",
     "shown_in_any_case",
@@ -168,6 +169,16 @@ def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
         show()
         raise
     show()
+
+
+def require_folder(path: Path) -> None:
+    """Refuse a file whose folder does not exist, before work is done for it.
+
+    Raises:
+        ConfigError: If there is no such folder.
+    """
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {shown(str(path.parent))}; make it first")
 
 
 def _for_any_file(text: str) -> str:
