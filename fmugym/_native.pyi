@@ -212,6 +212,8 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     sampling: bytes
+    watched: Access | None
+    watched_places: bytes
 
 class Arrays(TypedDict):
     """The pool's own arrays.

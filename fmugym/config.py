@@ -117,10 +117,11 @@ class EnvConfig:
             give up at once.
         samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
             default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
-            values after each substep. After a reset an integral is 0.
+            values after each substep, and of those within that the FMU tells in intermediate
+            updates (FMI 3.0). After a reset an integral is 0.
         input_interpolation: How inputs change within a step: ``"hold"`` (the default) at once, or
             ``"linear"`` from the value of the last step; one for all inputs, or by name. The FMU
-            must be able to interpolate inputs (FMI 1.0 and 2.0, co-simulation).
+            must be able to interpolate inputs, in co-simulation.
         interface: How the FMU is run: ``"co_simulation"`` or ``"model_exchange"``; by default
             co-simulation where the FMU offers it, or as the class says.
         solver: The method of integration for model exchange: ``"dormand_prince"``, ``"euler"``,

@@ -5,6 +5,8 @@
     FMUGymError
     ├── ConfigError       a name, number or type that the user gave does not fit the FMU
     │   ├── ArgumentError a constructor does not have this argument; it is a ``TypeError``, too
+    │   ├── UnknownParameterError
+    │   │                 ``env.parameters`` has no such name; it is a ``KeyError``, too
     │   └── TaskError     a declared task has a mistake; the text says where
     ├── FMULoadError      an archive, a model description or a library cannot be used
     ├── SimulationError   an FMI call failed, or a method was called out of order
@@ -30,6 +32,7 @@ __all__ = [
     "LicenceError",
     "SimulationError",
     "TaskError",
+    "UnknownParameterError",
     "printable",
     "reason",
     "shown",
@@ -80,6 +83,13 @@ class ArgumentError(ConfigError, TypeError):
 
     It is a ``TypeError`` for callers that try arguments, as Stable-Baselines3 does.
     """
+
+
+class UnknownParameterError(ConfigError, KeyError):
+    """``env.parameters`` has no such name. It is a ``KeyError``, as with any other mapping."""
+
+    def __str__(self) -> str:
+        return printable(self.args[0])
 
 
 class TaskError(ConfigError):

@@ -17,12 +17,13 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.archive.units import conversion_between
@@ -34,6 +35,7 @@ from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
+from fmugym.series.store import TEXT
 from fmugym.task.actions import flat_inputs
 
 __all__ = ["PlantLog", "play_log"]
@@ -58,6 +60,7 @@ class PlantLog:
         episodes: Numbers of the episodes, shape (n,).
         inputs_before: Whether inputs in a row are those that led to it, from the row before;
             otherwise they hold until the next row.
+        texts: The cells of the columns that are no numbers, by name: remarks, or Strings.
     """
 
     times: FloatArray
@@ -65,6 +68,7 @@ class PlantLog:
     units: Mapping[str, str]
     episodes: FloatArray
     inputs_before: bool = False
+    texts: Mapping[str, npt.NDArray[np.object_]] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], *, inputs_before: bool | None = None) -> PlantLog:
@@ -88,16 +92,21 @@ class PlantLog:
         values = {
             name: np.array([_number(path, row, place) for row in rows])
             for place, (name, _) in enumerate(found)
-            if name and _is_numeric(rows, place)
+            if name and _is_numeric(rows, place) and found[place][1] != TEXT
+        }
+        texts = {
+            name: np.array([row[place] for row in rows], object)
+            for place, (name, _) in enumerate(found)
+            if name and name not in values
         }
         if "time" not in values:
             raise ConfigError(f"{shown(str(path))} has no column 'time' of numbers")
         times = values.pop("time")
         numbers = values.pop("episode", np.cumsum(np.diff(times, prepend=times[:1]) < 0.0))
         _require_rising(path, times, numbers)
-        units = {name: unit for name, unit in found if unit}
+        units = {name: unit for name, unit in found if unit and unit != TEXT}
         before = "step" in values if inputs_before is None else inputs_before
-        return cls(times, values, units, numbers.astype(np.float64), before)
+        return cls(times, values, units, numbers.astype(np.float64), before, texts)
 
     def parts(self) -> Iterator[PlantLog]:
         """The episodes, one by one."""
@@ -105,7 +114,11 @@ class PlantLog:
         for rows in np.split(np.arange(len(self.times)), ends):
             columns = {name: values[rows] for name, values in self.columns.items()}
             yield replace(
-                self, times=self.times[rows], columns=columns, episodes=self.episodes[rows]
+                self,
+                times=self.times[rows],
+                columns=columns,
+                episodes=self.episodes[rows],
+                texts={name: cells[rows] for name, cells in self.texts.items()},
             )
 
 

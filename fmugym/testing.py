@@ -103,7 +103,8 @@ def check_hooks(make_env: Callable[..., gymnasium.Env[Any, Any]], **kwargs: Any)
 def _of_this_package(env: gymnasium.Env[Any, Any]) -> FMUEnv:
     inner = env.unwrapped if isinstance(env, gymnasium.Env) else env
     if not isinstance(inner, FMUEnv):
-        raise ConfigError(f"expected an environment of fmugym, got {type(inner).__name__}")
+        got = f"the class {inner.__name__}" if isinstance(inner, type) else type(inner).__name__
+        raise ConfigError(f"expected an environment of fmugym, got {got}")
     return inner
 
 

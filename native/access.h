@@ -33,7 +33,7 @@ typedef struct {
     Part listed, rest; /* rest: of arrays that are not listed as a whole, the other elements */
 } Group;
 
-typedef struct {
+typedef struct Access {
     const Fmi *fmi;
     uint64_t id; /* unique in the process */
     size_t count;

@@ -50,6 +50,7 @@ static const Model model = {
     .clocks = offsetof(Functions, clocks),
     .update = update3,
     .step = step,
+    .updates = true,
 };
 
 static void *instantiate(const Library *library, const Identity *identity) {

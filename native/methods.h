@@ -7,6 +7,7 @@
 #include "clock.h"
 #include "fmi.h"
 
+struct Access;
 struct Solver;
 
 typedef struct Method {
@@ -44,6 +45,9 @@ typedef struct Solving {
     const uint32_t *ramped_references; /* inputs that change linearly */
     size_t number_of_ramps;
     double ramp_duration;
+    /* The outputs that the FMU tells in intermediate updates, or NULL, and their places among all. */
+    const struct Access *watched;
+    const uint32_t *watched_places;
 } Solving;
 
 #endif

@@ -47,12 +47,8 @@ static const void *loaded(const Evaluation *e, const char *from, size_t step, si
 }
 
 static const void *load_row(const Evaluation *e, const Row *row, Register *to) {
-    const Fresh *fresh = e->source->fresh;
     const char *from = row->data + e->begin * row->size;
 
-    if (fresh != NULL && row->output > 0) {
-        return fresh->columns + (row->output - 1) * PROGRAM_WIDTH;
-    }
     if (row->changes) { /* a later STORE_ROW must not change what was loaded */
         memcpy(to, from, e->count * row->size);
         clear_rest(to, e->count, e->lanes, row->size);

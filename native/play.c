@@ -98,8 +98,8 @@ static void take_actions(const Turn *turn, size_t begin, size_t count) {
     memcpy(a->current + offset, turn->actions + offset, count * size);
 }
 
-void play_keep_outputs(const Play *play, size_t begin, size_t count) {
-    for (size_t i = 0; i < play->number_of_outputs; i++) {
+void play_keep_outputs(const Play *play, size_t first, size_t number, size_t begin, size_t count) {
+    for (size_t i = first; i < first + number; i++) {
         const size_t place = i * play->count + begin;
         memcpy(play->kept_rows + place, play->output_rows + place, count * sizeof(double));
     }
@@ -124,7 +124,7 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     const Source source = source_of(turn);
     program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
     if (play->reads_kept) {
-        play_keep_outputs(play, begin, count);
+        play_keep_outputs(play, 0, play->number_of_outputs, begin, count);
     }
     count_steps(play, begin, count);
 }

@@ -126,8 +126,8 @@ void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh
 void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch,
                   Verdict *verdict);
 
-/* Keeps the outputs of a run, before the new ones replace them. */
-void play_keep_outputs(const Play *play, size_t begin, size_t count);
+/* Keeps so many outputs of a run, from the first of them on, before the new ones replace them. */
+void play_keep_outputs(const Play *play, size_t first, size_t number, size_t begin, size_t count);
 
 /* Sets what hooks read at the start of an episode: actions, inputs, episode variables, and the
  * outputs before the step. */

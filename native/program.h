@@ -178,12 +178,11 @@ typedef struct {
     uint16_t results[PROGRAM_RESULTS];
 } Program;
 
-/* The outputs of a run that are not in their rows yet. */
+/* The outputs of a run, which are also in their rows. */
 typedef struct {
-    const double *columns; /* PROGRAM_WIDTH of each output; 0 after the last in whole blocks */
-    const double *lines;   /* the same numbers, those of each environment after each other */
-    size_t width;          /* the number of outputs */
-    bool fits_floats;      /* whether all are finite as floats */
+    const double *lines; /* those of each environment after each other */
+    size_t width;        /* the number of outputs */
+    bool fits_floats;    /* whether all are finite as floats */
 } Fresh;
 
 /* What changes from call to call. */
@@ -193,7 +192,7 @@ typedef struct {
     const uint8_t *ended;   /* NULL stands for none */
     const int8_t *statuses; /* NULL stands for all OK */
     char *const *seen;      /* the arrays that the slots refer to */
-    const Fresh *fresh;     /* NULL if the outputs are in their rows */
+    const Fresh *fresh;     /* NULL if the outputs are in their rows only */
 } Source;
 
 /* What a run notes. */

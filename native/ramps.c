@@ -4,6 +4,7 @@
 
 #include "shared.h"
 #include "solver.h"
+#include "update.h"
 
 enum { MOST_AT_ONCE = 64 };
 
@@ -38,7 +39,8 @@ void ramps_aim(Solver *me, const uint32_t *references, size_t count, const doubl
     }
 }
 
-/* Sets the inputs of some ramps with one call for the values and one for the derivatives. */
+/* Sets the inputs of some ramps with one call for the values and one for the derivatives, which FMI 3.0 does
+ * not have. */
 static Status set_some(Solver *me, size_t first, size_t count, const double *values,
                        const double *slopes) {
     const uint32_t *references = me->solving->ramped_references + first;
@@ -50,6 +52,9 @@ static Status set_some(Solver *me, size_t first, size_t count, const double *val
         orders[i] = 1;
     }
     solver_restore_floats(me);
+    if (me->updates != NULL) {
+        return status;
+    }
     if (older(me)->set_derivatives == NULL) {
         return solver_fail(me, "the FMU lacks its function for the derivatives of inputs");
     }
@@ -81,6 +86,25 @@ Status ramps_set(Solver *me, double time) {
         }
     }
     return status;
+}
+
+bool ramps_move(const Solver *me) {
+    bool any = false;
+
+    for (size_t i = 0; i < me->solving->number_of_ramps; i++) {
+        any |= me->ramps[i].from != me->ramps[i].to;
+    }
+    return any;
+}
+
+Status ramps_step(Solver *me, double time, double size) {
+    double reached = time;
+    bool event = false, terminate = false;
+
+    me->memory.time = time;
+    const Status status = ramps_set(me, time);
+    return status > STATUS_WARNING ? status
+                                   : updates_step(me, time, size, &reached, &event, &terminate);
 }
 
 bool ramps_own(const Solver *me, uint32_t reference) {

@@ -53,6 +53,8 @@ size_t run_listed(Task *task, size_t begin, size_t end, Scratch scratch) {
 
 /* Steps of neighbours */
 
+enum { TOGETHER = 4 /* rows of outputs; transpose takes as many at a time */ };
+
 /* Writes columns as rows. Takes squares of four by four, which compilers load at once. */
 WIDE static void transpose(const double *restrict from, size_t from_step, size_t rows,
                            size_t columns, double *restrict to, size_t to_step) {
@@ -343,22 +345,10 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
-static void record_inputs(const Task *task, size_t begin, size_t count, const double *inputs) {
-    const size_t width = task->pool->settings.inputs->count;
-
-    for (size_t j = 0; j < count; j++, inputs += width) {
-        if (!is_in(task->call->mask, begin + j)) {
-            record_add(task->pool, begin + j, inputs);
-        }
-    }
-}
-
 /* Steps or resets a run, and leaves the outputs in the scratch memory. */
 static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
-    if (task->pool->records != NULL) {
-        record_inputs(task, begin, count, scratch.inputs);
-    }
+    records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 
@@ -408,45 +398,37 @@ static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) 
     return troubled;
 }
 
-static void make_columns(const Pool *pool, size_t count, Scratch scratch) {
-    const size_t width = pool->settings.outputs->count;
-    const size_t rest = (PROGRAM_WIDTH - count) % PROGRAM_BLOCK;
+/* Moves the outputs of a run into their rows, and those before the step from there into the rows that
+ * keep them, unless a program reads these. It takes few rows at a time, which stay in the cache for
+ * both: rows of many instances would drive each other out of it. */
+static void replace_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
+    const Settings *s = &task->pool->settings;
+    const Play *play = task->call->turn->play;
+    const size_t width = s->outputs->count;
 
-    transpose(scratch.outputs, width, count, width, scratch.columns, PROGRAM_WIDTH);
-    for (size_t i = 0; i < width && rest > 0; i++) {
-        memset(scratch.columns + i * PROGRAM_WIDTH + count, 0, rest * sizeof *scratch.columns);
+    for (size_t i = 0; i < width; i += TOGETHER) {
+        const size_t number = width - i < TOGETHER ? width - i : TOGETHER;
+        if (!play->reads_kept) {
+            play_keep_outputs(play, i, number, begin, count);
+        }
+        transpose(outputs + i, width, count, number, s->output_values + i * s->count + begin,
+                  s->count);
     }
 }
 
-static void keep_columns(const Pool *pool, size_t begin, size_t count, const double *columns) {
-    const Settings *s = &pool->settings;
-
-    for (size_t i = 0; i < s->outputs->count; i++) {
-        memcpy(s->output_values + i * s->count + begin, columns + i * PROGRAM_WIDTH,
-               count * sizeof *columns);
-    }
-}
-
-/* The programs read the outputs where they are in the cache. Their rows keep the old ones for so
- * long, and these are kept just before the new ones replace them, unless a program reads them. */
 size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
-    const Pool *pool = task->pool;
     const Turn *turn = task->call->turn;
-    Fresh fresh = {scratch.columns, scratch.outputs, pool->settings.outputs->count, true};
-
+    Fresh fresh = {scratch.outputs, task->pool->settings.outputs->count, true};
     size_t troubled;
+
     if (task->operation == AFTER) {
         troubled = take_over(task, run.begin, run.count, scratch, &fresh.fits_floats);
     } else {
         play_prepare(turn, run.begin, run.count, run.registers);
         troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
+        replace_outputs(task, run.begin, run.count, scratch.outputs);
     }
-    make_columns(pool, run.count, scratch);
     play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
-    if (!turn->play->reads_kept) {
-        play_keep_outputs(turn->play, run.begin, run.count);
-    }
-    keep_columns(pool, run.begin, run.count, scratch.columns);
     return troubled;
 }
 

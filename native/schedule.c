@@ -70,8 +70,7 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     const Settings *s = &task->pool->settings;
     const size_t most = most_values(task), run = length_of_longest_run(task, begin, end);
     const size_t in = run * s->inputs->count, out = run * s->outputs->count;
-    const size_t columns = task->call->turn == NULL ? 0 : PROGRAM_WIDTH * s->outputs->count;
-    const size_t size = 2 * most + in + out + columns;
+    const size_t size = 2 * most + in + out;
     double stack[STACK_VALUES];
     double *memory = size <= STACK_VALUES ? stack : malloc(size * sizeof *memory);
 
@@ -79,7 +78,7 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
         return task_give_up(task, begin, end);
     }
     double *inputs = memory + 2 * most;
-    const Scratch scratch = {memory, memory + most, inputs, inputs + in, inputs + in + out, true};
+    const Scratch scratch = {memory, memory + most, inputs, inputs + in, true};
     const size_t troubled = work_with(task, begin, end, scratch);
     if (memory != stack) {
         free(memory);

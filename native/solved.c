@@ -4,6 +4,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "update.h"
+
 /* A component: the solver, and the values that were last set, by type. Inputs that stay the same
  * need no event. */
 typedef struct {
@@ -43,6 +45,9 @@ static void forget(Solved *me) {
     memset(me->solver.kept, 0, solver_kept_size(&me->solver));
     me->solver.memory.next_event = INFINITY;
     me->solver.stale = true;
+    if (me->solver.updates != NULL) {
+        updates_clear(me->solver.updates);
+    }
     forget_last(me);
 }
 
@@ -52,6 +57,17 @@ static const void *functions_at(const Library *library, size_t offset) {
 }
 
 static Status set_clocked(Solver *me, size_t clock);
+
+/* Returns whether there was enough memory. */
+static bool open_updates(Solver *me) {
+    const Solving *s = me->solving;
+
+    if (me->model->updates && (s->number_of_ramps > 0 || s->watched != NULL)) {
+        me->updates = updates_open(me);
+        return me->updates != NULL;
+    }
+    return true;
+}
 
 void *solved_take(const Model *model, const Library *library, const Identity *identity,
                   void *component) {
@@ -68,8 +84,11 @@ void *solved_take(const Model *model, const Library *library, const Identity *id
                               .floats = identity->floats,
                               .environment = identity->environment};
         if (solver_open(&me->solver)) {
-            forget(me);
-            return me;
+            if (open_updates(&me->solver)) {
+                forget(me);
+                return me;
+            }
+            solver_close(&me->solver);
         }
     }
     if (component != NULL) {
@@ -86,6 +105,7 @@ void solved_free(const Library *library, void *component) {
     for (int type = 0; type < NUMBER_OF_TYPES; type++) {
         free(me->last[type].bytes);
     }
+    updates_close(me->solver.updates);
     solver_close(&me->solver);
     free(me);
 }
@@ -133,6 +153,9 @@ Status solved_do_step(const Library *library, void *component, double time, doub
 
     (void)library;
     (void)no_return;
+    if (me->model->step != NULL && me->model->update == NULL) {
+        return ramps_step(me, time, step);
+    }
     if (me->model->step != NULL) {
         me->memory.time = time; /* which may differ from the end of the last step by its rounding */
     }

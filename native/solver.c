@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "log.h"
+#include "update.h"
 
 enum {
     MOST_UPDATES = 1000,  /* of the discrete states in one event */
@@ -489,13 +490,9 @@ static Status step_by_fmu(Solver *me, double until) {
     const double time = me->memory.time;
     double reached = until;
     bool event = false, terminate = false;
-    Status status = me->solving->number_of_ramps > 0 ? ramps_set(me, time) : STATUS_OK;
+    const Status status = updates_step(me, time, until - time, &reached, &event, &terminate);
 
-    if (good(status)) {
-        status = me->model->step(me->library, me->component, time, until - time, &reached, &event,
-                                 &terminate);
-        solver_restore_floats(me);
-    }
+    solver_restore_floats(me);
     if (!good(status)) {
         return status;
     }

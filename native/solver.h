@@ -1,6 +1,6 @@
 /* Model exchange: the pool integrates the FMU's equations and handles its events. In co-simulation
  * with event mode the FMU does its steps, and the pool handles the events between them; with ramps
- * it only sets the inputs between them.
+ * and intermediate updates it only sets inputs and reads outputs.
  *
  * Everything above sees an instance that can do steps, as in co-simulation: solved.h. */
 
@@ -47,6 +47,7 @@ typedef struct Model {
      * or to stop. */
     Status (*step)(const Library *library, void *component, double time, double size,
                    double *reached, bool *event, bool *terminate);
+    bool updates; /* whether it may make intermediate updates in it */
 } Model;
 
 typedef enum { BEFORE_EVENTS, IN_EVENTS, IN_CONTINUOUS_TIME } Mode;
@@ -95,6 +96,7 @@ typedef struct Solver {
     char *kept;   /* the memory of ticks and ramps, which is saved with the state */
     Ticks *ticks; /* one for each clock */
     Ramp *ramps;
+    struct Updates *updates; /* of FMI 3.0, or NULL */
     bool *active; /* whether each clock ticks in this event, or is to tick in the next one */
 } Solver;
 

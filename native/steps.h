@@ -12,7 +12,6 @@ typedef struct {
     void *typed;    /* the same values in their C types */
     double *inputs; /* inputs of a run of instances, one instance after the other */
     double *outputs;
-    double *columns; /* the same outputs, PROGRAM_WIDTH places for each of them */
     bool sound; /* whether these inputs are all finite */
 } Scratch;
 

@@ -76,7 +76,8 @@ typedef struct {
     Element element;
     int32_t input, output; /* its slots, or -1 */
     const double *starts;  /* of all elements of its array; NULL for a scalar */
-    Scale scale;
+    Scale scale;           /* from the variable of the system, if that is set */
+    Scale reading;         /* to the variable of the system */
 } End;
 
 /* Parts that step one after the other; or a loop, whose inner routes carry what it solves for. */

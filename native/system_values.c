@@ -172,7 +172,7 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
     } else {
         status = end_get(me, end, value);
     }
-    *value = scaled(end->scale, *value);
+    *value = scaled(end->reading, *value);
     return status;
 }
 

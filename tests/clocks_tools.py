@@ -24,7 +24,11 @@ FRACTIONS = CLOCKS | {
 }
 
 REALS = {
-    "x": (30, 'causality="output" variability="continuous" initial="exact" start="0"'),
+    "x": (
+        30,
+        'causality="output" variability="continuous" initial="exact" start="0" '
+        'intermediateUpdate="true"',
+    ),
     "der(x)": (31, 'causality="local" variability="continuous" derivative="30"'),
     "period": (32, 'causality="parameter" variability="fixed" start="0.2"'),
     "pace": (33, 'causality="parameter" variability="tunable" start="0.5"'),

@@ -18,6 +18,7 @@ STATES = {
     "relay": ["x"],
     "sun": ["x"],
     "season": ["x"],
+    "updating": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -34,13 +35,14 @@ OTHERS = {
     "relay": ["turns", "last", "speed"],
     "sun": ["now", "sine", "seconds", "u"],
     "season": ["u"],
+    "updating": ["u", "k", "mischief", "y", "calls", "tentative"],
 }
 """The other variables in the order of their value references."""
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
 OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
-OUTPUTS |= {"now", "sine", "seconds"}
+OUTPUTS |= {"y", "calls", "now", "sine", "seconds"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},
     "ball": {"h": 1, "v": 0, "g": -9.81, "e": 0.7, "v_min": 0.1},
@@ -53,6 +55,7 @@ START = {
     "relay": {"x": 0, "last": 1e9, "speed": 1},
     "sun": {"x": 0, "u": 0},
     "season": {"x": 1, "u": 0},
+    "updating": {"x": 1, "u": 0, "k": 1, "mischief": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

@@ -98,6 +98,7 @@ class TestRecord:
         ("arguments", "fact"),
         [
             (["--output", "a.xls"], "a.xls"),
+            (["--output", "missing/a.png"], "'missing'"),
             (["--output", "a.csv", "--action", "0", "--action", "1"], "one run, got 2"),
             (["--output", "a.csv", "--variables", "phy"], "'phi'"),
             (["--output", "a.csv", "--every", "0.03"], "0.02"),
@@ -127,6 +128,13 @@ class TestRecord:
 
 
 class TestEvaluate:
+    @pytest.mark.parametrize(("plot", "fact"), [("a.csv", ".png"), ("missing/a.png", "'missing'")])
+    def test_a_picture_that_cannot_be_written_is_refused_first(self, plot, fact, capsys):
+        code, out, err = run(capsys, "evaluate", CART_POLE, "--action", "0", "--plot", plot)
+        assert (code, out) == (1, "")
+        assert fact in err
+        assert err.count("\n") == 1
+
     def test_several_scenarios_and_a_picture(self, tmp_path, capsys):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.png"

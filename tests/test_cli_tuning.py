@@ -84,6 +84,7 @@ class TestTune:
             ([RANGES, "--rounds", "0"], "--rounds"),
             ([RANGES, "--output", "a.json"], ".toml"),
             ([RANGES, "--output", "a.toml", "--name", "a b"], "'a b'"),
+            ([RANGES, "--output", "missing/a.toml"], "'missing'"),
             ([RANGES, "--scenario", "frst"], "'frost'"),
         ],
     )

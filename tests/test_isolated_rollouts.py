@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from process_tools import FaultyEnv, faulty_fmu, start_values
 from test_isolated_hooks import Sampled, Short, TwoPendulums
-from test_vector_tasks import Delayed, Goal, Tables, Task, Tracking
+from test_vector_tasks import Delayed, Goal, Outside, Tables, Tracking
 from vector_tools import CART_POLE, require_equal
 
 import fmugym
@@ -166,16 +166,6 @@ def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
 
 
 def test_an_index_outside_of_its_table(make):
-    class Outside(Task):
-        def __init__(self):
-            super().__init__(max_episode_steps=20)
-
-        def _is_done(self):
-            return self.state[0] > 90.0
-
-        def _reward_policy(self):
-            return np.take([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], self.step_count)
-
     envs = make(Outside)
     envs.reset(seed=0)
     with pytest.raises(IndexError, match="outside of its table"):

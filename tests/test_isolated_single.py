@@ -10,7 +10,15 @@ import pytest
 from fmu_tools import PlainEnv, probe_config
 from process_tools import FaultyEnv, faulty_fmu
 from test_isolated_hooks import Sampled, TwoPendulums
-from test_single_compiled import TASKS, Counting, Failing, require_readings, require_same, same
+from test_single_compiled import (
+    TASKS,
+    Counting,
+    Failing,
+    require_readings,
+    require_same,
+    require_same_snapshots,
+    same,
+)
 from vector_tools import Drawing
 
 import fmugym
@@ -249,22 +257,9 @@ def test_interrupts_in_a_step_end_the_episode(hooks):
 
 
 @pytest.mark.parametrize("cls", [TASKS[0], Counting])
-def test_snapshots_and_copies(cls):
+def test_snapshots(cls):
     one, other = isolated(cls), here(cls)
-    rng, results = np.random.default_rng(0), []
-    size = one.action_space.shape
-    actions = [rng.uniform(-0.01, 0.01, size).astype(np.float32) for _ in range(6)]
-    for env in (one, other):
-        env.reset(seed=6)
-        found = [env.step(action) for action in actions[:2]]
-        snapshot = env.save_state()
-        found += [env.step(action) for action in actions[2:4]]
-        env.restore_state(snapshot)
-        found += [env.step(action) for action in actions[2:]]
-        results.append(found)
-    assert all(map(same, *results))
-    assert one._play is not None
-    require_readings(one, other)
+    require_same_snapshots(one, other)
     one.close()
 
 

@@ -171,6 +171,24 @@ class Telling(Counting):
         return {"count": self.variables["count"], "action": self.action, "time": self.time}
 
 
+def require_same_snapshots(one, other):
+    """Go back to a snapshot in two environments; the first one runs compiled."""
+    rng, results = np.random.default_rng(0), []
+    size = one.action_space.shape
+    actions = [rng.uniform(-0.01, 0.01, size).astype(np.float32) for _ in range(6)]
+    for env in (one, other):
+        env.reset(seed=6)
+        found = [env.step(action) for action in actions[:2]]
+        snapshot = env.save_state()
+        found += [env.step(action) for action in actions[2:4]]
+        env.restore_state(snapshot)
+        found += [env.step(action) for action in actions[2:]]
+        results.append(found)
+    assert all(map(same, *results))
+    assert one._play is not None
+    require_readings(one, other)
+
+
 TASKS = [Tracking, Delayed, Goal, Tables, Acting, Counting, Ranking, Telling]
 
 
@@ -483,21 +501,7 @@ class TestLife:
 
     @pytest.mark.parametrize("cls", [Tracking, Counting])
     def test_snapshots(self, cls):
-        one, other = (with_hooks(cls, hooks) for hooks in ("compiled", "python"))
-        rng, results = np.random.default_rng(0), []
-        size = one.action_space.shape
-        actions = [rng.uniform(-0.01, 0.01, size).astype(np.float32) for _ in range(6)]
-        for env in (one, other):
-            env.reset(seed=6)
-            found = [env.step(action) for action in actions[:2]]
-            snapshot = env.save_state()
-            found += [env.step(action) for action in actions[2:4]]
-            env.restore_state(snapshot)
-            found += [env.step(action) for action in actions[2:]]
-            results.append(found)
-        assert all(map(same, *results))
-        assert one._play is not None
-        require_readings(one, other)
+        require_same_snapshots(*(with_hooks(cls, hooks) for hooks in ("compiled", "python")))
 
     def test_draws_in_hooks_are_refused(self):
         class Random(Drawing):

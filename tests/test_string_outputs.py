@@ -1,14 +1,18 @@
 """Strings that FMUs give: monitored, so that hooks read them as texts."""
 
 import contextlib
+import importlib.util
 import logging
 import os
 import pickle
 import signal
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import foreign_talker
+import gymnasium
 import numpy as np
 import pytest
 import test_strings
@@ -19,10 +23,12 @@ from pythonfmu import FmuBuilder
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
 from fmugym.archive.fmu import FMU
-from fmugym.archive.texts import number_of
+from fmugym.archive.texts import number_of, numbers_of
+from fmugym.logs import PlantLog
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.local import local_pool
-from fmugym.series import RecordSeries
+from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
+from fmugym.task.quantity import Quantity
 
 WORDS = test_strings.WORDS
 pools, versions = test_strings.pools, test_strings.versions
@@ -286,16 +292,150 @@ def test_numbers_of_texts():
     assert [number_of(""), number_of("foobar")] == fold
 
 
-def test_series_leave_texts_out(feedthrough):
-    env = RecordSeries(Echo(feedthrough[3]))
-    env.reset(seed=0)
-    env.step(0)
-    names = [column.name for column in env.series.columns]
-    assert "length" in names
-    assert not {"String_told", "String_out", "String_parameter"} & set(names)
-    env.close()
-    with pytest.raises(ConfigError, match="String_told"):
-        RecordSeries(Echo(feedthrough[3]), ["String_told"])
+def test_nobody_is_asked_for_an_empty_text():
+    """A question to worker processes would take its time in each step."""
+    spec = importlib.util.find_spec("fmugym.archive.texts")
+    fresh, asked = importlib.util.module_from_spec(spec), []
+    spec.loader.exec_module(fresh)
+    fresh.ask_for_texts(asked.append)
+    assert [fresh.text_of(number_of(text)) for text in ("", "never met")] == ["", ""]
+    assert asked == [number_of("never met")]
+
+
+ALL = ("String_told", "String_out", "String_parameter", "length")
+
+
+class TestSeries:
+    """The text of each step is in columns, and comes back out of files."""
+
+    def record(self, env, names=ALL, steps=(3, 2, 4), **options):
+        """Play episodes; return the recorder and the texts that the hooks have read."""
+        recorded, told = RecordSeries(env, names, **options), []
+        for seed, count in enumerate(steps):
+            recorded.reset(seed=seed)
+            told.append(env.out["String_told"])
+            for _ in range(count):
+                recorded.step(0)
+                told.append(env.out["String_told"])
+        return recorded, told
+
+    @versions
+    @pools
+    def test_of_one_environment(self, feedthrough, version, options):
+        recorded, told = self.record(Echo(feedthrough[version], **options))
+        series = recorded.series
+        recorded.close()
+        assert series["String_told"].tolist() == told
+        assert series["String_parameter"].tolist() == told
+        assert set(series["String_out"]) == {"start"}
+        assert series["length"].tolist() == [test_strings.SIZES[word] for word in told]
+        assert len({column.kind for column in series.columns if column.name in ALL}) == 3
+
+    def test_monitored_ones_are_there_by_default(self, feedthrough):
+        recorded, _ = self.record(Echo(feedthrough[3]), None)
+        names = [column.name for column in recorded.series.columns]
+        assert {"String_told", "String_out"} <= set(names)
+        assert "String_parameter" not in names
+        recorded.close()
+
+    def test_ones_that_are_not_monitored(self, feedthrough):
+        recorded = RecordSeries(test_strings.Reading(feedthrough[3]), ["String_t*", "length"])
+        recorded.reset(seed=0)
+        recorded.step(0)
+        series = recorded.series
+        recorded.close()
+        lengths = [test_strings.SIZES[word] for word in series["String_told"]]
+        assert series["length"].tolist() == lengths
+
+    @pools
+    @pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+    @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+    def test_of_many_environments(self, feedthrough, options, hooks, mode):
+        envs = FMUVectorEnv(
+            lambda: Echo(feedthrough[3], max_episode_steps=2, **options),
+            3,
+            hooks=hooks,
+            autoreset_mode=gymnasium.vector.AutoresetMode[mode.upper()],
+        )
+        recorded = RecordVectorSeries(envs, ALL)
+        recorded.reset(seed=4)
+        for _ in range(7):
+            ended = recorded.step(np.zeros(3, np.int64))[3]
+            if mode == "disabled" and ended.any():
+                recorded.reset(options={"reset_mask": ended})
+        episodes = recorded.series.episodes()
+        recorded.close()
+        assert len(episodes) > 6
+        for rows in episodes.values():
+            (word,) = set(rows["String_told"])
+            assert set(rows["String_parameter"]) == {word}
+            assert set(rows["length"]) == {test_strings.SIZES[word]}
+        assert len({rows["String_told"][0] for rows in episodes.values()}) > 1
+
+    def test_csv_files(self, feedthrough, tmp_path):
+        recorded, told = self.record(Echo(feedthrough[3]), path=tmp_path / "a.csv")
+        recorded.close()
+        recorded.series.write(tmp_path / "b.csv")
+        assert (tmp_path / "a.csv").read_text() == (tmp_path / "b.csv").read_text()
+        log = PlantLog.read(tmp_path / "a.csv")
+        assert log.texts["String_told"].tolist() == told
+        assert set(log.texts["String_out"]) == {"start"}
+        assert "String_told" not in log.columns
+        assert "String_told" not in log.units
+        parts = [part.texts["String_parameter"] for part in log.parts()]
+        assert np.concatenate(parts).tolist() == told
+
+    def test_texts_that_look_like_something_else(self, feedthrough, tmp_path):
+        words = ["1", 'a,"b"', "nan", "two\nlines", " ", "T [degC]"]
+        env = Echo(feedthrough[3], fmugym.Choice(words))
+        recorded, told = self.record(env, steps=[1] * 30, path=tmp_path / "a.csv")
+        recorded.close()
+        assert set(told) == set(words)
+        assert PlantLog.read(tmp_path / "a.csv").texts["String_told"].tolist() == told
+
+    def test_parquet_files_and_frames(self, feedthrough, tmp_path):
+        pytest.importorskip("pyarrow", reason="needs the extra parquet")
+        recorded, told = self.record(Echo(feedthrough[3]), path=tmp_path / "a.parquet")
+        series = recorded.series
+        recorded.close()
+        read = TimeSeries.read(tmp_path / "a.parquet")
+        assert read["String_told"].tolist() == told
+        assert read.columns == series.columns
+        np.testing.assert_array_equal(read.values, series.values)
+        frame = pytest.importorskip("pandas").read_parquet(tmp_path / "a.parquet")
+        assert frame["String_told"].tolist() == series.to_pandas()["String_told"].tolist() == told
+
+    def test_another_process_knows_the_texts(self, feedthrough):
+        """The numbers of texts that an FMU has made are known to its process only."""
+        recorded, told = self.record(Echo(feedthrough[3], isolation="process"))
+        data = pickle.dumps(recorded.series)
+        recorded.close()
+        text = "import pickle, sys; s = pickle.load(sys.stdin.buffer)\n"
+        text += "print(ascii(s['String_told'].tolist()))"
+        command = [sys.executable, "-c", text]
+        found = subprocess.run(command, input=data, capture_output=True, check=True, timeout=60)
+        assert found.stdout.decode().strip() == ascii(told)
+
+    def test_pictures_and_reports(self, tmp_path):
+        columns = (
+            *(Quantity("episode", "index"), Quantity("step", "index"), Quantity("time", "time")),
+            *(Quantity("phase", "text"), Quantity("reward", "reward")),
+            *(Quantity("terminated", "flag"), Quantity("truncated", "flag")),
+        )
+        words = [f"phase <{i // 4}> $x$" for i in range(60)]
+        values = np.zeros((60, 7))
+        values[:, 1] = values[:, 2] = np.arange(60)
+        values[:, 3] = numbers_of(words)
+        series = TimeSeries(columns, values, texts={number_of(word): word for word in words})
+        plot(series, tmp_path / "phases.svg")
+        svg = (tmp_path / "phases.svg").read_text()
+        assert "phase &lt;0&gt; $x$" in svg
+        assert "11 more" in svg
+        assert "phase &lt;14&gt;" not in svg
+        write_report(tmp_path / "phases.html", {"run": series}, title="Phases")
+        page = (tmp_path / "phases.html").read_text()
+        assert page.count("6.67 %") == 15
+        assert "phase &lt;14&gt; $x$" in page
 
 
 @pytest.mark.parametrize(

@@ -431,3 +431,35 @@ class TestPictures:
 
     def test_names_that_look_like_mathematics_are_texts(self, tmp_path):
         FMUSystem({"$x$": HOUSE}, name="$\\alpha").plot(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("backend", ["native", "python"])
+def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units(backend):
+    """273.15 K are 0 degC, by definition; and half a pendulum is a gain of 2."""
+    system = fmugym.FMUSystem(
+        {"house": fmugym.bundled_fmu("House"), "rod": fmugym.bundled_fmu("Pendulum")},
+        ["outside -> house.T_out", fmugym.Connection("half", "rod.m", gain=2.0)],
+        units={"outside": "degC"},
+    )
+    names = ["outside", "house.T_out", "half", "rod.m"]
+
+    class Read(fmugym.FMUEnv):
+        def __init__(self):
+            config = {
+                "model_input_names": ["outside"],
+                "model_output_names": names,
+                "model_parameters": {"outside": -3.0, "half": 0.25},
+                "bounds": {"outside": (-20, 40)},
+                "time_step": 60.0,
+            }
+            super().__init__(system, config, backend=backend)
+
+        def _is_done(self):
+            return False
+
+    env = Read()
+    env.reset(seed=0)
+    assert env.state == pytest.approx((-3.0, 270.15, 0.25, 0.5), rel=1e-12)
+    env.step(np.array([7.0]))
+    assert env.state == pytest.approx((7.0, 280.15, 0.25, 0.5), rel=1e-12)
+    env.close()

@@ -293,10 +293,12 @@ class TestTimeDependentFMU:
 
     @pytest.fixture(name="make_env", params=["1", "2", "3"])
     def fixture_make_env(self, request, tmp_path):
-        """FMI 1.0 has no saved states: episodes are played again."""
+        """FMI 1.0 has no saved states."""
         path = exchange_tools.exchange_fmu(tmp_path / "M.fmu", "season", int(request.param))
 
         class Season(fmugym.FMUEnv):
+            fmu_version = request.param
+
             def __init__(self):
                 config = {
                     "model_input_names": "u",
@@ -317,6 +319,18 @@ class TestTimeDependentFMU:
     @pytest.mark.parametrize("passed", [0, 3])
     @pytest.mark.parametrize("kind", ["python", "native"])
     def test_is_the_solution_of_the_equation(self, make_env, kind, passed):
+        """Without a trial, saved states are not trusted, and episodes are played again."""
+        assert self.check(make_env, kind, passed).method == "replay"
+
+    @pytest.mark.parametrize("kind", ["python", "native"])
+    def test_with_restored_states(self, make_env, kind, monkeypatch):
+        monkeypatch.setenv("FMUGYM_PROBE", "on")
+        method = self.check(make_env, kind, 3).method
+        has_states = make_env.fmu_version != "1"
+        assert method == ("state" if has_states else "replay")
+
+    def check(self, make_env, kind, passed):
+        """Compare the matrices with the solution; returns the snapshot where they begin."""
         actions = np.linspace(-0.5, 0.8, 7, dtype=np.float32)[:, None]
         with make_env() as env:
             env.reset(seed=0)
@@ -340,6 +354,7 @@ class TestTimeDependentFMU:
         for rate, u in zip(growth, actions[:, 0].tolist(), strict=True):
             x.append(rate * (x[-1] + u) - u)
         assert found.x[:, 0] == pytest.approx(np.array(x), rel=1e-8)
+        return snapshot
 
 
 def test_wrong_derivatives_are_told(monkeypatch, caplog):

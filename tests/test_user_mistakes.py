@@ -24,6 +24,7 @@ from fmugym import (
     FMI3CSEnv,
     FMULoadError,
     FMUSystem,
+    FMUVectorEnv,
     SimulationError,
     Uniform,
     bundled_fmu,
@@ -323,6 +324,73 @@ def test_file(probe, tmp_path, temp_root, same_working_directory, make, match):
 def test_no_path(path):
     with pytest.raises((ConfigError, TypeError)):
         PlainEnv(path, probe_config())
+
+
+def test_a_class_that_does_not_call_its_base():
+    class Forgetful(FMI2CSEnv):
+        def __init__(self):
+            pass
+
+        def _is_done(self):
+            return False
+
+    for use in (lambda: Forgetful().reset(), lambda: FMUVectorEnv(Forgetful, num_envs=2)):
+        with pytest.raises(ConfigError, match=r"Forgetful.*super\(\).__init__"):
+            use()
+
+
+def test_misspelt_hooks_are_warned_of_once(probe, caplog):
+    class Misspelt(PlainEnv):
+        def _get_observations(self):
+            return self.state
+
+        def is_truncated(self):
+            return True
+
+        def _is_done_early(self):
+            """No hook, nor is a method with other arguments."""
+
+        def _updates(self, number):
+            """No hook."""
+
+    for _ in range(2):
+        Misspelt(probe(2), probe_config()).close()
+    named = [[text for text in r.args if "_" in str(text)] for r in caplog.records]
+    assert named == [["_get_observations", "_get_observation"], ["is_truncated", "_is_truncated"]]
+
+
+def test_hooks_that_are_there_are_not_misspelt(probe, caplog):
+    """A helper beside the hook may have a similar name."""
+
+    class Helped(PlainEnv):
+        def _get_observation(self):
+            return self._get_observation_2()
+
+        def _get_observation_2(self):
+            return super()._get_observation()
+
+    Helped(probe(2), probe_config()).close()
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("many", [False, True])
+def test_an_unknown_parameter_in_a_hook(probe, many):
+    class Asking(PlainEnv):
+        def _is_done(self):
+            return self.state[0] > self.parameters["gian"]
+
+    def make():
+        return Asking(probe(2), probe_config(model_parameters={"gain": 1.0}))
+
+    def play():
+        env = FMUVectorEnv(make, num_envs=2) if many else make()
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+
+    with pytest.raises(ConfigError, match="parameter 'gian'; did you mean 'gain'") as caught:
+        play()
+    assert isinstance(caught.value, KeyError)
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
 
 def test_a_class_without_is_done(probe):

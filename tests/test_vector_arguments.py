@@ -144,6 +144,21 @@ def test_arguments_of_other_types(name, value, temp_root):
     assert not list(temp_root.iterdir())
 
 
+def test_a_misspelt_mask_is_told_the_right_name():
+    envs = FMUVectorEnv(Drawing, num_envs=2)
+    with pytest.raises(ConfigError, match="'resetmask'; did you mean 'reset_mask'"):
+        envs.reset(options={"resetmask": np.array([True, False])})
+    envs.close()
+
+
+def test_arguments_of_make_vec_are_those_of_both():
+    """The class and the vector environment share the keyword arguments."""
+    with pytest.raises(
+        ConfigError, match=r"'autoreset'.*'render_mode'.*'autoreset_mode'.*'threads'"
+    ):
+        gym.make_vec("fmugym/CartPole-v0", num_envs=2, autoreset="disabled")
+
+
 def test_unknown_arguments_are_type_errors_too():
     for error in (ConfigError, TypeError):
         with pytest.raises(error, match="'thread'; did you mean 'threads'"):

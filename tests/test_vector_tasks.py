@@ -147,17 +147,20 @@ def test_tasks_are_those_of_single_environments(cls):
     require_pair_equal(cls, steps=30, hooks="compiled", rtol=1e-12)
 
 
+class Outside(Task):
+    """Looks values up in a table that is too short for long episodes."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=20)
+
+    def _is_done(self):
+        return self.state[0] > 90.0
+
+    def _reward_policy(self):
+        return np.take([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], self.step_count)
+
+
 def test_an_index_outside_of_its_table():
-    class Outside(Task):
-        def __init__(self):
-            super().__init__(max_episode_steps=20)
-
-        def _is_done(self):
-            return self.state[0] > 90.0
-
-        def _reward_policy(self):
-            return np.take([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], self.step_count)
-
     envs = FMUVectorEnv(Outside, 3, hooks="compiled")
     envs.reset(seed=0)
     for _ in range(7):

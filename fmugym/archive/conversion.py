@@ -52,8 +52,10 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     experiment = source.defaultExperiment
     _read_unsigned_limits(source, root)
     elements = {element.get("name"): element for element in root.find("ModelVariables")}
+    makes_updates = _offers(root, interface, "providesIntermediateUpdate")
     variables = {
-        v.name: _convert_variable(v, elements.get(v.name, {})) for v in source.modelVariables
+        v.name: _convert_variable(v, elements.get(v.name, {}), makes_updates)
+        for v in source.modelVariables
     }
     return ModelDescription(
         fmi_version=source.fmiVersion,
@@ -75,7 +77,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
-        has_event_mode=_has_event_mode(root, interface),
+        has_event_mode=_offers(root, interface, "hasEventMode"),
         model_exchange=None if interface == "co_simulation" else _model_exchange(source, root),
     )
 
@@ -109,9 +111,10 @@ def _model_exchange(source: Any, root: Any) -> ModelExchange:
     )
 
 
-def _has_event_mode(root: Any, interface: str) -> bool:
+def _offers(root: Any, interface: str, flag: str) -> bool:
+    """Read a flag of co-simulation in FMI 3.0."""
     element = root.find("CoSimulation")
-    offered = element is not None and element.get("hasEventMode") in {"true", "1"}
+    offered = element is not None and element.get(flag) in {"true", "1"}
     return offered and interface == "co_simulation" and root.get("fmiVersion", "").startswith("3")
 
 
@@ -267,7 +270,7 @@ def _read_unsigned_limits(source: Any, root: Any) -> None:
             variable.min, variable.max = element.get("min"), element.get("max")
 
 
-def _convert_variable(source: Any, element: Any) -> Variable:
+def _convert_variable(source: Any, element: Any, makes_updates: bool) -> Variable:
     _check_reference(source)
     ticking = _ticking(source, element)
     return Variable(
@@ -293,6 +296,7 @@ def _convert_variable(source: Any, element: Any) -> Variable:
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking),
         by_fractions=element.get("supportsFraction") in {"true", "1"},
+        updated=makes_updates and element.get("intermediateUpdate") in {"true", "1"},
     )
 
 

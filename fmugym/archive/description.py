@@ -219,9 +219,21 @@ class ModelDescription:
         return tuple(v for v in inputs if known.issuperset(v.clocks))
 
     def unable_to_interpolate(self, variable: Variable) -> str | None:
-        """Name the FMU that cannot let an input change linearly within a step; None if it can."""
-        able = self.capabilities.can_interpolate_inputs
-        return None if able else f"{self.model_name} (FMI {self.fmi_version})"
+        """Say why an input cannot change linearly within a step; None if it can."""
+        name = f"{self.model_name} (FMI {self.fmi_version})"
+        if self.model_exchange is not None:
+            return f"{name} cannot interpolate inputs in model exchange"
+        if self.fmi_major_version < 3:
+            able = self.capabilities.can_interpolate_inputs
+            return None if able else f"{name} cannot interpolate inputs (canInterpolateInputs)"
+        if self.uses_event_mode:
+            return f"{name} cannot interpolate inputs in event mode, which it needs"
+        if not variable.updated:
+            return (
+                f"{name} cannot interpolate inputs: it takes no values of {variable.name!r} within "
+                "a step (providesIntermediateUpdate, and intermediateUpdate of the variable)"
+            )
+        return None
 
     def what_drives(self, variable: Variable) -> str | None:
         """In a system: the output or the name of the system that sets a variable; or None."""

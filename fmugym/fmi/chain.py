@@ -70,7 +70,7 @@ class _Chain:
                 part, [ends[row].variable for row in rows], [end.variable for _, end in pairs]
             )
             for (column, end), values in zip(pairs, found.T, strict=True):
-                gains = np.array([ends[row].gain for row in rows])
+                gains = np.array([ends[row].reading[0] for row in rows])
                 result[rows, column] += values * gains * end.gain
         return result
 

@@ -80,10 +80,6 @@ class ExchangeInstance(Instance):
             self._last: dict[str, _LastSet] = {}
         return self._solver
 
-    def _complain(self, text: str) -> None:
-        """Log what the solver says like a message of the FMU."""
-        self._log.receive(Status.ERROR, "solver", text)
-
     def _forget(self, memory: Memory) -> None:
         self._own_solver().forget(memory)
         self._last.clear()

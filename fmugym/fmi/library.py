@@ -43,7 +43,7 @@ _load_lock = threading.Lock()
 def _instance_class(description: ModelDescription, solving: Solving | None) -> type[Instance]:
     if description.uses_event_mode:
         return FMI3EventsInstance
-    if solving is not None and solving.ramps:
+    if solving is not None and (solving.ramps or solving.watched):
         return RAMPED_CLASSES[description.fmi_major_version]
     return _INSTANCE_CLASSES[description.fmi_major_version, description.interface]
 

@@ -32,6 +32,7 @@ from fmugym.fmi.words import Message, quoted
 __all__ = [
     "Hearing",
     "MessageLog",
+    "catching",
     "fmi1_callbacks",
     "fmi2_callbacks",
     "fmi3_log_message",
@@ -194,7 +195,7 @@ def _keep_lost(unraisable: sys.UnraisableHookArgs, /) -> None:
         fmu_calls.pass_on(unraisable)
 
 
-def _catching(function: Callable[P, None]) -> Callable[P, None]:
+def catching(function: Callable[P, None]) -> Callable[P, None]:
     """Make a callback of a function: it keeps what the function raises for ``fmu_calls``."""
 
     def called(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -206,7 +207,7 @@ def _catching(function: Callable[P, None]) -> Callable[P, None]:
     return called
 
 
-_CALLBACK_CODE: Final = cast(FunctionType, _catching(print)).__code__
+_CALLBACK_CODE: Final = cast(FunctionType, catching(print)).__code__
 """That of every callback; its frame is the first where an exception comes before its lines."""
 
 
@@ -229,7 +230,7 @@ def _make_callbacks(structure: Any) -> Any:
     """Fill a callback structure. The members used here are the same in FMI 1.0 and 2.0."""
     types = dict(structure._fields_)
     callbacks = structure()
-    callbacks.logger = types["logger"](_catching(_by_name))
+    callbacks.logger = types["logger"](catching(_by_name))
     callbacks.allocateMemory = ctypes.cast(fmpy.calloc, types["allocateMemory"])
     callbacks.freeMemory = ctypes.cast(fmpy.free, types["freeMemory"])
     addLoggerProxy(ctypes.byref(callbacks))
@@ -238,4 +239,4 @@ def _make_callbacks(structure: Any) -> Any:
 
 fmi1_callbacks = _make_callbacks(fmi1CallbackFunctions)
 fmi2_callbacks = _make_callbacks(fmi2CallbackFunctions)
-fmi3_log_message = fmi3LogMessageCallback(_catching(_deliver))
+fmi3_log_message = fmi3LogMessageCallback(catching(_deliver))

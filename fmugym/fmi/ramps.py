@@ -1,4 +1,4 @@
-"""Co-simulation of FMI 1.0 and 2.0 with inputs that change linearly within a step.
+"""Co-simulation with inputs that change linearly within a step.
 
 This does what ``native/ramps.c`` does, operation by operation.
 """
@@ -9,13 +9,15 @@ import ctypes
 import math
 import struct
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.fmi.access import Access
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
+from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.solver import Memory, Mode
 from fmugym.fmi.span import Initialize, Span
@@ -48,6 +50,7 @@ class _Ramp(NamedTuple):
 class _Ramped(Instance):
     """An instance whose inputs aim at the values that are set."""
 
+    _c_type: ClassVar = "Real"
     _ramps: tuple[_Ramp, ...] = ()
 
     @property
@@ -69,6 +72,8 @@ class _Ramped(Instance):
 
     def _set_ramps(self, time: float) -> int:
         assert self._solving is not None
+        if not self._ramps:
+            return Status.OK
         duration = self._solving.ramp_duration
         begun = (r._replace(start=time) if math.isnan(r.start) else r for r in self._ramps)
         self._ramps = tuple(begun)
@@ -76,14 +81,18 @@ class _Ramped(Instance):
         count = len(values)
         references = (ctypes.c_uint32 * count)(*self._references)
         size = ctypes.c_size_t(count)
-        set_values = self._function("SetReal")
+        set_values = self._function(f"Set{self._c_type}")
         numbers = (ctypes.c_double * count)(*values)
-        status = sane(set_values(self._component, references, size, numbers))
-        if status > Status.WARNING:
-            return status
+        more = self._trailing_arguments(count)
+        status = sane(set_values(self._component, references, size, numbers, *more))
+        return status if status > Status.WARNING else self._set_slopes(references, slopes)
+
+    def _set_slopes(self, references: Any, slopes: Sequence[float]) -> int:
+        count = len(slopes)
         orders = (ctypes.c_int * count)(*[1] * count)
         numbers = (ctypes.c_double * count)(*slopes)
         set_slopes = self._function("SetRealInputDerivatives")
+        size = ctypes.c_size_t(count)
         return sane(set_slopes(self._component, references, size, orders, numbers))
 
     def _prepare_initialization(self) -> Initialize:
@@ -99,8 +108,9 @@ class _Ramped(Instance):
     def _read_inputs(self) -> Sequence[float]:
         references = np.array(self._references, np.uint32)
         values = np.zeros(len(references))
-        get, _, arguments = super().prepare_access("Real", references, values)
-        self.check("reading the inputs", get(*arguments))
+        get, _, arguments = super().prepare_access(self._c_type, references, values)
+        if self._references:
+            self.check("reading the inputs", get(*arguments))
         return [float(value) for value in values]
 
     def prepare_access(
@@ -110,7 +120,7 @@ class _Ramped(Instance):
         get, set_, arguments = super().prepare_access(c_type, references, buffer)
         known = {reference: place for place, reference in enumerate(self._references)}
         aims = [(i, known[r]) for i, r in enumerate(references.tolist()) if r in known]
-        if c_type != "Real" or not aims:
+        if c_type != self._c_type or not aims:
             return get, set_, arguments
         others = [i for i, r in enumerate(references.tolist()) if r not in known]
         rest = np.zeros(len(others))
@@ -168,4 +178,41 @@ class _RampedFMI2(_Ramped, FMI2Instance):
     """FMI 2.0."""
 
 
-RAMPED_CLASSES: Final[dict[int, type[Instance]]] = {1: _RampedFMI1, 2: _RampedFMI2}
+class _UpdatedFMI3(_Ramped, FMI3Instance):
+    """FMI 3.0, which takes inputs and tells outputs in intermediate updates."""
+
+    _c_type: ClassVar = "Float64"
+
+    def _prepare_updates(self) -> None:
+        super()._prepare_updates()
+        assert self.updates is not None
+        self.updates.set_inputs = self._set_ramps
+        self.updates.moves = self._moves
+
+    def _moves(self) -> bool:
+        return any(ramp.first != ramp.last for ramp in self._ramps)
+
+    def _prepare_step(self) -> Callable[[float, float], int]:
+        step, updates = FMI3Instance._prepare_step(self), self.updates
+        assert updates is not None
+        updates.access = Access(self, updates.variables)
+
+        def updated_step(time: float, step_size: float) -> int:
+            status = self._set_ramps(time)
+            if status > Status.WARNING:
+                return self.judge_step(status)
+            with updates.begin(time, step_size):
+                status = step(time, step_size)
+            return self.judge_step(updates.judge(status))
+
+        return updated_step
+
+    def _set_slopes(self, references: Any, slopes: Sequence[float]) -> int:
+        return Status.OK  # values within the step take their place
+
+
+RAMPED_CLASSES: Final[dict[int, type[Instance]]] = {
+    1: _RampedFMI1,
+    2: _RampedFMI2,
+    3: _UpdatedFMI3,
+}

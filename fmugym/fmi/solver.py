@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
+from fmugym.archive.variable import Variable
 from fmugym.fmi.clocks import TICKS_SIZE, CallError, Ticks, Timetable
 from fmugym.fmi.crossings import Bracket, crosses
 from fmugym.fmi.equations import Equations
@@ -47,6 +48,7 @@ class Solving:
         max_step: The longest step in seconds; infinite for no limit.
         ramps: The value references of inputs that change linearly, in co-simulation.
         ramp_duration: How long each change takes, in seconds.
+        watched: The outputs that the FMU is to tell in intermediate updates.
     """
 
     solver: str = "dormand_prince"
@@ -54,6 +56,7 @@ class Solving:
     max_step: float = math.inf
     ramps: tuple[int, ...] = ()
     ramp_duration: float = 1.0
+    watched: tuple[Variable, ...] = ()
 
 
 _MEMORY: Final = struct.Struct("=dddqq")

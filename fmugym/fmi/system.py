@@ -159,7 +159,7 @@ class SystemInstance(Instance, Repeatable):
     def _get_all(self, ends: Sequence[tuple[PartVariable, ...]], buffer: npt.NDArray[Any]) -> None:
         for index, behind in enumerate(ends):
             end = behind[0]
-            buffer[index] = scaled(end.gain, end.offset, self._get(end))
+            buffer[index] = scaled(*end.reading, self._get(end))
 
     def _get(self, end: PartVariable) -> float:
         if self._control is not None and end.part == MASTER:

@@ -154,6 +154,7 @@ class NativePool(SavingPool):
         if private_libraries:
             paths = copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
+        watched = tuple(spec.outputs[i] for i in spec.watched)
         try:
             return _native.Pool(
                 library=cast(
@@ -173,7 +174,11 @@ class NativePool(SavingPool):
                 variables=cast(
                     "_native.Variables",
                     variable_settings(spec)
-                    | {"inputs": self._access(spec.inputs), "outputs": self._access(spec.outputs)},
+                    | {
+                        "inputs": self._access(spec.inputs),
+                        "outputs": self._access(spec.outputs),
+                        "watched": self._access(watched) if watched else None,
+                    },
                 ),
                 arrays={
                     "inputs": self.inputs,

@@ -157,6 +157,7 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
     return {
         "num_observed": spec.num_observed,
         "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
+        "watched_places": np.array(spec.watched, np.uint32).tobytes(),
     }
 
 
@@ -167,7 +168,7 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
-        if not description.uses_event_mode and not spec.ramped:
+        if not (description.uses_event_mode or spec.ramped or spec.watched):
             return None
         ramps = np.array([v.value_reference for v in spec.ramped], np.uint32).tobytes()
         by_fmu = b"by_fmu", 1.0, math.inf, 0, 0, False, None, None
@@ -199,6 +200,8 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
         return 2
     if isinstance(description, SystemDescription):
         return 0
+    if spec.watched or (spec.ramped and description.fmi_major_version == 3):
+        return 4
     return 3 if spec.ramped else 0
 
 

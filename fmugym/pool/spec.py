@@ -231,11 +231,25 @@ class PoolSpec:
         return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
 
     @property
+    def watched(self) -> tuple[int, ...]:
+        """The places of outputs whose values within a step count, and which the FMU tells there."""
+        # there are no samplings if all are "last"
+        pairs = enumerate(zip(self.outputs, self.samplings, strict=False))
+        return tuple(i for i, (output, name) in pairs if output.updated and name != "last")
+
+    @property
     def solving(self) -> Solving:
         """How the equations of FMUs of model exchange are solved."""
         tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
         ramps = tuple(v.value_reference for v in self.ramped)
-        return Solving(self.solver, tolerance, self.max_step or math.inf, ramps, self.time_step)
+        return Solving(
+            self.solver,
+            tolerance,
+            self.max_step or math.inf,
+            ramps,
+            self.time_step,
+            tuple(self.outputs[place] for place in self.watched),
+        )
 
     @property
     def communication_step_size(self) -> float:

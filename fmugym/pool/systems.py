@@ -153,6 +153,8 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
         _numbers(end.variable.place for end in ends),
         _doubles(end.gain for end in ends),
         _doubles(end.offset for end in ends),
+        _doubles(end.reading[0] for end in ends),
+        _doubles(end.reading[1] for end in ends),
     )
 
 

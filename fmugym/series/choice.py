@@ -9,15 +9,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.archive.texts import number_of, numbers_of
 from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import unknown_name
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.task.quantity import Quantities, Quantity
+from fmugym.task.quantity import TEXT_KINDS, Quantities, Quantity
 
 __all__ = ["Choice", "choose", "flat", "matches", "quantities_of"]
 
 _VARYING: Final = ("continuous", "discrete")
+_PARAMETERS: Final = ("parameter", "text parameter")
 
 
 class Choice(NamedTuple):
@@ -78,18 +80,18 @@ def choose(env: FMUEnv, patterns: Iterable[str] | None) -> Choice:
 
     Args:
         env: The environment, or the prototype of many.
-        patterns: Globs. They choose among the names of the task, the varying numbers of the FMU
+        patterns: Globs. They choose among the names of the task, the varying variables of the FMU
             that the task has no name for, and ``observation.NAME``, what the agent sees of a name.
             None for all names of the task except parameters.
 
     Raises:
         ConfigError: If a glob matches nothing.
     """
-    quantities, read = quantities_of(env)
+    quantities, read = _with_texts(env, quantities_of(env))
     others = {variable.name: variable for variable in _others(env, quantities)}
     seen = {f"observation.{name}": index for index, name in enumerate(_observation_names(env))}
     if patterns is None:
-        wanted = {one.name for one in quantities if one.kind != "parameter"}
+        wanted = {one.name for one in quantities if one.kind not in _PARAMETERS}
     else:
         named = [one.name for one in quantities] + [n for n in others if _varies(others[n])]
         known = [*named, *seen]
@@ -161,16 +163,46 @@ def _of_config(env: FMUEnv) -> Quantities:
     return Quantities(found, read)
 
 
+def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
+    """Add the Strings that the config monitors or sets; they are read as numbers of texts."""
+    strings = env.fmu.description.strings
+    places = {name: place for place, name in enumerate(env.out) if name in strings}
+    given = tuple(name for name in env._interface.parameters if name in strings)
+    if not places and not given:
+        return quantities
+
+    def read(env: Any) -> Sequence[Any]:
+        drawn = env.parameters
+        return (
+            *quantities.read(env),
+            *(env._values[place] for place in places.values()),
+            *(_number(drawn.get(name, np.nan)) for name in given),
+        )
+
+    found = [Quantity(name, TEXT_KINDS[0]) for name in places]
+    found += [Quantity(name, TEXT_KINDS[1]) for name in given]
+    return Quantities([*quantities.all, *found], read)
+
+
+def _number(value: Any) -> Any:
+    """The number of a text, or those of an array of texts."""
+    if isinstance(value, str):
+        return number_of(value)
+    return numbers_of(value) if isinstance(value, np.ndarray) else value
+
+
 def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
+    if variable.kind == "string":
+        return Quantity(variable.name, TEXT_KINDS[0])
     limits = variable.minimum, variable.maximum
     return Quantity(variable.name, kind, variable.unit or "", *limits)
 
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
-    """The numeric variables of the FMU for which the task has no name of its own."""
+    """The numbers and Strings of the FMU for which the task has no name of its own."""
     known = {*env._interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
-        if variable.is_number:
+        if variable.is_number or (variable.kind == "string" and not variable.shape):
             yield from (one for one in variable.elements if one.name not in known)
 
 

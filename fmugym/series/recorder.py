@@ -103,7 +103,7 @@ class _Recorder:
             raise SimulationError("there is no recording before the first reset")
         block = self._memory.rows()
         limits = getattr(self.episodes.prototype, "cost_limits", {})
-        return TimeSeries(self._rows.columns, block.values, block.faults, limits)
+        return TimeSeries(self._rows.columns, block.values, block.faults, limits, block.texts)
 
     def close(self) -> None:
         """Complete the file."""
@@ -159,7 +159,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: An ``FMUEnv``, or wrappers around one.
-        variables: Globs, which choose among the names of the task, all numeric variables of the
+        variables: Globs, which choose among the names of the task, all numbers and Strings of the
             FMU that the task has no name for, and ``observation.NAME``, what the agent sees of a
             name; ``*`` is any text, ``?`` one character. By default, all names of the task except
             parameters.

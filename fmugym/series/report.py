@@ -11,7 +11,14 @@ from typing import Final
 
 from fmugym.checks import check_path
 from fmugym.series.pictures import as_svg
-from fmugym.series.summary import Course, EpisodeSummary, courses, summaries
+from fmugym.series.summary import (
+    Course,
+    EpisodeSummary,
+    TextCourse,
+    courses,
+    summaries,
+    text_courses,
+)
 from fmugym.series.timeseries import TimeSeries
 
 __all__ = ["write_report"]
@@ -234,6 +241,9 @@ def _episodes(series: TimeSeries, most: int, prefix: str) -> Iterator[str]:
         opened = "" if len(episodes) > 1 else " open"
         table = _table(header, rows)
         yield f"<details{opened}><summary>Variables in numbers</summary>{table}</details>"
+        if texts := list(text_courses(one)):
+            table = _table(["String", "text", "first at", "share"], list(map(_texts, texts)))
+            yield f"<details{opened}><summary>Strings</summary>{table}</details>"
     if len(episodes) > most:
         yield f'<p class="soft">{len(episodes) - most} more episodes are not drawn.</p>'
 
@@ -247,6 +257,11 @@ def _course(course: Course) -> list[str]:
     unit = _text(course.quantity.unit)
     numbers = course.least, course.mean, course.most, course.last, course.deviation
     return [_text(course.quantity.name, "first"), unit, *(_cell(_number(n)) for n in numbers)]
+
+
+def _texts(course: TextCourse) -> list[str]:
+    name, text = _text(course.name, "first"), _text(course.text)
+    return [name, text, _cell(_duration(course.begin)), _cell(f"{100 * course.share:.3g} %")]
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

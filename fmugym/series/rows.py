@@ -8,11 +8,12 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.texts import text_of
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.series.choice import Choice, flat
 from fmugym.series.store import Block
-from fmugym.task.quantity import Quantity
+from fmugym.task.quantity import TEXT_KINDS, Quantity
 
 __all__ = ["Episodes", "Infos", "Outcome", "Rows", "present"]
 
@@ -160,6 +161,7 @@ class Rows:
         self._number = np.full(count, -1, np.int64)
         self._starts: Any = np.zeros(count)
         self.columns = tuple(self._columns())
+        self._texts = [i for i, one in enumerate(self.columns) if one.kind in TEXT_KINDS]
 
     def _columns(self) -> Iterator[Quantity]:
         if self._is_vector:
@@ -243,7 +245,13 @@ class Rows:
         told = {
             rows[index]: str(why) for index, why in infos.each("fault").items() if index in rows
         }
-        return Block(np.array(parts, np.float64).T, told)
+        table = np.array(parts, np.float64).T
+        return Block(table, told, _texts_in(table[:, self._texts]) if self._texts else {})
+
+
+def _texts_in(numbers: FloatArray) -> dict[float, str]:
+    """The texts by their numbers, as long as somebody knows them."""
+    return {number: text_of(number) for number in np.unique(numbers).tolist() if number == number}
 
 
 def _summed(infos: Infos) -> Iterator[tuple[str, ...]]:

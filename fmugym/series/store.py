@@ -12,16 +12,30 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
-from fmugym.task.quantity import Quantity
+from fmugym.task.quantity import TEXT_KINDS, Quantity
 
-__all__ = ["FAULT", "WHOLE", "Block", "Memory", "Store", "heading", "open_store"]
+__all__ = [
+    "FAULT",
+    "TEXT",
+    "WHOLE",
+    "Block",
+    "Memory",
+    "Store",
+    "cells_of",
+    "heading",
+    "open_store",
+]
 
 FAULT: Final = "fault"
 """The last column: the reason of a fault, a text."""
+
+TEXT: Final = "text"
+"""What stands in the place of the unit where cells are texts."""
 
 WHOLE: Final = ("index", "flag")
 """The kinds of columns that hold whole numbers."""
@@ -37,10 +51,12 @@ class Block:
     Attributes:
         values: Shape (rows, columns).
         faults: The reasons of faults by row.
+        texts: The texts that numbers in columns of texts stand for.
     """
 
     values: FloatArray
     faults: Mapping[int, str] = field(default_factory=dict)
+    texts: Mapping[float, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.values)
@@ -50,11 +66,13 @@ class Block:
         """Put blocks together."""
         blocks, begin = list(blocks), 0
         faults: dict[int, str] = {}
+        texts: dict[float, str] = {}
         for block in blocks:
+            texts |= block.texts
             faults |= {begin + row: reason for row, reason in block.faults.items()}
             begin += len(block)
         values = [block.values for block in blocks]
-        return cls(np.concatenate(values) if values else np.empty((0, width)), faults)
+        return cls(np.concatenate(values) if values else np.empty((0, width)), faults, texts)
 
 
 class Store(Protocol):
@@ -119,8 +137,17 @@ class Memory:
 
 
 def heading(column: Quantity) -> str:
-    """The name and the unit of a column, such as ``T [degC]``."""
+    """The name and the unit of a column, such as ``T [degC]``; that of texts is ``[text]``."""
+    if column.kind in TEXT_KINDS:
+        return f"{column.name} [{TEXT}]"
     return f"{column.name} [{column.unit}]" if column.unit else column.name
+
+
+def cells_of(values: FloatArray, column: Quantity, texts: Mapping[float, str]) -> npt.NDArray[Any]:
+    """The values of a column in their own type; a text that is missing is None."""
+    if column.kind in TEXT_KINDS:
+        return np.array([texts.get(value) for value in values.tolist()], object)
+    return values.astype(np.int64) if column.kind in WHOLE else values
 
 
 class CsvStore:
@@ -129,21 +156,26 @@ class CsvStore:
     def __init__(self, path: Path, columns: Sequence[Quantity]) -> None:
         self._file = path.open("x", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
-        self._whole = [column.kind in WHOLE for column in columns]
+        self._kinds = [column.kind for column in columns]
         self._writer.writerow([*map(heading, columns), FAULT])
 
     def add(self, block: Block) -> None:
         """See ``Store``."""
         for number, row in enumerate(block.values.tolist()):
-            cells = [self._cell(*pair) for pair in zip(row, self._whole, strict=True)]
+            cells = [
+                self._cell(value, kind, block.texts)
+                for value, kind in zip(row, self._kinds, strict=True)
+            ]
             self._writer.writerow([*cells, block.faults.get(number, "")])
         self._file.flush()
 
     @staticmethod
-    def _cell(value: float, whole: bool) -> Any:
+    def _cell(value: float, kind: str, texts: Mapping[float, str]) -> Any:
         if math.isnan(value):
             return ""
-        return int(value) if whole else value
+        if kind in TEXT_KINDS:
+            return texts[value]
+        return int(value) if kind in WHOLE else value
 
     def close(self) -> None:
         """See ``Store``."""
@@ -164,7 +196,8 @@ class ParquetStore:
 
     def _field(self, column: Quantity) -> Any:
         facts = {"unit": column.unit, "quantity": json.dumps(asdict(column))}
-        kind = "int64" if column.kind in WHOLE else "float64"
+        kind = "string" if column.kind in TEXT_KINDS else "float64"
+        kind = "int64" if column.kind in WHOLE else kind
         return self._arrow.field(column.name, self._arrow.type_for_alias(kind), metadata=facts)
 
     def add(self, block: Block) -> None:
@@ -178,7 +211,7 @@ class ParquetStore:
         block = Block.joined(self._waiting, len(self._columns))
         self._waiting, self._rows = [], 0
         arrays = [
-            self._arrow.array(values.astype(np.int64) if column.kind in WHOLE else values)
+            self._arrow.array(cells_of(values, column, block.texts), from_pandas=False)
             for values, column in zip(block.values.T, self._columns, strict=True)
         ]
         faults = [block.faults.get(number) for number in range(len(block))]

@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.series.timeseries import TimeSeries
 from fmugym.task.quantity import Quantity
 
-__all__ = ["Course", "EpisodeSummary", "courses", "summaries"]
+__all__ = ["Course", "EpisodeSummary", "TextCourse", "courses", "summaries", "text_courses"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,23 @@ class Course:
     deviation: float | None
 
 
+@dataclass(frozen=True)
+class TextCourse:
+    """One text of a String in an episode.
+
+    Attributes:
+        name: The name of the String.
+        text: The text.
+        begin: When the String had it first, in seconds since the beginning of the episode.
+        share: The part of the rows in which it has it.
+    """
+
+    name: str
+    text: str
+    begin: float
+    share: float
+
+
 def summaries(series: TimeSeries) -> list[EpisodeSummary]:
     """Sum up all episodes."""
     return [_summary(key, one) for key, one in series.episodes().items()]
@@ -106,6 +123,17 @@ def courses(series: TimeSeries) -> Iterator[Course]:
             own = [series[one.name] for one in setpoints if one.of == column.name]
             deviation = float(np.nanmean(np.abs(values - own[0]))) if len(own) == 1 else None
             yield Course(column, *_figures(known), deviation)
+
+
+def text_courses(series: TimeSeries) -> Iterator[TextCourse]:
+    """Sum up the texts of Strings in an episode, in the order in which they come."""
+    times = series["time"] - series["time"][0]
+    for column in series.of_kind("text"):
+        cells = series[column.name]
+        for text in dict.fromkeys(cells.tolist()):
+            found = cells == text
+            begin = float(times[found.argmax()])
+            yield TextCourse(column.name, text or "", begin, float(found.mean()))
 
 
 def _figures(values: Any) -> tuple[float, float, float, float]:

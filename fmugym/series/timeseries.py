@@ -1,4 +1,4 @@
-"""Time series of episodes: a table of numbers whose columns have names, units and meanings."""
+"""Time series of episodes: a table whose columns have names, units and meanings."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from fmugym.archive.texts import number_of, numbers_of
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
-from fmugym.series.store import FAULT, WHOLE, Block, open_store
-from fmugym.task.quantity import Quantity
+from fmugym.series.store import FAULT, Block, cells_of, open_store
+from fmugym.task.quantity import TEXT_KINDS, Quantity
 
 __all__ = ["TimeSeries"]
 
@@ -29,26 +31,30 @@ class TimeSeries:
             ``"index"`` (environment, episode, step), ``"time"``, ``"observation"``, ``"reward"``,
             ``"reward term"``, ``"cost"``, ``"cost term"``, ``"kpi"`` (of the episode until now) and
             ``"flag"`` (terminated, truncated).
-        values: Shape (rows, columns).
+        values: Shape (rows, columns). In columns of the kinds ``"text"`` and ``"text parameter"``,
+            numbers stand for texts.
         faults: The reasons of faults by row.
         cost_limits: What the costs of an episode may add up to, by name.
+        texts: The texts by the numbers that stand for them.
     """
 
     columns: tuple[Quantity, ...]
     values: FloatArray = field(repr=False)
     faults: Mapping[int, str] = field(default_factory=dict)
     cost_limits: Mapping[str, float] = field(default_factory=dict)
+    texts: Mapping[float, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def __getitem__(self, name: str) -> FloatArray:
-        """The values of a column, shape (rows,)."""
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """The values of a column, shape (rows,): numbers, or texts as objects."""
         names = [column.name for column in self.columns]
         if name not in names:
             raise unknown_name("column", name, names)
-        values: FloatArray = self.values[:, names.index(name)]
-        return values
+        place = names.index(name)
+        column, values = self.columns[place], self.values[:, place]
+        return cells_of(values, column, self.texts) if column.kind in TEXT_KINDS else values
 
     def of_kind(self, *kinds: str) -> list[Quantity]:
         """The columns of some kinds."""
@@ -71,7 +77,7 @@ class TimeSeries:
     def _where(self, mask: Any) -> TimeSeries:
         rows = np.flatnonzero(mask).tolist()
         faults = {new: self.faults[old] for new, old in enumerate(rows) if old in self.faults}
-        return TimeSeries(self.columns, self.values[rows], faults, self.cost_limits)
+        return TimeSeries(self.columns, self.values[rows], faults, self.cost_limits, self.texts)
 
     # Files.
 
@@ -86,7 +92,7 @@ class TimeSeries:
             FileExistsError: If the file exists.
         """
         store = open_store(check_path("the path of a recording", path), self.columns)
-        store.add(Block(self.values, self.faults))
+        store.add(Block(self.values, self.faults, self.texts))
         store.close()
 
     @classmethod
@@ -106,10 +112,11 @@ class TimeSeries:
             raise
         except Exception as error:  # a damaged file may raise anything
             raise ConfigError(f"{shown(str(file))} is no recording: {error}") from None
-        values = [table.column(column.name).to_numpy() for column in columns]
+        texts: dict[float, str] = {}
+        values = [_read_column(table.column(column.name), column, texts) for column in columns]
         faults = enumerate(table.column(FAULT).to_pylist())
-        matrix = np.stack(values, axis=1).astype(np.float64)
-        return cls(tuple(columns), matrix, {row: why for row, why in faults if why is not None})
+        told = {row: why for row, why in faults if why is not None}
+        return cls(tuple(columns), np.stack(values, axis=1), told, texts=texts)
 
     def to_pandas(self) -> Any:
         """Return a pandas DataFrame; ``frame.attrs["units"]`` has the units by name.
@@ -119,10 +126,19 @@ class TimeSeries:
         """
         frame: Any = imported("pandas", "pandas").DataFrame(
             {
-                column.name: values.astype(np.int64) if column.kind in WHOLE else values
+                column.name: cells_of(values, column, self.texts)
                 for column, values in zip(self.columns, self.values.T, strict=True)
             }
         )
         frame[FAULT] = [self.faults.get(row, "") for row in range(len(self))]
         frame.attrs["units"] = self.units
         return frame
+
+
+def _read_column(stored: Any, column: Quantity, texts: dict[float, str]) -> FloatArray:
+    """The numbers of a column of Arrow; those of texts are noted with their texts."""
+    if column.kind not in TEXT_KINDS:
+        return np.asarray(stored.to_numpy(), np.float64)
+    cells = stored.to_pylist()
+    texts |= {number_of(cell): cell for cell in cells if cell is not None}
+    return numbers_of(cells)

@@ -34,12 +34,21 @@ class PartVariable:
         part: The index of the component; ``MASTER`` for what the master itself tells.
         variable: As its FMU describes it.
         gain, offset: See ``fmugym.systems.plan.End``.
+        is_target: Whether the system's variable is the source of this one: an input or a parameter.
     """
 
     part: int
     variable: Variable
     gain: float = 1.0
     offset: float = 0.0
+    is_target: bool = False
+
+    @property
+    def reading(self) -> tuple[float, float]:
+        """Gain and offset with which the value here gives that of the system's variable."""
+        if self.is_target and self.gain:
+            return 1.0 / self.gain, -self.offset / self.gain
+        return self.gain, self.offset
 
 
 @dataclass(frozen=True)
@@ -74,9 +83,9 @@ class SystemDescription(ModelDescription):
     def unable_to_interpolate(self, variable: Variable) -> str | None:
         """See ``ModelDescription.unable_to_interpolate``; the first component that cannot."""
         for end in self.ends[variable.value_reference]:
-            unable = self.parts[end.part].unable_to_interpolate(variable)
+            unable = self.parts[end.part].unable_to_interpolate(end.variable)
             if unable is not None:
-                return f"component {self.plan.components[end.part].name!r}, {unable},"
+                return f"component {self.plan.components[end.part].name!r}, {unable}"
         return None
 
     def what_drives(self, variable: Variable) -> str | None:
@@ -264,7 +273,8 @@ def _variables(
             ends += [(PartVariable(index, element),) for element in own.elements]
     elements = {one.name for v in variables.values() if v.shape for one in v.elements}
     for connector in plan.connectors:
-        behind = [_behind(plan, parts, end) for end in connector.ends]
+        is_source = connector.causality != "output"
+        behind = [_behind(plan, parts, end, is_source) for end in connector.ends]
         variable = _connector_variable(connector, behind[0], len(ends))
         names = {connector.name, *(one.name for one in variable.elements)}
         for name in names & (variables.keys() | elements):
@@ -347,7 +357,7 @@ def _joined(array: Variable, texts: Iterable[str | None]) -> str:
 
 def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -> Variable:
     """What something else drives cannot be set from outside."""
-    variable = replace(own, name=name, value_reference=reference)
+    variable = replace(own, name=name, value_reference=reference, updated=False)
     places = [place for place, one in enumerate(own.elements) if one.name in driven]
     if own.shape:
         variable = replace(variable, driven=frozenset(places))
@@ -355,7 +365,9 @@ def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -
     return replace(variable, causality="local", initial=None) if is_driven else variable
 
 
-def _behind(plan: SystemPlan, parts: Sequence[ModelDescription], end: End) -> PartVariable:
+def _behind(
+    plan: SystemPlan, parts: Sequence[ModelDescription], end: End, is_target: bool
+) -> PartVariable:
     """The variable behind an end, which may be an array here."""
     part = _number_of(plan, end.component)
     starts = dict(plan.components[part].starts)
@@ -364,7 +376,7 @@ def _behind(plan: SystemPlan, parts: Sequence[ModelDescription], end: End) -> Pa
     variable = _started(array, starts)
     if found.array is not None:
         variable = variable.elements[found.place]
-    return PartVariable(part, variable, end.gain, end.offset)
+    return PartVariable(part, variable, end.gain, end.offset, is_target)
 
 
 def _elements_behind(end: PartVariable) -> list[PartVariable]:
@@ -382,6 +394,7 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         own,
         name=connector.name,
         value_reference=reference,
+        updated=False,
         array=None,
         place=0,
         driven=frozenset() if own.shape else None,

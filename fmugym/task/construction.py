@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
 from math import floor, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, cast
+from weakref import WeakSet
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +25,7 @@ from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.hooks import OwnHooks
+from fmugym.task.hooks import OwnHooks, misspelt_hooks
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import resolve
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
@@ -134,12 +135,18 @@ class Constructed(Pictured):
 
     def _open_pool(self, method: str) -> Pool:
         if self._pool is None:
+            self._require_construction()
             if self._is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
             self._opening = self._opening.apart()
             self.fmu = self._opening.fmu
             self._use(self._opening.open())
         return cast(Pool, self._pool)
+
+    def _require_construction(self) -> None:
+        if not hasattr(self, "_opening"):
+            name = type(self).__name__
+            raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 
     def _close_pool(self) -> None:
         if self._pool is not None:
@@ -170,6 +177,11 @@ class Constructed(Pictured):
                 self._spec.communication_step_size,
                 internal,
                 self.fmu.path.name,
+            )
+        for method, hook in _misspelt(type(self), self._base):
+            self.logger.warning(
+                "%s has a method %r, but no hook %r: is its name misspelt?",
+                *(type(self).__name__, method, hook),
             )
         if self.fmu.description.capabilities.needs_execution_tool:
             self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
@@ -249,13 +261,13 @@ class Constructed(Pictured):
         if not isinstance(hook, _StopTime):
             vars(self)["_is_truncated"] = _StopTime(self, hook)
 
-    def _plan_of_reset(self, options: Mapping[str, Any] | None) -> EpisodePlan:
+    def _plan_of_reset(self, options: Mapping[str, Any] | None, *also_known: str) -> EpisodePlan:
         if options is None:
             return self._plan
         options = check_mapping("the options of reset", options)
         for name in options:
             if name not in self.reset_options:
-                raise unknown_name("reset option", name, self.reset_options)
+                raise unknown_name("reset option", name, (*self.reset_options, *also_known))
         if not options:
             return self._plan
         parameters = self._get_episode_parameters(options)
@@ -275,6 +287,17 @@ class Constructed(Pictured):
             self.config.episode_variables,
             own.keys(),
         )
+
+
+_checked: Final[WeakSet[type[Any]]] = WeakSet()
+
+
+def _misspelt(cls: type[Any], base: type[Any]) -> Iterable[tuple[str, str]]:
+    """The misspelt hooks of a class, but only the first time that a process makes one of it."""
+    if cls in _checked:
+        return ()
+    _checked.add(cls)
+    return misspelt_hooks(cls, base).items()
 
 
 @cache

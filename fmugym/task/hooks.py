@@ -6,7 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from difflib import get_close_matches
+from inspect import signature
+from types import FunctionType
+from typing import TYPE_CHECKING, Any, Final
 
 import gymnasium
 import numpy as np
@@ -22,7 +25,10 @@ from fmugym.task.values import NamedValues
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
 
-__all__ = ["Hooks", "OwnHooks"]
+__all__ = ["Hooks", "OwnHooks", "misspelt_hooks"]
+
+_ALIKE: Final = 0.85
+"""How alike the names of a method and of a hook are if one is meant to be the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +62,32 @@ def _is_own(env: Hooks, base: type[Any], name: str) -> bool:
     name = name if name in {"step", "reset"} else f"_{name}"
     found = getattr(env, name)
     return getattr(found, "__func__", found) is not getattr(base, name)
+
+
+def misspelt_hooks(cls: type[Any], base: type[Any]) -> dict[str, str]:
+    """Find methods that are probably meant to be hooks, which a class does not have.
+
+    Args:
+        cls: The class of an environment.
+        base: ``FMUEnv``.
+
+    Returns:
+        The hooks by the names of the methods. They take the same number of arguments.
+    """
+    inherited = {name: getattr(cls, name) for name in vars(Hooks) if name.startswith("_")}
+    hooks = {
+        name.strip("_"): (name, len(signature(method).parameters))
+        for name, method in inherited.items()
+        if isinstance(method, FunctionType) and method is getattr(base, name)
+    }
+    added = [vars(owner) for owner in cls.__mro__ if owner not in base.__mro__]
+    methods = {n: m for names in added for n, m in names.items() if isinstance(m, FunctionType)}
+    found = {}
+    for name in sorted(methods.keys() - set(dir(base))):
+        near = get_close_matches(name.strip("_"), hooks, n=1, cutoff=_ALIKE)
+        if near and hooks[near[0]][1] == len(signature(methods[name]).parameters):
+            found[name] = hooks[near[0]][0]
+    return found
 
 
 def _environments_first(values: Any) -> Any:

@@ -174,7 +174,8 @@ class Interface:
         """The inputs that change linearly within a step.
 
         Raises:
-            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real.
+            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real
+                or Float64.
         """
         names = self.config.ramped_inputs
         inputs = {variable.name: variable for variable in self.inputs}
@@ -183,12 +184,10 @@ class Interface:
             unable = self.description.unable_to_interpolate(variable)
             if unable is not None:
                 raise ConfigError(
-                    f"config key 'input_interpolation': {unable} cannot interpolate "
-                    "inputs, which is an option of FMI 1.0 and 2.0 for co-simulation; "
-                    f"{variable.name!r} can only hold"
+                    f"config key 'input_interpolation': {unable}; {variable.name!r} can only hold"
                 )
-            found = variable.kind, variable.variability, variable.causality, variable.shape
-            if found != ("real", "continuous", "input", ()):
+            found = variable.variability, variable.causality, variable.is_scalar
+            if found != ("continuous", "input", True) or variable.type not in {"Real", "Float64"}:
                 raise ConfigError(
                     f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
                     f"a {variable.variability} {variable.causality} of type {variable.type}, "

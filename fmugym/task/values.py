@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.texts import text_of, texts_of
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
 
 __all__ = [
     "EpisodeVariables",
@@ -152,7 +152,7 @@ class ParameterValues(dict[str, Any]):
     def __missing__(self, name: Any) -> Any:
         places = array_places(self).get(name) if isinstance(name, str) else None
         if places is None:
-            raise KeyError(name)
+            raise UnknownParameterError(str(unknown_name("parameter", name, self)))
         values = list(self.values())
         return stacked([values[place] for place in places])
 

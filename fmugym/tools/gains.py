@@ -21,6 +21,7 @@ from fmugym.tools.options import (
     add_task,
     check_numbers,
     note,
+    require_folder,
     say,
     say_json,
     tell,
@@ -123,6 +124,7 @@ def _require_new(path: Path, name: str) -> None:
         raise ConfigError(f"a task file ends with .toml, got {shown(str(path))}")
     if not name.isidentifier() or not name.isascii():
         raise ConfigError(f"a controller has a name such as 'tuned', got {shown(name)}")
+    require_folder(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; name a new file")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +14,7 @@ from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, shown
 from fmugym.tools.agents import agent_policy
 from fmugym.tools.overview import plain
 from fmugym.tools.simulation import Policy, action_of, policy_of
@@ -30,6 +31,7 @@ __all__ = [
     "note",
     "only_player",
     "players_of",
+    "require_folder",
     "say",
     "say_json",
     "shown_in_any_case",
@@ -169,12 +171,29 @@ def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
     show()
 
 
+def require_folder(path: Path) -> None:
+    """Refuse a file whose folder does not exist, before work is done for it.
+
+    Raises:
+        ConfigError: If there is no such folder.
+    """
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {shown(str(path.parent))}; make it first")
+
+
+def _for_any_file(text: str) -> str:
+    """A text whose letters are escaped unless standard output is UTF-8, as TOML and Python are."""
+    if codecs.lookup(sys.stdout.encoding or "ascii").name == "utf-8":
+        return text
+    return text.encode("ascii", "backslashreplace").decode()
+
+
 def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:
     """Write a text to a new file, or to standard output, and notes to the error stream."""
     if output is None:
-        print(text, end="")
+        print(_for_any_file(text), end="")
     else:
-        with output.open("x", encoding="ascii", newline="\n") as file:
+        with output.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
     for one in notes:
         note(one)

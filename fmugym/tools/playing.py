@@ -28,7 +28,7 @@ from fmugym.tools.options import (
 )
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
-from fmugym.tools.records import Recording, require_format, title_of
+from fmugym.tools.records import Recording, require_format, require_picture, title_of
 from fmugym.tools.simulation import Policy, Summary, simulate
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
@@ -165,7 +165,7 @@ def add_evaluate(commands: Commands) -> None:
 def _evaluate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
     if arguments.plot is not None:
-        require_format(arguments.plot, 1)
+        require_picture(arguments.plot)
     players = players_of(arguments, random=True)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []

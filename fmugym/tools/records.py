@@ -13,28 +13,45 @@ from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
+from fmugym.tools.options import require_folder
 
-__all__ = ["About", "Recording", "require_format", "title_of"]
+__all__ = ["About", "Recording", "require_format", "require_picture", "title_of"]
 
 _TABLES: Final = (".csv", ".parquet")
 _PICTURES: Final = (".png", ".svg", ".pdf")
 _REPORT: Final = ".html"
 
 
+def require_picture(path: Path) -> None:
+    """Refuse a file for a picture before any episode is played for it.
+
+    Raises:
+        ConfigError: If its name tells no format of pictures, or its folder does not exist.
+        FileExistsError: If it exists.
+    """
+    _require_new(path, _PICTURES)
+
+
 def require_format(path: Path, runs: int) -> None:
     """Refuse a file before any episode is played for it.
 
     Raises:
-        ConfigError: If its name tells no known format, or a table cannot hold so many runs.
+        ConfigError: If its name tells no known format, its folder does not exist, or a table cannot
+            hold so many runs.
         FileExistsError: If it exists.
     """
-    known = (*_TABLES, *_PICTURES, _REPORT)
-    if path.suffix.lower() not in known:
-        raise ConfigError(f"a file ends with one of {', '.join(known)}; got {shown(str(path))}")
+    _require_new(path, (*_TABLES, *_PICTURES, _REPORT))
     if path.suffix.lower() in _TABLES and runs > 1:
         raise ConfigError(f"{shown(str(path))} holds one run, got {runs}; a report holds several")
+
+
+def _require_new(path: Path, endings: Sequence[str]) -> None:
+    if path.suffix.lower() not in endings:
+        raise ConfigError(f"the file ends with one of {', '.join(endings)}; got {shown(str(path))}")
+    require_folder(path)
     if path.exists():
         raise FileExistsError(f"{path} exists; name a new file")
+    require_folder(path)
 
 
 def title_of(target: str) -> str:

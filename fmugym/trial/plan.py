@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 from fmugym.archive.fmu import FMU
@@ -208,13 +209,25 @@ _GRADES: Final = {
 }
 
 
+_warned: Final[set[tuple[Path, str]]] = set()
+
+
+def _level_of(fmu: FMU, subject: str) -> int:
+    """A program that makes many environments of an FMU is warned of each subject once."""
+    is_new = (fmu.path, subject) not in _warned
+    _warned.add((fmu.path, subject))
+    return logging.WARNING if is_new else logging.INFO
+
+
 def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
     """Log the reset methods that the FMU offers but that do not work correctly."""
     wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
     if not verdict.deterministic:
-        log.warning("%s gives other outputs each time, even if it begins afresh", fmu.path.name)
+        text = "%s gives other outputs each time, even if it begins afresh"
+        log.log(_level_of(fmu, "outputs"), text, fmu.path.name)
     if ResetMethod.RESET in wrong:
-        log.warning(
+        log.log(
+            _level_of(fmu, str(verdict.reset_method)),
             "%s does not begin anew when it is reset; episodes begin by the method %r instead",
             fmu.path.name,
             str(verdict.reset_method),

@@ -21,6 +21,7 @@ from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
 
 __all__ = [
+    "ARGUMENTS",
     "HOOKS",
     "POOL_OPTIONS",
     "UnknownAttributeError",
@@ -40,7 +41,8 @@ HOOKS: Final = ("auto", "compiled", "array", "per_env")
 POOL_OPTIONS: Final = ("threads", "private_libraries", "isolation", "workers", "call_timeout")
 """The arguments that are meant for the pool."""
 
-_ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
+ARGUMENTS: Final = ("make_env", "num_envs", "max_episode_steps", "autoreset_mode", "hooks")
+"""The arguments that are not."""
 
 _BOOL: Final = np.dtype(np.bool_)
 
@@ -130,7 +132,7 @@ def checked_pool_options(options: Mapping[str, Any], num_envs: int) -> dict[str,
     """
     for name in options:
         if name not in (*POOL_OPTIONS, "backend"):
-            raise unknown_argument("FMUVectorEnv", name, (*_ARGUMENTS, *POOL_OPTIONS, "backend"))
+            raise unknown_argument("FMUVectorEnv", name, (*ARGUMENTS, *POOL_OPTIONS, "backend"))
     checked = {name: value for name, value in options.items() if value is not None}
     for name in checked.keys() & {"threads", "workers"}:
         checked[name] = min(check_count(name, checked[name]), num_envs)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import load_env_creator
 from gymnasium.vector import AutoresetMode
 
+from fmugym.errors import ArgumentError
+
 if TYPE_CHECKING:
     from fmugym.vector.env import FMUVectorEnv
 
@@ -52,7 +54,7 @@ class VectorEntryPoint:
         **kwargs: Any,
     ) -> FMUVectorEnv:
         """Make a vector environment; see ``FMUVectorEnv``."""
-        from fmugym.vector.arguments import POOL_OPTIONS  # registration shall be quick
+        from fmugym.vector.arguments import ARGUMENTS, POOL_OPTIONS  # registration shall be quick
         from fmugym.vector.env import FMUVectorEnv
 
         pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
@@ -60,15 +62,19 @@ class VectorEntryPoint:
         creator: Any = load_env_creator(env_class) if isinstance(env_class, str) else env_class
         if not isinstance(backend, str):  # it names no pool: the class knows what to do with it
             kwargs["backend"], backend = backend, "auto"
-        return FMUVectorEnv(
-            partial(creator, **kwargs),
-            num_envs,
-            max_episode_steps=max_episode_steps,
-            autoreset_mode=autoreset_mode,
-            hooks=hooks,
-            backend=backend,
-            **pool_options,
-        )
+        try:
+            return FMUVectorEnv(
+                partial(creator, **kwargs),
+                num_envs,
+                max_episode_steps=max_episode_steps,
+                autoreset_mode=autoreset_mode,
+                hooks=hooks,
+                backend=backend,
+                **pool_options,
+            )
+        except ArgumentError as error:
+            more = ", ".join(map(repr, (*ARGUMENTS[1:], *POOL_OPTIONS)))
+            raise ArgumentError(f"{error}; a vector environment also takes {more}") from None
 
 
 def vectorized(env_class: Callable[..., Any] | str) -> Callable[..., FMUVectorEnv]:

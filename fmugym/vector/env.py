@@ -125,6 +125,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         try:
             self._maker = EnvMaker(make_env)
             self._prototype = self._maker.make()
+            self._prototype._require_construction()
             self._set_up_or_close(way, limit, options)
         except MemoryError:
             raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None

@@ -29,6 +29,7 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
         FMULoadError: If the FMU cannot be used on this machine.
     """
     env = EnvMaker(make_env).make()
+    env._require_construction()
     env._use(env._opening.open(num_instances, **options))
     return env
 

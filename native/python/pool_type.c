@@ -198,6 +198,9 @@ static void pool_dealloc(PyObject *object) {
 typedef struct {
     PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance;
     PyAccess *inputs, *outputs;
+    PyObject *watched; /* an Access or None */
+    const char *watched_places;
+    Py_ssize_t size_of_places;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, manner, private_libraries, logging, can_save;
@@ -246,9 +249,11 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", NULL};
-    return parse_group(group, "$O!O!ny#:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings);
+    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", "watched_places",
+                            "watched", NULL};
+    return parse_group(group, "$O!O!ny#y#O:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings,
+                       &a->watched_places, &a->size_of_places, &a->watched);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
@@ -307,6 +312,28 @@ static bool check_accesses(const Arguments *a) {
         PyErr_SetString(PyExc_TypeError, "expected an Access of this FMI version");
         return false;
     }
+    return true;
+}
+
+/* The outputs of which the FMU may tell more than their values at the ends of steps. */
+static bool take_watched(const Arguments *a, Solving *solving) {
+    if (a->watched == Py_None) {
+        return true;
+    }
+    const PyAccess *watched = (const PyAccess *)a->watched;
+    const uint32_t *places = (const uint32_t *)(const void *)a->watched_places;
+    bool sound = PyObject_TypeCheck(a->watched, access_type) &&
+                 watched->access.fmi == a->outputs->access.fmi && a->samplings > 0 &&
+                 (size_t)a->size_of_places == watched->access.count * sizeof *places;
+    for (size_t i = 0; sound && i < watched->access.count; i++) {
+        sound = places[i] < a->outputs->access.count;
+    }
+    if (!sound) {
+        PyErr_SetString(PyExc_ValueError, "the watched outputs do not fit the outputs");
+        return false;
+    }
+    solving->watched = &watched->access;
+    solving->watched_places = places;
     return true;
 }
 
@@ -454,6 +481,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->pace.interval = (uint64_t)(a->pace * 1e9);
     s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
+           take_watched(a, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }

@@ -333,13 +333,14 @@ static void give_starts(End *end, int32_t array, Bytes sizes, const double *cons
 
 static bool take_ends(PyObject *tuple, System *s) {
     Bytes sizes, starts, firsts, parts, types, references, inputs, outputs, arrays, places;
-    Bytes gains, offsets;
+    Bytes gains, offsets, reading_gains, reading_offsets;
 
     if (!PyTuple_Check(tuple) ||
-        !PyArg_ParseTuple(tuple, "y#y#y#y#y#y#y#y#y#y#y#y#", BYTES(sizes), BYTES(starts),
+        !PyArg_ParseTuple(tuple, "y#y#y#y#y#y#y#y#y#y#y#y#y#y#", BYTES(sizes), BYTES(starts),
                           BYTES(firsts), BYTES(parts), BYTES(types), BYTES(references),
                           BYTES(inputs), BYTES(outputs), BYTES(arrays), BYTES(places),
-                          BYTES(gains), BYTES(offsets))) {
+                          BYTES(gains), BYTES(offsets), BYTES(reading_gains),
+                          BYTES(reading_offsets))) {
         return refuse("variables");
     }
     const size_t count = (size_t)types.size;
@@ -352,14 +353,17 @@ static bool take_ends(PyObject *tuple, System *s) {
                  count_of(parts, 4) == count && count_of(references, 4) == count &&
                  count_of(inputs, 4) == count && count_of(outputs, 4) == count &&
                  count_of(arrays, 4) == count && count_of(places, 4) == count &&
-                 count_of(gains, 8) == count && count_of(offsets, 8) == count;
+                 count_of(gains, 8) == count && count_of(offsets, 8) == count &&
+                 count_of(reading_gains, 8) == count && count_of(reading_offsets, 8) == count;
     for (size_t i = 0; sound && i < count; i++) {
         s->ends[i] = (End){.part = numbers_of(parts)[i],
                            .type = (Type)(uint8_t)types.data[i],
                            .element = {numbers_of(references)[i], numbers_of(places)[i], 1},
                            .input = (int32_t)numbers_of(inputs)[i],
                            .output = (int32_t)numbers_of(outputs)[i],
-                           .scale = scale_of(doubles_of(gains)[i], doubles_of(offsets)[i])};
+                           .scale = scale_of(doubles_of(gains)[i], doubles_of(offsets)[i]),
+                           .reading = scale_of(doubles_of(reading_gains)[i],
+                                               doubles_of(reading_offsets)[i])};
         give_starts(&s->ends[i], (int32_t)numbers_of(arrays)[i], sizes, starts_of_arrays);
         sound = is_sound_end(s, &s->ends[i]);
     }

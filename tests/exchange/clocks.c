@@ -21,7 +21,12 @@ enum { CONSTANT, FIXED, CALCULATED, TUNABLE, CHANGING, COUNTDOWN, STRIKE, BELL, 
 enum { COUNT = 10, LAST = 20, X = 30, DER_X, PERIOD, PACE, COMMAND, SAMPLE, PLAIN, EAGER, ALARM, BAD };
 enum { COMMANDS = 40, SAMPLES, PLAINS, END_OF_ARRAYS, SIZE = 2 }; /* arrays */
 
+typedef void Update(void *environment, double time, bool set, bool get, bool finished, bool early,
+                    bool *early_requested, double *early_time);
+
 typedef struct {
+    Update *update; /* called within steps if anything is wanted there, otherwise NULL */
+    void *environment;
     int mode;
     bool exchange, active[CLOCKS], counts_down;
     double time, x, next_alarm, countdown;
@@ -35,10 +40,12 @@ typedef struct {
     }
 
 static void start(Model *me) {
-    const bool exchange = me->exchange;
+    const Model kept = *me;
 
     memset(me, 0, sizeof *me);
-    me->exchange = exchange;
+    me->exchange = kept.exchange;
+    me->update = kept.update;
+    me->environment = kept.environment;
     me->period = 0.2;
     me->pace = 0.5;
     me->next_alarm = 0.3;
@@ -63,14 +70,18 @@ void *fmi3InstantiateModelExchange(const char *name, const char *token, const ch
 void *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *resources,
                                   bool visible, bool logging, bool event_mode, bool early_return,
                                   const unsigned *intermediate, size_t intermediate_count,
-                                  void *environment, void *logger,
-                                  void (*update)(void *, double, bool, bool, bool, bool, bool *,
-                                                 double *)) {
+                                  void *environment, void *logger, Update *update) {
     bool wants_early_return = true;
     double early_return_time = 0.0;
 
     update(environment, 0.0, false, false, true, true, &wants_early_return, &early_return_time);
-    return event_mode && early_return && !wants_early_return ? make(false) : NULL;
+    if (!event_mode || !early_return || wants_early_return) {
+        return NULL;
+    }
+    Model *me = make(false);
+    me->update = intermediate_count > 0 ? update : NULL;
+    me->environment = environment;
+    return me;
 }
 
 void fmi3FreeInstance(Model *me) {
@@ -340,6 +351,16 @@ int fmi3SetFloat64(Model *me, const unsigned *references, size_t count, const do
 
 /* Co-simulation */
 
+/* In the middle of a step and at its end. */
+static void tell(Model *me, double begin, double end) {
+    for (int i = 1; i <= 2 && me->update != NULL; i++) {
+        bool early = false;
+        double early_time = 0.0;
+        me->x = begin + 0.5 * i * (end - begin);
+        me->update(me->environment, me->x, false, true, true, true, &early, &early_time);
+    }
+}
+
 int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *event,
                bool *terminate, bool *early, double *reached) {
     const double until = time + step;
@@ -349,6 +370,7 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     me->time = me->eager > 0.0 ? fmin(until, time + me->eager) : until;
     *event = me->time >= me->next_alarm;
     me->time = *event ? me->next_alarm : me->time;
+    tell(me, time, me->time);
     me->x = me->time;
     *early = me->time < until;
     *reached = me->time;

@@ -6,7 +6,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-static const double INTERNAL_STEP = 1e-3;
+#ifndef INTERNAL_STEP
+#define INTERNAL_STEP 1e-3
+#endif
 
 #define REQUIRE(condition)                                                                         \
     if (!(condition)) {                                                                            \
@@ -128,18 +130,30 @@ int core_nominals(Model *me, double *x, size_t count) {
     return OK;
 }
 
+/* In intermediate updates, only what was asked for at the instantiation may be got and set. */
+static bool is_wanted(const Model *me, unsigned reference) {
+    bool wanted = !me->updating;
+
+    for (size_t i = 0; i < me->number_wanted; i++) {
+        wanted |= me->wanted[i] == reference;
+    }
+    return wanted;
+}
+
 int core_get(Model *me, const unsigned *references, size_t count, double *values) {
-    REQUIRE(me->mode != INSTANTIATED);
+    REQUIRE(me->mode != INSTANTIATED && (!me->updating || me->may_get));
     model_rates(me);
     for (size_t i = 0; i < count; i++) {
+        REQUIRE(is_wanted(me, references[i]));
         values[i] = me->v[references[i]];
     }
     return OK;
 }
 
 int core_set(Model *me, const unsigned *references, size_t count, const double *values) {
-    REQUIRE(me->mode != CONTINUOUS && me->mode != TERMINATED);
+    REQUIRE(me->mode != CONTINUOUS && me->mode != TERMINATED && (!me->updating || me->may_set));
     for (size_t i = 0; i < count; i++) {
+        REQUIRE(is_wanted(me, references[i]));
         me->v[references[i]] = values[i];
     }
     return OK;
@@ -152,6 +166,7 @@ static bool step_once(Model *me, double until) {
     double before[MOST], after[MOST];
     bool event = false;
 
+    model_update(me, false);
     model_rates(me);
     model_indicators(me, before);
     for (size_t i = 0; i < STATES; i++) {
@@ -162,6 +177,7 @@ static bool step_once(Model *me, double until) {
     }
     me->time += step;
     model_rates(me);
+    model_update(me, true);
     model_indicators(me, after);
     for (size_t i = 0; i < INDICATORS; i++) {
         event |= (before[i] > 0) != (after[i] > 0);
@@ -182,13 +198,17 @@ int core_set_slopes(Model *me, const unsigned *references, size_t count, const i
     return OK;
 }
 
-/* Does no more of a step than EARLY seconds. */
+/* Does no more of a step than EARLY seconds, and breaks off one that is longer than LONGEST. */
 int core_do_step(Model *me, double time, double step) {
     const double until = time + fmin(step, EARLY);
 
     REQUIRE(me->mode == STEPPING && fabs(time - me->time) < 1e-9);
-    me->time = time;
+    me->time = me->step_begin = time;
+    me->step_end = time + step;
     while (me->time < until - 1e-12) {
+        if (step > LONGEST && me->time > time + 0.5 * step) {
+            return DISCARD;
+        }
         if (step_once(me, until)) {
             me->stops = true;
             return DISCARD;
@@ -214,6 +234,9 @@ int core_set_state(Model *me, const void *state) {
     memcpy(me->name, kept.name, sizeof kept.name);
     me->logger = kept.logger;
     me->environment = kept.environment;
+    me->update = kept.update;
+    memcpy(me->wanted, kept.wanted, sizeof kept.wanted);
+    me->number_wanted = kept.number_wanted;
     return OK;
 }
 

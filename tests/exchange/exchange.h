@@ -18,6 +18,10 @@ enum { MOST = 32 };
 #define EARLY INFINITY
 #endif
 
+#ifndef LONGEST
+#define LONGEST INFINITY
+#endif
+
 typedef struct {
     double v[MOST]; /* the variables */
     double slope[MOST]; /* of inputs, in co-simulation */
@@ -33,6 +37,12 @@ typedef struct {
     bool wants_event;  /* after a complete step */
     char name[64];
     void *logger, *environment;
+    /* intermediate updates of co-simulation */
+    void *update;
+    unsigned wanted[MOST]; /* the variables that are wanted in them */
+    size_t number_wanted;
+    bool updating, may_set, may_get;
+    double step_begin, step_end;
 } Model;
 
 /* Every model has these. */
@@ -43,6 +53,8 @@ void model_rates(Model *me);      /* computes derivatives and outputs */
 void model_indicators(const Model *me, double *z);
 void model_event(Model *me);      /* updates the discrete states */
 void model_complete(Model *me);   /* after a step */
+/* Tells of a point of an internal step: its beginning, where inputs are wanted, or its end. */
+void model_update(Model *me, bool at_end);
 double model_partial(const Model *me, size_t unknown, size_t known);
 
 Model *core_new(const char *name, bool exchange, void *logger, void *environment);

@@ -13,7 +13,14 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
                                   bool visible, bool logging, bool event_mode, bool early_return,
                                   const unsigned *intermediate, size_t intermediate_count,
                                   void *environment, void *logger, void *intermediate_update) {
-    return core_new(name, false, logger, environment);
+    Model *me = core_new(name, false, logger, environment);
+
+    me->update = intermediate_update;
+    me->number_wanted = intermediate_count < MOST ? intermediate_count : MOST;
+    for (size_t i = 0; i < me->number_wanted; i++) {
+        me->wanted[i] = intermediate[i];
+    }
+    return me;
 }
 
 void fmi3FreeInstance(Model *me) {
@@ -56,7 +63,7 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     *early = !me->stops && me->time < time + step - 1e-9;
     *terminate = me->stops;
     *last = me->time;
-    return status == DISCARD ? OK : status;
+    return status == DISCARD && me->stops ? OK : status;
 }
 
 int fmi3EnterEventMode(Model *me) {

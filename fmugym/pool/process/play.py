@@ -69,7 +69,9 @@ class PlayAround:
         return _native.Pool(
             library=_NO_LIBRARY,
             experiment=cast("_native.Experiment", experiment_settings(spec)),
-            variables=cast("_native.Variables", variable_settings(spec) | accesses),
+            variables=cast(
+                "_native.Variables", variable_settings(spec) | accesses | {"watched": None}
+            ),
             arrays={
                 "inputs": arrays.inputs,
                 "outputs": arrays.outputs,

@@ -13,7 +13,7 @@ import logging
 import math
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -282,14 +282,7 @@ class ProcessPool(SavingPool):
             replies = self._crew.run(ROLLOUT, self._crew.able, tell)
             self._crew.note_lost()
         own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
-        troubled = int(np.count_nonzero(self._crew.lost))
-        for supervisor, reply in replies.items():
-            if isinstance(reply, IndexError):
-                raise reply
-            troubled += reply[0]
-            for array, part in zip(own, reply[1], strict=True):
-                array[:, supervisor.block] = part
-        return troubled
+        return int(np.count_nonzero(self._crew.lost)) + _take_rolled(replies, own)
 
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.rollouts import PlayOfWorkers
@@ -517,6 +510,17 @@ class ProcessPool(SavingPool):
         missing = np.flatnonzero(lost if mask is None else lost & mask)
         if missing.size:
             raise SimulationError(self.failure(int(missing[0])))
+
+
+def _take_rolled(replies: Mapping[Supervisor, Any], arrays: Sequence[npt.NDArray[Any]]) -> int:
+    """Put the results of rollouts together; returns how many instances had trouble."""
+    for reply in replies.values():
+        if isinstance(reply, IndexError):  # of a hook
+            raise reply
+    for supervisor, (_, parts) in replies.items():
+        for array, part in zip(arrays, parts, strict=True):
+            array[:, supervisor.block] = part
+    return sum(troubled for troubled, _ in replies.values())
 
 
 class _Snapshot:

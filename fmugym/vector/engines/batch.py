@@ -207,7 +207,7 @@ class BatchEngine(Engine):
         self.has_moved = False
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
-        plan = self.env._plan_of_reset(options)
+        plan = self.env._plan_of_reset(options, "reset_mask")
         drawn = self._begin(mask, indices, plan)
         self.env._in_hooks = True
         try:

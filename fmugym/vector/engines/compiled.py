@@ -14,6 +14,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
+from fmugym.signals import is_of_signal_handler
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
@@ -228,12 +229,15 @@ class CompiledEngine(BatchEngine):
         super()._assign(attributes)
         task: TracedTask | None = None
         try:
-            task = trace_hooks(self.env, self._columns)
-            require_same(self.env, Readings.of(self.env), task)
+            found = trace_hooks(self.env, self._columns)
+            require_same(self.env, Readings.of(self.env), found)
+            task = found
         except Exception as reason:  # as in find_programs
+            if is_of_signal_handler(reason):
+                raise
             logger.info("the hooks cannot be compiled any more: %s", reason)
-            task = None
-        self._prepare(task)
+        finally:
+            self._prepare(task)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
