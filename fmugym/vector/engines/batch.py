@@ -604,6 +604,7 @@ class BatchEngine(Engine):
             raise SimulationError(f"environment {index}: {reason}")
         for index, reason in reasons.items():
             env.logger.warning("environment %d: %s", index, reason)
+        env.done[faulty] = config.on_fault == "terminate"
         if (faulty & ~failed).any():
             self._undo(result, faulty & ~failed, reasons)
         texts = np.full(self._n, None, dtype=object)
@@ -613,7 +614,6 @@ class BatchEngine(Engine):
         result.rewards[faulty] = results.rewards(env._fault_reward(), self._n)[faulty]
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
-        env.done[faulty] = result.terminated[faulty]
 
     def _undo(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
