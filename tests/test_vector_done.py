@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from vector_tools import CART_POLE, Drawing, PushedCart, each_mode, require_equal, sampled_actions
+from vector_tools import (
+    CART_POLE,
+    PushedCart,
+    each_mode,
+    require_equal,
+    require_same_infos,
+    sampled_actions,
+)
 
 import fmugym
 from fmugym import SimulationError
@@ -133,8 +140,7 @@ def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks):
         envs.reset(seed=4, options={"model_parameters": {"m_cart": 2.0}})
         envs.step(np.zeros(3, np.int64))
         with pytest.raises(SimulationError, match="environment 1"):
-            for _ in range(4):
-                envs.step(np.array([0, 1, 0]))
+            envs.step(np.array([0, 1, 0]))
         envs.reset(seed=5)
     for _ in range(12):
         result, _ = (envs.step(np.zeros(3, np.int64)) for envs in (ours, theirs))
@@ -181,3 +187,50 @@ def test_a_series_has_the_present_done(mode, hooks):
         assert rows[-1]["costs.last"].any()
         envs.close()
     require_equal(*rows)
+
+
+class Judged(PushedCart):
+    """Rewards are not numbers at times; the info tells what a hook reads then."""
+
+    policy = "terminate"
+
+    def __init__(self):
+        super().__init__(max_episode_steps=5, on_fault=self.policy, fault_reward=-7.0)
+
+    def _get_inputs(self):
+        return self.action
+
+    def _reward_policy(self):
+        return np.where(self.state[1] < -0.006, np.nan, 0.0)
+
+    def _get_info(self):
+        return {"done": self.done}
+
+
+class Cut(Judged):
+    """A fault is not the end of the task."""
+
+    policy = "truncate"
+
+
+@each_kind
+@each_mode
+@pytest.mark.parametrize("task", [Judged, Cut])
+def test_infos_of_faults_have_done(task, mode, hooks):
+    ours, theirs = pair(task, hooks, mode)
+    faults = 0
+    for envs in ours, theirs:
+        envs.reset(seed=1)
+    for actions in sampled_actions(ours, 30):
+        mine, other = ours.step(actions), theirs.step(actions)
+        require_equal(mine[2], other[2])
+        require_same_infos(mine[4], other[4])
+        infos = mine[4].get("final_info", mine[4])
+        faults += int(np.count_nonzero(infos.get("_fault", False)))
+        ended = mine[2] | mine[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+    assert faults
+    ours.close()
+    theirs.close()

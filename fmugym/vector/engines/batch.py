@@ -632,7 +632,8 @@ class BatchEngine(Engine):
             )
         copy_rows(again, result.observations, mask)
         if env._has_info:
-            copy_rows(self._infos(np.ones(self._n, np.bool_)), result.infos, mask)
+            infos = self._infos(np.ones(self._n, np.bool_))
+            copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
 
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
