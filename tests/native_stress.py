@@ -32,6 +32,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
+from fmugym.task.values import LateDict
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
@@ -99,6 +100,8 @@ def draws(*rows):
 
 
 DRAWS = draws(0)
+TOLD = "drawn", "_drawn", *LateDict.parts(dict, {})
+"""What a reset tells of the episodes that it starts."""
 
 
 class ReceiverError(Exception):
@@ -188,14 +191,15 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (np.empty, tuple, None, self.results()),
+                "results": (np.empty, tuple, None, self.results(), TOLD),
             },
         )
 
     def results(self):
         """The shapes and types of what a step returns."""
         flags = (self.n,), bool
-        return ((self.n, len(self.outputs)), np.float32), ((self.n,), float), flags, flags
+        observations, drawn = ((self.n, len(self.outputs)), np.float32), ((1, self.n), float)
+        return observations, ((self.n,), float), flags, flags, flags, drawn
 
     def draw(self):
         """Seed streams and draw from them while other threads play."""
