@@ -368,6 +368,16 @@ class Pool:
     def step_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> Any:
         """Do a step, with all that was taken over; see ``SingleCalls.step``."""
 
+    def before_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> bool | None:
+        """Do what comes before the FMU's part of ``step_single``; None if nothing was done."""
+
+    def after_single(self, troubled: int, /) -> Any:
+        """Do what comes after the FMU's part of ``step_single``.
+
+        The output values are those that the pool's array has. The argument tells how many instances
+        had trouble; the result is that of ``step_single``.
+        """
+
     def begin_single(self, action: Any, /) -> None:
         """Take what counts as the action of the step before."""
 
@@ -376,6 +386,9 @@ class Pool:
 
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""
+
+    def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
+        """Do a whole reset with a mask; see ``NativePool.reset_of_play``."""
 
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""

@@ -6,6 +6,7 @@ methods fail. It returns the value in its plain Python type, or raises ``ConfigE
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 import os
@@ -13,14 +14,15 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from numbers import Real
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 
 __all__ = [
     "LARGEST_COUNT",
+    "KnownArguments",
     "check_count",
     "check_dict",
     "check_flag",
@@ -42,6 +44,29 @@ __all__ = [
 LARGEST_COUNT: Final = 2**31 - 1
 """The largest number of steps or threads that can be asked for."""
 
+_BY_NAME: Final = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+class KnownArguments:
+    """Base of classes whose constructors name the nearest argument for a misspelt one.
+
+    Raises:
+        ArgumentError: If there is no argument of a name; that is a ``TypeError``, too.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, *_: Any, **given: Any) -> Self:
+        """Check the names; the class's own ``__init__`` gets the arguments."""
+        if given:
+            own = list(inspect.signature(cls.__init__).parameters.values())[1:]
+            known = [one.name for one in own if one.kind in _BY_NAME]
+            takes_any = any(one.kind is one.VAR_KEYWORD for one in own)
+            unknown = [] if takes_any else [name for name in given if name not in known]
+            for name in unknown:
+                raise unknown_argument(cls.__name__, name, known)
+        return super().__new__(cls)
+
 
 def check_number(
     what: str,
@@ -51,6 +76,7 @@ def check_number(
     *,
     positive: bool = False,
     may_be_infinite: bool = False,
+    may_be_boolean: bool = False,
 ) -> float:
     """Return a value as a float of a range.
 
@@ -61,11 +87,12 @@ def check_number(
         maximum: The highest number allowed.
         positive: Whether 0 is refused too.
         may_be_infinite: Whether infinity is allowed.
+        may_be_boolean: Whether True and False are allowed, as for variables that may be Booleans.
 
     Raises:
         ConfigError: If it is no number, NaN, or out of its range.
     """
-    number = number_of(what, value)
+    number = number_of(what, value, may_be_boolean=may_be_boolean)
     in_range = minimum <= number <= maximum and (number > 0 or not positive)
     if in_range and (may_be_infinite or math.isfinite(number)):
         return number
@@ -84,7 +111,7 @@ def _range(minimum: float, maximum: float, positive: bool, may_be_infinite: bool
     return kind if minimum == -math.inf else f"{kind} and at least {minimum:g}"
 
 
-def number_of(what: str, value: Any) -> float:
+def number_of(what: str, value: Any, *, may_be_boolean: bool = False) -> float:
     """Return a value as a float, finite or not.
 
     Raises:
@@ -92,7 +119,7 @@ def number_of(what: str, value: Any) -> float:
     """
     if type(value) is float:
         return value
-    if _is_real(value):
+    if _is_real(value) and (may_be_boolean or not _is_boolean(value)):
         with suppress(Exception):  # the number is too large, or the object's own method fails
             return float(value)
     raise ConfigError(f"{what} must be a number, got {shown(value)}")
@@ -101,7 +128,7 @@ def number_of(what: str, value: Any) -> float:
 def float_or_nan(value: Any) -> float:
     """Return a value as a float; NaN if it is no real number."""
     try:
-        return number_of("", value)
+        return number_of("", value, may_be_boolean=True)
     except ConfigError:
         return math.nan
 
@@ -112,6 +139,12 @@ def _is_real(value: Any) -> bool:
     return issubclass(type(value), Real) or (
         hasattr(type(value), "__float__") and not issubclass(type(value), str | bytes)
     )
+
+
+def _is_boolean(value: Any) -> bool:
+    if issubclass(type(value), np.ndarray):
+        return bool(value.ndim == 0 and value.dtype == np.bool_)
+    return issubclass(type(value), bool | np.bool_)
 
 
 def check_count(what: str, value: Any, largest: int = LARGEST_COUNT) -> int:

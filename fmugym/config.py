@@ -337,7 +337,7 @@ def _variable(name: str, value: Any) -> Any:
     what = f"episode variable {name!r}"
     if isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim):
         return _variable_array(what, value)
-    return _number(what, as_distribution(what, value))
+    return _number(what, as_distribution(what, value), may_be_boolean=True)
 
 
 def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
@@ -364,15 +364,17 @@ def _drawn_array(what: str, value: Any) -> npt.NDArray[Any]:
         raise ConfigError(f"{what} must be an array of numbers, got {shown(value)}")
     array = np.empty(len(elements), object)
     for place, one in enumerate(elements):
-        array[place] = _number(f"element {place} of {what}", one)
+        array[place] = _number(f"element {place} of {what}", one, may_be_boolean=True)
     return array.reshape(shape)
 
 
-def _number(what: str, value: Any) -> Any:
+def _number(what: str, value: Any, *, may_be_boolean: bool = False) -> Any:
     """Return a number or a distribution of numbers."""
     if isinstance(value, Choice) and any(isinstance(one, str) for one in value.values):
         raise ConfigError(f"{what} must be a number, got {shown(value)}")
-    return value if is_distribution(value) else check_number(what, value)
+    if is_distribution(value):
+        return value
+    return check_number(what, value, may_be_boolean=may_be_boolean)
 
 
 def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:
@@ -386,7 +388,7 @@ def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:
 
 def _bounds(name: str, limits: Any) -> tuple[float, float]:
     try:
-        low, high = (number_of("limit", limit) for limit in limits)
+        low, high = (number_of("limit", one, may_be_boolean=True) for one in limits)
     except Exception:  # no pair of numbers, or an object whose own methods fail
         low = high = math.nan
     if not low < high:

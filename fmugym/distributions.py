@@ -17,7 +17,14 @@ from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_number, check_option, has_method, number_of
+from fmugym.checks import (
+    KnownArguments,
+    check_mapping,
+    check_number,
+    check_option,
+    has_method,
+    number_of,
+)
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
@@ -63,7 +70,7 @@ def _kind(name: str) -> Any:
 
 
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(KnownArguments):
     """The uniform distribution over ``[low, high)``, drawn as ``rng.uniform(low, high)``.
 
     Raises:
@@ -90,7 +97,7 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class LogUniform:
+class LogUniform(KnownArguments):
     """The distribution whose logarithm is uniform; ``0 < low <= high``.
 
     Raises:
@@ -116,7 +123,7 @@ class LogUniform:
 
 
 @dataclass(frozen=True)
-class Normal:
+class Normal(KnownArguments):
     """The normal distribution, redrawn until the value is finite and lies in ``[low, high]``.
 
     Raises:
@@ -161,7 +168,7 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Choice(KnownArguments):
     """One of the given values, with equal or the given probabilities.
 
     The values are numbers; for a parameter that is an Enumeration they may be names of its items.
@@ -283,7 +290,9 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
         drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
     except Exception as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
-    return drawn if isinstance(drawn, str) else check_number(f"what {shown(value)} draws", drawn)
+    if isinstance(drawn, str):
+        return drawn
+    return check_number(f"what {shown(value)} draws", drawn, may_be_boolean=True)
 
 
 def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | None:
@@ -331,7 +340,7 @@ def _take(distribution: Any, *names: str) -> None:
 
 
 def _finite(distribution: Any, value: Any, name: str = "a value") -> float:
-    return check_number(f"{_name(distribution)}: {name}", value)
+    return check_number(f"{_name(distribution)}: {name}", value, may_be_boolean=True)
 
 
 def _name(distribution: Any) -> str:

@@ -237,7 +237,7 @@ class FMUEnv(Constructed):
         obstacle = None
         if self._own.step or self._own.reset:
             obstacle = f"{'step' if self._own.step else 'reset'} is overridden"
-        elif not pool.plays_alone or pool.num_instances > 1:
+        elif not pool.can_play or pool.num_instances > 1:
             obstacle = "the pool is not a native one of its own"
         if obstacle is None and self._way != "python":
             self._play, self._width, self._tells = None, 0, False

@@ -141,7 +141,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     Returns:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
-    names = list(known)
+    names = _in_order(known)
     near = _nearest(name, names)
     if near is not None:
         return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near!r}?")
@@ -156,10 +156,15 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentErr
         name: The argument as it was given.
         known: All arguments that the class has.
     """
-    names = list(known)
+    names = _in_order(known)
     near = _nearest(name, names)
     hint = f"known are: {_listing(names)}" if near is None else f"did you mean {near!r}?"
     return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """The names as a list; sets have another order in each process."""
+    return sorted(names) if isinstance(names, set | frozenset) else list(names)
 
 
 def _nearest(name: object, known: list[str]) -> str | None:

@@ -254,10 +254,13 @@ class _InstanceInWine:
         spec = PoolSpec((), (), 1.0, start_time=fmu.description.start_time)
         self._pool = trial_pool(fmu, spec, 1, logger)
         self.close = self._pool.close
-        self._pool.reset(tuple(start), np.array([list(start.values())], float).T)
-        if self._pool.statuses[0] > Status.WARNING:
-            with closing(self):
+        try:
+            self._pool.reset(tuple(start), np.array([list(start.values())], float).T)
+            if self._pool.statuses[0] > Status.WARNING:
                 raise SimulationError(self._pool.failure(0))
+        except BaseException:
+            self.close()
+            raise
 
     def jacobian(self, unknowns: Variables, knowns: Variables) -> FloatArray:
         return self._pool.differentiate(unknowns, knowns)[:, :, 0]

@@ -146,14 +146,8 @@ typedef struct {
     uint32_t type, reference, place; /* place: see Element */
 } RecordedStart;
 
-/* The episode of an instance so far; see records.h. */
-typedef struct {
-    RecordedStart *starts;
-    size_t number_of_starts;
-    double *inputs; /* of each step */
-    size_t rows, room;
-    bool whole; /* whether no step of the episode is missing */
-} Record;
+/* The episodes of all instances so far; see records.h. */
+typedef struct Records Records;
 
 enum { SAMPLES = 8 };
 
@@ -193,7 +187,7 @@ typedef struct Pool {
     Snapshot *snapshots;
     void **spares;   /* for each instance, a state whose memory is used again, or NULL */
     Atomic wasteful; /* whether the FMU makes a new state instead of overwriting one */
-    Record *records; /* NULL if they are not kept */
+    Records *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Tape tape;

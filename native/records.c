@@ -5,29 +5,82 @@
 
 static const size_t RECORDS_LIMIT = (size_t)256 << 20; /* total bytes of one pool's records */
 
-enum { FIRST_ROOM = 32 };
+static const size_t NOT_WHOLE = SIZE_MAX;
+
+enum {
+    FIRST_ROWS = 32, /* of the first block; each later one has as many as all before it together */
+    BLOCKS = 24      /* more than the limit allows */
+};
+
+typedef struct {
+    RecordedStart *values;
+    size_t count;
+} Starts;
+
+/* A row has the inputs of a step of all instances. Each counts the steps of its own episode, but most
+ * neighbours are at the same one. So a run of instances writes to one place in memory instead of one
+ * for each instance, which takes several times as long. */
+struct Records {
+    size_t count, width;
+    Starts *starts; /* of each instance */
+    size_t *rows;   /* the steps of each instance, or NOT_WHOLE */
+    Atomic blocks[BLOCKS]; /* addresses of rows */
+};
+
+static Records *make_records(size_t count, size_t width) {
+    Records *r = calloc(1, sizeof *r);
+
+    if (r != NULL) {
+        r->count = count;
+        r->width = width;
+        r->starts = calloc(count, sizeof *r->starts);
+        r->rows = malloc(count * sizeof *r->rows);
+    }
+    return r;
+}
+
+static void free_records(Records *r) {
+    for (size_t i = 0; i < r->count && r->starts != NULL; i++) {
+        free(r->starts[i].values);
+    }
+    for (size_t k = 0; k < BLOCKS; k++) {
+        free((void *)(uintptr_t)atomic_get(&r->blocks[k]));
+    }
+    free(r->starts);
+    free(r->rows);
+    free(r);
+}
 
 bool records_open(Pool *pool) {
-    if (pool->records == NULL) {
-        pool->records = calloc(pool->settings.count, sizeof *pool->records);
+    const size_t count = pool->settings.count;
+
+    if (pool->records != NULL) {
+        return true;
     }
-    return pool->records != NULL;
+    Records *r = make_records(count, pool->settings.inputs->count);
+    if (r != NULL && (r->starts == NULL || r->rows == NULL)) {
+        free_records(r);
+        r = NULL;
+    }
+    for (size_t i = 0; r != NULL && i < count; i++) {
+        r->rows[i] = NOT_WHOLE;
+    }
+    pool->records = r;
+    return r != NULL;
 }
 
 void records_close(Pool *pool) {
-    for (size_t i = 0; i < pool->settings.count && pool->records != NULL; i++) {
-        free(pool->records[i].starts);
-        free(pool->records[i].inputs);
+    if (pool->records != NULL) {
+        free_records(pool->records);
+        pool->records = NULL;
     }
-    free(pool->records);
-    pool->records = NULL;
 }
 
-static void note_starts(Record *record, const Access *start, const double *starts) {
+static void note_starts(RecordedStart *values, const Access *start, const double *starts) {
     for (size_t i = 0; i < start->count; i++) {
         const Element *variable = &start->variables[i];
-        record->starts[i] = (RecordedStart){starts[i], start->types[i], variable->reference,
-                                            variable->place};
+        values[i] = (RecordedStart){starts[i], start->types[i], variable->reference,
+                                    variable->place};
     }
 }
 
@@ -35,54 +88,112 @@ void record_begin(Pool *pool, size_t index, const Access *start, const double *s
     if (pool->records == NULL) {
         return;
     }
-    Record *record = &pool->records[index];
-    record->rows = 0;
-    record->whole = true;
-    if (record->number_of_starts != start->count || record->starts == NULL) {
-        free(record->starts);
-        record->starts = calloc(start->count + 1, sizeof *record->starts);
-        record->number_of_starts = start->count;
-        record->whole = record->starts != NULL;
+    Starts *own = &pool->records->starts[index];
+    if (own->count != start->count || own->values == NULL) {
+        free(own->values);
+        own->values = calloc(start->count + 1, sizeof *own->values);
+        own->count = start->count;
     }
-    if (record->whole) {
-        note_starts(record, start, starts);
+    if (own->values != NULL) {
+        note_starts(own->values, start, starts);
+    }
+    pool->records->rows[index] = own->values == NULL ? NOT_WHOLE : 0;
+}
+
+/* Threads may need a new block at the same time. Then one of them makes it for all. */
+static double *block_of(Records *r, size_t block, size_t rows) {
+    uint64_t known = atomic_get(&r->blocks[block]);
+
+    if (known != 0) {
+        return (double *)(uintptr_t)known;
+    }
+    double *made = malloc(rows * r->count * r->width * sizeof *made + 1);
+    if (made == NULL || atomic_replace(&r->blocks[block], &known, (uintptr_t)made)) {
+        return made;
+    }
+    free(made);
+    return (double *)(uintptr_t)known;
+}
+
+/* Returns NULL if there is no memory for it. */
+static double *row_of(Records *r, size_t row) {
+    size_t block = 0, end = FIRST_ROWS;
+
+    for (; row >= end; block++) {
+        end *= 2;
+    }
+    if (end * (r->width + 1) > RECORDS_LIMIT / sizeof(double) / r->count) {
+        return NULL;
+    }
+    const size_t first = block == 0 ? 0 : end / 2;
+    double *inputs = block_of(r, block, end - first);
+    return inputs == NULL ? NULL : inputs + (row - first) * r->count * r->width;
+}
+
+/* The instances have done the same number of steps. */
+static void add_to_row(Records *r, size_t begin, size_t end, const double *inputs) {
+    double *row = row_of(r, r->rows[begin]);
+    const size_t rows = row == NULL ? NOT_WHOLE : r->rows[begin] + 1;
+
+    if (row != NULL && r->width > 0) {
+        memcpy(row + begin * r->width, inputs, (end - begin) * r->width * sizeof *inputs);
+    }
+    for (size_t i = begin; i < end; i++) {
+        r->rows[i] = rows;
     }
 }
 
-static bool make_room(const Pool *pool, Record *record) {
-    const size_t width = pool->settings.inputs->count + 1;
-    const size_t room = record->room == 0 ? FIRST_ROOM : 2 * record->room;
+void records_add(Pool *pool, size_t begin, size_t count, Mask mask, const double *inputs) {
+    Records *r = pool->records;
+    size_t next;
 
-    if (record->rows < record->room) {
-        return true;
+    for (size_t i = begin; r != NULL && i < begin + count; i = next) {
+        const size_t rows = is_in(mask, i) ? NOT_WHOLE : r->rows[i];
+        next = i + 1;
+        if (rows == NOT_WHOLE) {
+            continue;
+        }
+        while (next < begin + count && r->rows[next] == rows && !is_in(mask, next)) {
+            next++;
+        }
+        add_to_row(r, i, next, inputs + (i - begin) * r->width);
     }
-    if (room * width > RECORDS_LIMIT / sizeof(double) / pool->settings.count) {
-        return false;
-    }
-    double *inputs = realloc(record->inputs, room * width * sizeof *inputs);
-    if (inputs != NULL) {
-        record->inputs = inputs;
-        record->room = room;
-    }
-    return inputs != NULL;
 }
 
 void record_add(Pool *pool, size_t index, const double *inputs) {
-    const size_t width = pool->settings.inputs->count;
-
-    if (pool->records == NULL || !pool->records[index].whole) {
-        return;
-    }
-    Record *record = &pool->records[index];
-    record->whole = make_room(pool, record);
-    if (record->whole) {
-        memcpy(record->inputs + record->rows * width, inputs, width * sizeof *inputs);
-        record->rows++;
-    }
+    records_add(pool, index, 1, (Mask){NULL, 0}, inputs);
 }
 
 void record_drop(Pool *pool, size_t index) {
     if (pool->records != NULL) {
-        pool->records[index].whole = false;
+        pool->records->rows[index] = NOT_WHOLE;
     }
+}
+
+bool record_is_whole(const Pool *pool, size_t index) {
+    return pool->records != NULL && pool->records->rows[index] != NOT_WHOLE;
+}
+
+bool record_copy(const Pool *pool, size_t index, Record *copy) {
+    Records *r = pool->records;
+    const Starts *starts = &r->starts[index];
+    const size_t rows = r->rows[index], width = r->width;
+
+    *copy = (Record){.number_of_starts = starts->count, .rows = rows};
+    copy->starts = malloc((starts->count + 1) * sizeof *copy->starts);
+    copy->inputs = malloc((rows * width + 1) * sizeof *copy->inputs);
+    if (copy->starts == NULL || copy->inputs == NULL) {
+        return false;
+    }
+    memcpy(copy->starts, starts->values, starts->count * sizeof *copy->starts);
+    for (size_t row = 0; row < rows && width > 0; row++) {
+        memcpy(copy->inputs + row * width, row_of(r, row) + index * width,
+               width * sizeof *copy->inputs);
+    }
+    return true;
+}
+
+void record_clear(Record *copy) {
+    free(copy->starts);
+    free(copy->inputs);
 }

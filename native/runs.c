@@ -343,22 +343,10 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
-static void record_inputs(const Task *task, size_t begin, size_t count, const double *inputs) {
-    const size_t width = task->pool->settings.inputs->count;
-
-    for (size_t j = 0; j < count; j++, inputs += width) {
-        if (!is_in(task->call->mask, begin + j)) {
-            record_add(task->pool, begin + j, inputs);
-        }
-    }
-}
-
 /* Steps or resets a run, and leaves the outputs in the scratch memory. */
 static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
-    if (task->pool->records != NULL) {
-        record_inputs(task, begin, count, scratch.inputs);
-    }
+    records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     size_t troubled = do_each(task, begin, count, scratch);
 

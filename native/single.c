@@ -29,7 +29,6 @@ static bool make_inputs(const Pool *pool, const Single *s) {
     return true;
 }
 
-/* From here on the step counts, whatever becomes of it. */
 static void keep_what_was(const Pool *pool, const Single *s) {
     const size_t bytes = s->elements * s->size;
 
@@ -39,7 +38,6 @@ static void keep_what_was(const Pool *pool, const Single *s) {
     for (size_t i = 0; i < s->number_of_rows; i++) {
         memcpy(s->rows[i].before, s->rows[i].now, s->rows[i].size);
     }
-    ++*s->step_count;
 }
 
 /* Values beyond a float32 make an observation that is not finite. */
@@ -65,14 +63,24 @@ static bool judge(const Pool *pool, const Single *s, SingleResult *result) {
            fits_observation(pool, s);
 }
 
-SingleOutcome single_step(Pool *pool, const Single *single, const Call *call,
-                          SingleResult *result) {
+bool single_before(const Pool *pool, const Single *single) {
     if (!make_inputs(pool, single)) {
-        return SINGLE_REFUSED;
+        return false;
     }
     keep_what_was(pool, single);
-    if (pool_step(pool, call) > 0 || !judge(pool, single, result)) {
-        return SINGLE_TROUBLED;
+    return true;
+}
+
+SingleOutcome single_after(const Pool *pool, const Single *single, size_t troubled,
+                           SingleResult *result) {
+    ++*single->step_count; /* whatever becomes of the step */
+    return troubled == 0 && judge(pool, single, result) ? SINGLE_DONE : SINGLE_TROUBLED;
+}
+
+SingleOutcome single_step(Pool *pool, const Single *single, const Call *call,
+                          SingleResult *result) {
+    if (!single_before(pool, single)) {
+        return SINGLE_REFUSED;
     }
-    return SINGLE_DONE;
+    return single_after(pool, single, pool_step(pool, call), result);
 }

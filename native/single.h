@@ -45,4 +45,10 @@ typedef struct {
 SingleOutcome single_step(Pool *pool, const Single *single, const Call *call,
                           SingleResult *result);
 
+/* The two parts of it, around a step that is done elsewhere. The first returns false instead of
+ * SINGLE_REFUSED. The second takes how many instances had trouble in the step. */
+bool single_before(const Pool *pool, const Single *single);
+SingleOutcome single_after(const Pool *pool, const Single *single, size_t troubled,
+                           SingleResult *result);
+
 #endif

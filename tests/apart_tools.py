@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from process_tools import faulty_fmu, start_values
+from process_tools import start_values
 from system_tools import linear, linear_fmu, system
 
 import fmugym
@@ -38,11 +38,6 @@ def compiled(tmp_path_factory):
     """The FMU of linear equations by FMI version."""
     folder = tmp_path_factory.mktemp("linear")
     return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
-
-
-@pytest.fixture(scope="module", name="faulty")
-def compiled_faulty(tmp_path_factory):
-    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
 
 
 @pytest.fixture(name="make")

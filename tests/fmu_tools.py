@@ -203,6 +203,17 @@ def probe_fmu(folder, version=2, edits=None, **keywords):
     return edited_fmu(path, folder, edits, **keywords) if edits or keywords else path
 
 
+CLAIMING_DERIVATIVES = {
+    'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="true"',
+    "<ModelStructure/>": '<ModelStructure><Derivatives><Unknown index="9"/></Derivatives>'
+                         "</ModelStructure>",
+    '<ScalarVariable name="mix" valueReference="10" causality="output" '
+    'variability="continuous"><Real ': '<ScalarVariable name="mix" valueReference="10" '
+    'causality="output" variability="continuous"><Real derivative="10"',
+}  # fmt: skip
+"""Edits of the probe by which it claims to provide derivatives."""
+
+
 def edited_fmu(source, folder, edits=None, *, drop=(), add=None):
     """Copy an FMU with changes.
 

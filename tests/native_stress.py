@@ -40,6 +40,8 @@ PATIENCE = 120.0
 """Seconds after which a call counts as one that never returns."""
 
 counts = collections.Counter()
+ending = threading.Event()
+"""Set when the interpreter is about to end: receivers are silent then, and temporary files go."""
 
 
 def code(*rows):
@@ -112,6 +114,8 @@ class Receiver(logging.Handler):
         self.pool = None
 
     def emit(self, record):
+        if ending.is_set():  # nobody catches what is raised while pools close at the end
+            return
         dice = self._rng.random()
         if dice < 0.05:
             raise ReceiverError("a receiver fails")
@@ -377,7 +381,7 @@ class Crowd:
     """
 
     def __init__(self, ring, seed, end):
-        self.trouble, self.ending = [], threading.Event()
+        self.trouble = []
         self._ring, self._seed, self._end = ring, seed, end
         self._threads = [
             threading.Thread(target=self._loop, args=[i], daemon=True) for i in range(THREADS)
@@ -388,7 +392,7 @@ class Crowd:
     def join(self):
         for thread in self._threads[1::2]:
             thread.join()
-        self.ending.set()
+        ending.set()
 
     def _loop(self, number):
         rng = np.random.default_rng([self._seed, number])
@@ -396,7 +400,7 @@ class Crowd:
             while number % 2 == 0 or time.monotonic() < self._end:
                 self._ring.act(rng)
         except BaseException as error:
-            if not self.ending.is_set():  # temporary files go at the end
+            if not ending.is_set():
                 self.trouble.append(repr(error))
 
 

@@ -4,10 +4,12 @@ import contextlib
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import building
 import fmu_tools
+import pytest
 
 import fmugym
 
@@ -127,3 +129,37 @@ def no_descriptors_left(left=0):
         for descriptor in taken:
             os.close(descriptor)
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+posix_only = pytest.mark.skipif(os.name != "posix", reason="needs signals and forks")
+
+
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@pytest.fixture(name="faulty", scope="module")
+def fixture_faulty(tmp_path_factory):
+    """The FMU of ``faulty.c``."""
+    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(name="opened")
+def fixture_opened():
+    """Closes what is entered into it."""
+    with contextlib.ExitStack() as stack:
+        yield lambda closable: stack.enter_context(contextlib.closing(closable))
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition, seconds=20.0):
+    """Wait for what is bound to happen soon."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -4,6 +4,7 @@ The tests expect it, and docs/reliability.md tells it: ``python quirk_table.py``
 The FMUs are those of ``zoo/quirks.c``.
 """
 
+import functools
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -175,6 +176,16 @@ def quirk_fmu(folder, version, token):
         files = {name.replace("/", "\\"): content for name, content in files.items()}
         fmu_tools.write_fmu(path, files)
     return path
+
+
+def making_quirks(folder):
+    """A function of a token and an FMI version that writes each FMU once."""
+
+    @functools.cache
+    def make(token, version=2):
+        return quirk_fmu(folder / f"{token} {version}", version, token)
+
+    return make
 
 
 def markdown():

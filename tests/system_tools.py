@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from fmugym import bundled_fmu
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.local import local_pool
 from fmugym.systems import FMUSystem
@@ -103,6 +104,31 @@ def system(components, links, loop=None, name="system", **options):
     else:
         groups, evaluations = (Group(names, loop),), (Evaluation(tuple(range(len(links))), loop),)
     return SystemPlan(name, tuple(components), links, groups, evaluations, **options)
+
+
+# A damper of its own turns the pendulum without friction into the one with friction.
+
+FRICTION = 0.004  # N m s
+
+
+def _pendulum(damping):
+    starts = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0), ("b", damping))
+    return Component("pendulum", bundled_fmu("Pendulum"), starts=starts)
+
+
+def whole_pendulum():
+    """The pendulum with friction, in one part."""
+    return system([_pendulum(FRICTION)], ())
+
+
+def parted_pendulum(linear_path):
+    """The same in two parts."""
+    damper = linear("damper", linear_path, d=[[-FRICTION, 0], [0, 0]])
+    links = (
+        Link("pendulum", "theta_dot", "damper", "u1"),
+        Link("damper", "y1", "pendulum", "tau"),
+    )
+    return system([_pendulum(0.0), damper], links)
 
 
 # Two masses between springs, coupled by a spring with a damper.

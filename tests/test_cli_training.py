@@ -144,6 +144,22 @@ class TestTrain:
         assert code == 1
         assert "exists" in err
 
+    def test_no_agent_is_evaluated_twice(self, tmp_path, capsys):
+        """PPO learns after every 128 steps here, and an evaluation is due after every 16."""
+        folder = tmp_path / "agent"
+        options = "--steps", "160", "--envs", "4", "--episodes", "1", "--output", folder
+        code, _, err = run(capsys, "train", CART_POLE, "n_steps=32", *options)
+        assert code == 0
+        assert "n_steps" not in err
+        rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
+        assert [int(row["steps"]) for row in rows] == [16, 132, 256]
+
+    def test_a_rollout_that_is_longer_than_the_training_is_told(self, tmp_path, capsys):
+        options = "--steps", "100", "--envs", "2", "--episodes", "1", "--output", tmp_path / "a"
+        code, _, err = run(capsys, "train", CART_POLE, "n_steps=64", *options)
+        assert code == 0
+        assert "128 steps (n_steps=64 in 2 environments)" in err
+
     def test_scenarios_are_the_evaluation(self, tmp_path, capsys):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         arguments = "learning_starts=10", "train_freq=20"

@@ -12,6 +12,7 @@ import fmu_tools
 import numpy as np
 import pytest
 from fmpy.fmi3 import FMU3Model
+from pool_kinds import POOLS
 
 from fmugym import FMU, FMULoadError
 from fmugym import pool as pools
@@ -21,13 +22,8 @@ from fmugym.pool import PoolSpec
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
-OPTIONS = {
-    "python": {"backend": "python"},
-    "native": {"backend": "native"},
-    "process": {"backend": "auto", "isolation": "process", "workers": 1},
-}
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
-all_kinds = pytest.mark.parametrize("kind", list(OPTIONS))
+all_kinds = pytest.mark.parametrize("kind", list(POOLS))
 both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
@@ -47,7 +43,7 @@ def open_pool(path, kind, step, outputs):
         pytest.skip("the C extension was not built")
     fmu = FMU(path, probe_timeout=None)
     spec = PoolSpec((), tuple(map(fmu.variable, outputs)), time_step=step)
-    return closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS[kind]))
+    return closing(opening.make_pool(fmu, spec, 1, LOG, **POOLS[kind]))
 
 
 def last_tick(name, until):

@@ -29,7 +29,7 @@ class Precise(fmugym.FMUEnv):
         "q_dot_0": 0.0,
     }
 
-    def __init__(self, **changes):
+    def __init__(self, *, fmu=None, isolation=None, **changes):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
@@ -37,8 +37,7 @@ class Precise(fmugym.FMUEnv):
             "bounds": {"tau": (-0.02, 0.02)},
             "time_step": DT,
         }
-        isolation = changes.pop("isolation", None)
-        fmu = fmugym.bundled_fmu("Pendulum", self.version)
+        fmu = fmu or fmugym.bundled_fmu("Pendulum", self.version)
         super().__init__(fmu, config | changes, isolation=isolation)
 
     def _get_observation_space(self):

@@ -10,6 +10,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
+from pool_kinds import POOLS
 
 import fmugym
 from fmugym import FMU, ConfigError
@@ -19,15 +20,10 @@ from fmugym.tools.skeleton import Skeleton
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
-OPTIONS = {
-    "python": {"backend": "python"},
-    "native": {"backend": "native"},
-    "process": {"backend": "auto", "isolation": "process", "workers": 1},
-}
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
-all_kinds = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
+all_kinds = pytest.mark.parametrize("kind", [*POOLS, "wine"])
 both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
@@ -67,7 +63,7 @@ def make_pool(request, fmu_path):
             time_step=step,
             **spec,
         )
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
+        pool = opening.make_pool(fmu, spec, n, LOG, **POOLS.get(kind, {}))
         pool.variable = fmu.variable
         made.append(pool)
         return pool
@@ -178,7 +174,7 @@ class TestEarlyReturn:
             )
             fmu = FMU(path, probe_timeout=None)
             spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=size)
-            with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS.get(kind, {}))) as pool:
+            with closing(opening.make_pool(fmu, spec, 2, LOG, **POOLS.get(kind, {}))) as pool:
                 pool.variable = fmu.variable
                 start(pool)
                 ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
@@ -193,7 +189,7 @@ class TestEarlyReturn:
         given = {"constant": ' intervalDecimal="0.1"', "fixed": ' intervalCounter="1"'}[name]
         fmu = FMU(fmu_tools.edited_fmu(fmu_path(), tmp_path, {given: ""}), probe_timeout=None)
         spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1)
-        with closing(opening.make_pool(fmu, spec, 1, LOG, **OPTIONS.get(kind, {}))) as pool:
+        with closing(opening.make_pool(fmu, spec, 1, LOG, **POOLS.get(kind, {}))) as pool:
             pool.reset((), np.zeros((0, 1)))
             reference = list(clocks_tools.CLOCKS).index(name)
             assert f"value reference {reference} has an interval of nan" in pool.failure(0)
@@ -274,7 +270,7 @@ class TestStates:
         if not pools.has_native_pool():
             pytest.skip("the C extension was not built")
         rows = {}
-        for kind in OPTIONS:
+        for kind in POOLS:
             inputs = ("strike", "command", "pace")
             pool = start(make_pool(kind, interface, 2, inputs, COUNTS + LASTS, 0.17))
             random = np.random.default_rng(2)

@@ -8,6 +8,7 @@ import exchange_tools
 import numpy as np
 import pytest
 import wine_tools
+from pool_kinds import POOLS
 
 import fmugym
 from fmugym import FMU, ConfigError
@@ -17,16 +18,11 @@ from fmugym.pool.spec import whole_number_of_steps
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
-OPTIONS = {
-    "python": {"backend": "python"},
-    "native": {"backend": "native"},
-    "process": {"backend": "auto", "isolation": "process", "workers": 1},
-}
 ABLE = 'canInterpolateInputs="true"'
 EULER = 1e-3  # the step of the FMUs
 H = 0.1
 both_versions = pytest.mark.parametrize("version", [1, 2])
-all_kinds = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
+all_kinds = pytest.mark.parametrize("kind", [*POOLS, "wine"])
 
 
 class Env(fmugym.FMUEnv):
@@ -68,7 +64,7 @@ def make_pool(request, fmu_path):
         fmu = FMU(path, probe_timeout=None)
         u = fmu.variable("u")
         spec = PoolSpec((u,), (fmu.variable("x"),), H, ramped=(u,), **spec)
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
+        pool = opening.make_pool(fmu, spec, n, LOG, **POOLS.get(kind, {}))
         pool.k = fmu.variable("k")
         made.append(pool)
         return pool
@@ -125,7 +121,7 @@ def test_all_pools_give_the_same_numbers(make_pool, version):
     if not pools.has_native_pool():
         pytest.skip("the C extension was not built")
     rows = []
-    for kind in OPTIONS:
+    for kind in POOLS:
         pool = make_pool(kind, version, substeps=3)
         pool.reset((), np.zeros((0, 2)))
         random = np.random.default_rng(2)

@@ -7,7 +7,7 @@ import exchange_tools
 import foreign_tank
 import numpy as np
 import pytest
-from fmu_tools import edited_fmu, probe_fmu
+from fmu_tools import CLAIMING_DERIVATIVES, edited_fmu, probe_fmu
 from pythonfmu.builder import FmuBuilder
 from scipy.linalg import expm
 
@@ -179,15 +179,7 @@ def test_a_derivative_of_no_named_state_is_left_out(tmp_path):
 
 def test_an_fmu_that_fails(tmp_path, temp_root):
     """The probe claims to provide derivatives; its String is set before it fails."""
-    edits = {
-        'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="true"',
-        "<ModelStructure/>": '<ModelStructure><Derivatives><Unknown index="9"/></Derivatives>'
-                             "</ModelStructure>",
-        '<ScalarVariable name="mix" valueReference="10" causality="output" '
-        'variability="continuous"><Real ': '<ScalarVariable name="mix" valueReference="10" '
-        'causality="output" variability="continuous"><Real derivative="10"',
-    }  # fmt: skip
-    path = probe_fmu(tmp_path, edits=edits)
+    path = probe_fmu(tmp_path, edits=CLAIMING_DERIVATIVES)
     with pytest.raises(fmugym.SimulationError, match="the derivative by 'sum' returned Error"):
         fmugym.linearize(path, at={"label": "derived", "gain": 2.0})
     with pytest.raises(fmugym.SimulationError, match="initialization returned Error"):

@@ -10,6 +10,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
+from pool_kinds import POOLS
 from scipy.integrate import solve_ivp
 
 import fmugym
@@ -24,11 +25,6 @@ from fmugym.tools.skeleton import Skeleton
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
-OPTIONS = {
-    "python": {"backend": "python"},
-    "native": {"backend": "native"},
-    "process": {"backend": "auto", "isolation": "process", "workers": 1},
-}
 DERIVATIVES = 'providesDirectionalDerivative="true"'
 all_solvers = pytest.mark.parametrize("solver", SOLVERS)
 all_versions = pytest.mark.parametrize("version", [1, 2, 3])
@@ -69,7 +65,7 @@ def make_pool(request, fmu_path):
             time_step=step,
             **spec,
         )
-        pool = opening.make_pool(fmu, spec, n, LOG, **OPTIONS.get(kind, {}))
+        pool = opening.make_pool(fmu, spec, n, LOG, **POOLS.get(kind, {}))
         pool.variable = fmu.variable
         made.append(pool)
         return pool
@@ -411,7 +407,7 @@ def test_linear_models(fmu_path, version):
 class TestPools:
     """The contract of ``fmugym.pool.base`` for pools of model exchange."""
 
-    every_kind = pytest.mark.parametrize("kind", [*OPTIONS, "wine"])
+    every_kind = pytest.mark.parametrize("kind", [*POOLS, "wine"])
     CASES = (
         ("ball", [], ["h", "v", "bounces"], "h", "dormand_prince"),
         ("circuit", ["duty"], ["voltage", "discharges"], "limit", "rk4"),

@@ -108,6 +108,25 @@ class TestRecords:
         assert (second.names, second.starts.tolist()) == (("x_0",), [0.5])
         assert second.inputs[:, 0].tolist() == [*range(40), 9.0]
 
+    def test_are_each_of_their_own_episode(self, pool):
+        """However the steps of neighbours are shifted against each other."""
+        n, rng, fmu = 300, np.random.default_rng(0), FMU(bundled_fmu("CartPole"))
+        spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+        many = NativePool(fmu, spec, n, LOG, threads=2)
+        starting, given = np.ones(n, np.bool_), [[] for _ in range(n)]
+        for step in range(100):
+            many.reset((fmu.variable("x_0"),), np.full((1, n), 0.001 * step), starting)
+            given = [[] if anew else own for anew, own in zip(starting, given, strict=True)]
+            inputs, skipped = rng.normal(size=(1, n)), rng.random(n) < 0.02
+            many.step(inputs, skipped)
+            for index in np.flatnonzero(~skipped):
+                given[index].append(inputs[0, index])
+            starting = rng.random(n) < 0.005
+        assert max(map(len, given)) > 64 > min(map(len, given))
+        for index, own in enumerate(given):
+            assert many.record_of(index).inputs[:, 0].tolist() == own
+        many.close()
+
     @pytest.mark.parametrize(
         ("index", "starts", "inputs", "steps"),
         [

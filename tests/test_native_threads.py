@@ -46,6 +46,7 @@ def test_stress(options):
     """A short form of what ``sanitize.py`` does with sanitizers."""
     done = run_python(str(HERE / "native_stress.py"), "3", *options)
     assert done.returncode == 0, done.stderr[-3000:]
+    assert "Traceback" not in done.stderr
     assert json.loads(done.stdout.splitlines()[-1])["played"] > 10
 
 

@@ -52,7 +52,7 @@ def make_pool(request, tmp_path):
     if in_wine:
         request.getfixturevalue("wine")
         monkeypatch = request.getfixturevalue("monkeypatch")
-        monkeypatch.setattr("fmugym.archive.fmu.is_bundled", is_bundled_or_copy)
+        monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
     made = []
 
     def make(path, inputs, outputs, num_instances=1, time_step=0.1, **spec):
@@ -542,6 +542,8 @@ class TestFaults:
         _, status = pool.restore(pool.save())
         assert status.tolist() == [Status.ERROR]
         assert "restoring the FMU state returned Error" in pool.failure(0)
+        assert step(pool)[1].tolist() == [Status.ERROR]
+        assert "needs a reset" in pool.failure(0)
         self.assert_sound(pool)
 
     @with_state

@@ -25,6 +25,7 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
+from fmugym.trial import plan as trial_plan
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
 from fmugym.trial.trial import examine
@@ -61,13 +62,7 @@ class QuirkEnv(fmugym.FMUEnv):
 
 @pytest.fixture(scope="module")
 def make_fmu(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("quirks")
-
-    @functools.cache
-    def make(token, version=2):
-        return quirk_table.quirk_fmu(folder / f"{token} {version}", version, token)
-
-    return make
+    return quirk_table.making_quirks(tmp_path_factory.mktemp("quirks"))
 
 
 @pytest.fixture(autouse=True)
@@ -169,7 +164,14 @@ class TestEpisodes:
         assert_vector_right(envs, path, gains)
 
 
+@pytest.fixture
+def nothing_warned(monkeypatch):
+    """A process that has not warned of any FMU yet."""
+    monkeypatch.setattr(trial_plan, "_warned", set())
+
+
 @cases
+@pytest.mark.usefixtures("nothing_warned")
 def test_verdict(make_fmu, version, quirk, caplog):
     """What several instances need, and what the log tells."""
     path = make_fmu(quirk.token, version)
@@ -296,10 +298,21 @@ def test_inputs_stay_within_their_limits(make_fmu):
     assert np.all((np.array(rows) >= -0.5) & (np.array(rows) <= 0.25))
 
 
+@pytest.mark.usefixtures("nothing_warned")
 def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
     env = QuirkEnv(make_fmu("noise"))
     assert "gives other outputs each time, even if it begins afresh" in caplog.text
     env.close()
+
+
+@pytest.mark.usefixtures("nothing_warned")
+def test_many_environments_warn_once(make_fmu, caplog):
+    """A training makes environments again and again, for its evaluations."""
+    for _ in range(3):
+        QuirkEnv(make_fmu("reset does nothing")).close()
+    warnings = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
+    assert quirk_table.BAD_RESET in warnings[0].getMessage()
 
 
 class TestConfig:

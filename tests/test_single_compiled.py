@@ -428,12 +428,6 @@ class TestWays:
             env.reset(seed=0)
         env.close()
 
-    def test_worker_processes_run_no_compiled_hooks(self):
-        env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
-        with pytest.raises(ConfigError, match="pool"):
-            env.reset(seed=0)
-        env.close()
-
     def test_names(self):
         with pytest.raises(ConfigError, match="compiled"):
             fmugym.envs.CartPoleEnv(hooks="compild")

@@ -5,8 +5,9 @@ from itertools import pairwise
 
 import pytest
 
+from fmugym.fmi.equations import Equations, Events
 from fmugym.fmi.methods import METHODS
-from fmugym.fmi.solver import Equations, Events, Solver, Solving
+from fmugym.fmi.solver import Solver, Solving
 
 ORDERS = {"euler": 1, "rk4": 4, "dormand_prince": 5, "rosenbrock": 5}
 

@@ -1,6 +1,7 @@
 """Strings that FMUs give: monitored, so that hooks read them as texts."""
 
 import contextlib
+import importlib.util
 import logging
 import os
 import pickle
@@ -17,7 +18,7 @@ import wine_tools
 from pythonfmu import FmuBuilder
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv
+from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of
 from fmugym.pool import PoolSpec, has_native_pool
@@ -250,6 +251,26 @@ def test_a_backend_gives_texts(feedthrough):
     env.close()
 
 
+@pytest.mark.parametrize(
+    ("given", "facts"),
+    [
+        ({"String_told": 3.0}, "'String_told'.*String.*3.0"),
+        ({"String_told": None}, "'String_told'.*String.*None"),
+        ({"length": "one"}, "'one'"),
+    ],
+)
+def test_a_backend_that_mixes_texts_and_numbers_fails(feedthrough, given, facts):
+    class Mixed(Rig):
+        def outputs(self):
+            return super().outputs() | given
+
+    changes = {"words": "abc", "monitor_names": ["String_told"]}
+    env = test_strings.Reading(feedthrough[3], backend=Mixed(), **changes)
+    with pytest.raises(SimulationError, match=facts):
+        env.reset()
+    env.close()
+
+
 def test_long_and_foreign_texts(feedthrough):
     texts = ["x" * 199, "日本語", "\n\t"]
     for backend in ("native", "python"):
@@ -264,6 +285,16 @@ def test_numbers_of_texts():
     """Those of FNV-1a, folded: the published hashes of two texts of its authors."""
     fold = [(h >> 53) ^ (h % 2**53) for h in (0xCBF29CE484222325, 0x85944171F73967E8)]
     assert [number_of(""), number_of("foobar")] == fold
+
+
+def test_nobody_is_asked_for_an_empty_text():
+    """A question to worker processes would take its time in each step."""
+    spec = importlib.util.find_spec("fmugym.archive.texts")
+    fresh, asked = importlib.util.module_from_spec(spec), []
+    spec.loader.exec_module(fresh)
+    fresh.ask_for_texts(asked.append)
+    assert [fresh.text_of(number_of(text)) for text in ("", "never met")] == ["", ""]
+    assert asked == [number_of("never met")]
 
 
 def test_series_leave_texts_out(feedthrough):

@@ -18,9 +18,11 @@ from system_tools import (
     linear,
     linear_fmu,
     masses,
+    parted_pendulum,
     play,
     system,
     tank,
+    whole_pendulum,
 )
 
 import fmugym
@@ -257,20 +259,11 @@ class TestLoops:
 
 @by_each_master
 def test_the_pendulum_in_two_parts_comes_near_the_whole(make, fmus, master):
-    """A damper of its own turns the pendulum without friction into the one with friction."""
-    path, damping, errors = bundled_fmu("Pendulum"), 0.004, []
-    starts = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0))
+    errors, plans = [], (whole_pendulum(), replace(parted_pendulum(fmus[2]), master=master))
     for count in (100, 200, 400):
-        whole = Component("pendulum", path, starts=(*starts, ("b", damping)))
-        free = Component("pendulum", path, starts=(*starts, ("b", 0.0)))
-        damper = linear("damper", fmus[2], d=[[-damping, 0], [0, 0]])
-        links = (
-            Link("pendulum", "theta_dot", "damper", "u1"),
-            Link("damper", "y1", "pendulum", "tau"),
-        )
         rows = [
             play(make(plan, (), ["pendulum.theta_dot"], time_step=1.0 / count), count)
-            for plan in (system([whole], ()), system([free, damper], links, master=master))
+            for plan in plans
         ]
         errors.append(np.abs(rows[0] - rows[1]).max())
     assert np.abs(rows[0]).max() > 1.0

@@ -15,13 +15,13 @@ from apart_tools import (  # noqa: F401  # some are fixtures
     chain,
     closing_pools,
     compiled,
-    compiled_faulty,
     episodes,
     play,
     reset,
     where_they_run,
     with_fault,
 )
+from process_tools import fixture_faulty  # noqa: F401  # the fixture "faulty"
 from system_tools import masses, system
 
 import fmugym

@@ -23,9 +23,11 @@ from system_tools import (
     linear_fmu,
     masses,
     masses_exactly,
+    parted_pendulum,
     system,
     tank,
     tank_exactly,
+    whole_pendulum,
 )
 from test_systems import pendulums
 
@@ -36,7 +38,7 @@ from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import MASTERS, Component, Control, Link, Loop
+from fmugym.systems.plan import MASTERS, Control, Link, Loop
 
 STATISTICS = ("master.steps", "master.rejected_steps", "master.step_size", "master.error")
 
@@ -169,18 +171,9 @@ class TestAgainstClosedForms:
 
     @in_each_engine
     def test_the_pendulum_in_two_parts_comes_near_the_whole(self, fmus, native):
-        """A damper of its own turns the pendulum without friction into the one with friction."""
-        starts, damping = (("q_0", 0.5), ("c", 0.0), ("solver", 3.0)), 0.004
-        path, name = bundled_fmu("Pendulum"), "pendulum.theta_dot"
-        whole = Component("pendulum", path, starts=(*starts, ("b", damping)))
-        free = Component("pendulum", path, starts=(*starts, ("b", 0.0)))
-        damper = linear("damper", fmus[2], d=[[-damping, 0], [0, 0]])
-        links = (
-            Link("pendulum", "theta_dot", "damper", "u1"),
-            Link("damper", "y1", "pendulum", "tau"),
-        )
-        right = run(system([whole], ()), [name], 0.0025, 400, native)[::40]
-        plans = [controlled(system([free, damper], links), x) for x in (1e-3, 1e-5)]
+        name = "pendulum.theta_dot"
+        right = run(whole_pendulum(), [name], 0.0025, 400, native)[::40]
+        plans = [controlled(parted_pendulum(fmus[2]), x) for x in (1e-3, 1e-5)]
         errors = [np.abs(run(one, [name], 0.1, 10, native) - right).max() for one in plans]
         assert np.abs(right).max() > 1.0
         assert 5 < errors[0] / errors[1] < 20

@@ -3,7 +3,6 @@
 The FMUs are those of ``zoo/quirks.c``; what is right is an episode of a fresh system.
 """
 
-import functools
 import itertools
 import logging
 import os
@@ -39,13 +38,7 @@ LENGTHS = (3, 25, 25, 4, 25, 25, 25, 3, 25, 25)
 
 @pytest.fixture(scope="module", name="fmu_of")
 def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("components")
-
-    @functools.cache
-    def make(token, version=2):
-        return quirk_table.quirk_fmu(folder / f"{token} {version}", version, token)
-
-    return make
+    return quirk_table.making_quirks(tmp_path_factory.mktemp("components"))
 
 
 @pytest.fixture(autouse=True)

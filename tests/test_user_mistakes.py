@@ -1,5 +1,6 @@
 """Every mistake of a user: the class of the error, its text, and that nothing stays behind."""
 
+import copy
 import math
 import pickle
 
@@ -10,7 +11,25 @@ from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, write_fmu
 from gymnasium import spaces
 
 import fmugym
-from fmugym import ConfigError, FMI1CSEnv, FMI2CSEnv, FMI3CSEnv, FMULoadError, SimulationError
+from fmugym import (
+    FMU,
+    ArchiveLimits,
+    Choice,
+    Component,
+    ConfigError,
+    Connection,
+    EnvConfig,
+    FMI1CSEnv,
+    FMI2CSEnv,
+    FMI3CSEnv,
+    FMULoadError,
+    FMUSystem,
+    SimulationError,
+    Uniform,
+    bundled_fmu,
+)
+from fmugym.baselines import PID
+from fmugym.errors import ArgumentError
 
 
 def at_construction(error, match, **changes):
@@ -142,6 +161,66 @@ def test_unknown_arguments_are_type_errors_of_the_family(make, names):
     assert isinstance(caught.value, fmugym.ConfigError)
     assert all(name in str(caught.value) for name in names)
     assert isinstance(pickle.loads(pickle.dumps(caught.value)), TypeError)
+
+
+@pytest.mark.parametrize(
+    ("make", "given", "nearest"),
+    [
+        (lambda: Component("a.fmu", isolated=True), "isolated", "isolate"),
+        (lambda: Connection("a.y", "b.u", gaim=2), "gaim", "gain"),
+        (lambda: FMU("a.fmu", sise={}), "sise", "sizes"),
+        (lambda: ArchiveLimits(max_entry=3), "max_entry", "max_entries"),
+        (lambda: Uniform(lo=0, high=1), "lo", "low"),
+        (lambda: Choice([1, 2], probability=[1, 0]), "probability", "probabilities"),
+        (lambda: PID("y", 1.0, offsett=2), "offsett", "offset"),
+    ],
+)
+def test_misspelt_arguments_of_constructors(make, given, nearest):
+    with pytest.raises(ArgumentError, match=f"'{given}'.*'{nearest}'"):
+        make()
+
+
+def test_arguments_of_constructors_survive_copies():
+    connection = Connection("a.y", "b.u", gain=2)
+    for copied in (pickle.loads(pickle.dumps(connection)), copy.deepcopy(connection)):
+        assert copied == connection
+
+
+@pytest.mark.parametrize("true", [True, np.True_, np.array(True)])
+@pytest.mark.parametrize(
+    ("make", "name"),
+    [
+        (lambda true: EnvConfig.from_dict(probe_config(time_step=true)), "time_step"),
+        (lambda true: EnvConfig.from_dict(probe_config(start_time=true)), "start_time"),
+        (lambda true: FMUSystem({"a": bundled_fmu("CartPole")}, error_tolerance=true), "error_tol"),
+        (lambda true: Connection("a.y", "b.u", gain=true), "gain"),
+        (lambda true: Component("a.fmu", steps=true), "steps"),
+        (lambda true: Uniform(true, 2), "low"),
+        (lambda true: PID("y", 1.0, kp=true), "kp"),
+        (lambda true: bundled_fmu("CartPole", true), "version"),
+    ],
+)
+def test_true_is_no_number(make, name, true):
+    with pytest.raises(ConfigError, match=f"{name}.*True"):
+        make(true)
+
+
+def test_true_is_a_number_where_a_variable_may_be_a_boolean():
+    flags = {"on": True, "off": Choice([True])}
+    config = EnvConfig.from_dict(
+        probe_config(episode_variables=flags, bounds={"mix": (False, True)})
+    )
+    assert config.bounds["mix"] == (0.0, 1.0)
+    assert config.episode_variables["on"] == 1.0
+    assert config.episode_variables["off"].sample(np.random.default_rng(0)) == 1.0
+
+
+def test_names_in_bounds_are_listed_in_the_order_of_the_config(probe):
+    """Texts hash anew in each process, so the order of a set would change."""
+    names = ["steps", "mix", "sum", "mode"]
+    config = probe_config(model_output_names=names, bounds={"zzz": (0, 1)})
+    with pytest.raises(ConfigError, match=r"'zzz'.*'a', 'steps', 'mix', 'sum', 'mode'"):
+        PlainEnv(probe(2), config)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.0, 0.5, "1", True, [1], np.ones(2), np.array([1]), 1j, {}])

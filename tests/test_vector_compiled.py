@@ -1,5 +1,6 @@
 """Compiled hooks of vector environments are those of numbers, or are not compiled."""
 
+import contextlib
 import re
 import signal
 
@@ -26,6 +27,7 @@ from fmugym import ConfigError, Uniform
 from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.trace import trace_hooks
 
 needs_native = pytest.mark.skipif(
@@ -47,6 +49,46 @@ def test_what_cannot_be_compiled_is_left_to_numpy(backend):
     require_pair_equal(Branching, hooks="auto", backend=backend, rtol=1e-12)
     with pytest.raises(ConfigError, match="cannot be compiled"):
         FMUVectorEnv(Branching, 2, hooks="compiled", backend=backend)
+
+
+@needs_native
+@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="Windows has no signals of users")
+@pytest.mark.parametrize("moment", ["construction", "assignment"])
+def test_the_exception_of_a_signal_handler_is_not_that_of_a_hook(moment):
+    """A time limit of the caller must not pass for a hook that cannot be compiled."""
+
+    def ring(*_):
+        raise TimeoutError("it takes too long")
+
+    class Late(PushedCart):
+        weight = 1.0
+        rings = moment == "construction"
+
+        def _reward_policy(self):
+            if isinstance(self.state, Symbols) and type(self).rings:
+                signal.raise_signal(signal.SIGUSR1)
+            return self.weight * super()._reward_policy()
+
+    usual = signal.signal(signal.SIGUSR1, ring)
+    try:
+        if moment == "construction":
+            with pytest.raises(TimeoutError):
+                FMUVectorEnv(Late, 2)
+            return
+        with contextlib.closing(FMUVectorEnv(Late, 2)) as envs:
+            action = np.zeros(envs.action_space.shape, envs.action_space.dtype)
+            rewards = []
+            for weight in (1.0, 2.0):
+                envs.reset(seed=1)
+                if weight != 1.0:
+                    Late.rings = True
+                    with pytest.raises(TimeoutError):
+                        envs.set_attr("weight", weight)
+                rewards.append(envs.step(action)[1])
+            assert (rewards[1] == 2.0 * rewards[0]).all()
+            assert rewards[0].all()
+    finally:
+        signal.signal(signal.SIGUSR1, usual)
 
 
 @needs_native

@@ -6,7 +6,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import test_array_derivatives
-from test_derivatives import DT, HORIZON, Precise
+from test_derivatives import HORIZON, Precise
 from test_linearization import POINTS
 from test_trajectories import STARTS, TORQUES, along
 from wine_tools import building_for_windows, exchange_fmu, for_windows
@@ -15,18 +15,6 @@ import fmugym
 from fmugym import SimulationError, bundled_fmu, linearize
 
 PARTS = ("A", "B", "f", "x0", "u0")
-
-
-class PreciseInWine(Precise):
-    def __init__(self, path):
-        config = {
-            "model_input_names": "tau",
-            "model_output_names": ["q", "q_dot"],
-            "model_parameters": self.parameters,
-            "bounds": {"tau": (-0.02, 0.02)},
-            "time_step": DT,
-        }
-        fmugym.FMUEnv.__init__(self, path, config)
 
 
 @pytest.mark.usefixtures("wine")
@@ -76,16 +64,8 @@ class TestInWine:
             test_array_derivatives.test_some_elements(tmp_path, kind)
 
     def test_an_fmu_that_fails(self, tmp_path):
-        flag = ' providesDirectionalDerivative="true"'
-        edits = {
-            'modelIdentifier="Probe"': f'modelIdentifier="Probe"{flag}',
-            "<ModelStructure/>": '<ModelStructure><Derivatives><Unknown index="9"/></Derivatives>'
-                                 "</ModelStructure>",
-            '<ScalarVariable name="mix" valueReference="10" causality="output" '
-            'variability="continuous"><Real ': '<ScalarVariable name="mix" valueReference="10" '
-            'causality="output" variability="continuous"><Real derivative="10"',
-        }  # fmt: skip
-        path = for_windows(fmu_tools.probe_fmu(tmp_path, edits=edits), tmp_path)
+        probe = fmu_tools.probe_fmu(tmp_path, edits=fmu_tools.CLAIMING_DERIVATIVES)
+        path = for_windows(probe, tmp_path)
         with pytest.raises(SimulationError, match="a derivative returned Error"):
             linearize(path, at={"label": "derived", "gain": 2.0})
         with pytest.raises(SimulationError, match="initialization returned Error"):
@@ -95,7 +75,7 @@ class TestInWine:
     def test_along_a_trajectory(self, tmp_path, method):
         path = for_windows(bundled_fmu("Pendulum"), tmp_path)
         given = {"states": STARTS} if method == "differences" else {}
-        ours = along(partial(PreciseInWine, path), method=method, **given)
+        ours = along(partial(Precise, fmu=path), method=method, **given)
         native = along(method=method, **given)
         assert ours.A.shape == (HORIZON, 2, 2)
         for part in "ABCDxy":
@@ -106,7 +86,7 @@ class TestInWine:
     def test_of_several_instances_at_their_own_inputs(self, tmp_path):
         """``along`` plays one; here each of three has a state and a torque of its own."""
         path = for_windows(bundled_fmu("Pendulum"), tmp_path)
-        envs = fmugym.FMUVectorEnv(partial(PreciseInWine, path), 3, workers=2)
+        envs = fmugym.FMUVectorEnv(partial(Precise, fmu=path), 3, workers=2)
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(TORQUES[:3])

@@ -24,7 +24,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
-from fmugym.checks import check_count
+from fmugym.checks import KnownArguments, check_count
 from fmugym.errors import FMULoadError, reason
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
@@ -59,7 +59,7 @@ _has_devices = sys.platform == "win32"
 
 
 @dataclass(frozen=True)
-class ArchiveLimits:
+class ArchiveLimits(KnownArguments):
     """How large an FMU may be before it is refused unread.
 
     Attributes:
@@ -72,6 +72,7 @@ class ArchiveLimits:
 
     Raises:
         ConfigError: If a limit is not a positive integer.
+        ArgumentError: If there is no limit of this name; that is a ``TypeError``, too.
     """
 
     max_entries: int = 20_000

@@ -128,3 +128,6 @@ def with_texts(variable: Variable, texts: Sequence[str]) -> Variable:
 @functools.lru_cache(4096)
 def _with_texts(variable: Variable, texts: tuple[str, ...]) -> Variable:
     return replace(variable, items=tuple((text, int(number_of(text))) for text in texts))
+
+
+number_of("")  # nobody has to be asked for the text of an empty String

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.checks import check_number
+from fmugym.checks import KnownArguments, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["Controller", "FloatArray", "Numbers", "Signal", "check_numbers"]
@@ -24,7 +24,7 @@ Signal = str | Numbers
 """An element of the observation by name, or a constant."""
 
 
-class Controller(ABC):
+class Controller(KnownArguments, ABC):
     """A controller of one environment, or of the N environments of a vector environment.
 
     Attributes:
@@ -97,14 +97,14 @@ class Controller(ABC):
 
     # What a controller adds.
 
-    def _prepare(self) -> None:  # noqa: B027 (not every controller needs it)
+    def _prepare(self) -> None:
         """Find what the controller needs in the space and the names."""
 
     @abstractmethod
     def _decide(self, rows: FloatArray) -> FloatArray:
         """Choose the actions for observations of shape (N, k): shape (N,) or (N, m)."""
 
-    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:  # noqa: B027 (as above)
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         """Forget the episodes of some environments."""
 
     # Shared by controllers.

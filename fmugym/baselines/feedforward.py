@@ -70,7 +70,7 @@ class Schedule(Controller):
 
     def __init__(self, actions: Mapping[str, float], start: str = "00:00") -> None:
         times = {
-            _seconds(time): check_number(f"the action at {time}", action)
+            _seconds(time): check_number(f"the action at {time}", action, may_be_boolean=True)
             for time, action in check_mapping("actions", actions).items()
         }
         if not times:

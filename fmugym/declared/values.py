@@ -23,7 +23,7 @@ def number(entry: Entry) -> float:
     with entry.placing():
         if isinstance(entry.value, str):
             return Expression.parse(entry.value).constant()
-        return number_of(entry.name, entry.value)
+        return number_of(entry.name, entry.value, may_be_boolean=True)
 
 
 def number_or_distribution(entry: Entry) -> Any:

@@ -21,9 +21,9 @@ from fmugym.errors import ConfigError
 from fmugym.export.external import found_in
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.functions import exclusive
 from fmugym.vector.hooks.graph import Graph, Node
 from fmugym.vector.hooks.lowering import Store
+from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import loaded
 from fmugym.vector.hooks.tables import tables_in

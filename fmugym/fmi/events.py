@@ -7,8 +7,10 @@ from typing import ClassVar
 
 from fmpy.fmi3 import FMU3Slave
 
-from fmugym.fmi.exchange import ExchangeInstance, FMI3Events
+from fmugym.fmi.exchange import ExchangeInstance
+from fmugym.fmi.exchange_calls import FMI3Events, SetClocked
 from fmugym.fmi.fmi3 import FMI3Instance
+from fmugym.fmi.instance import Instance
 
 __all__ = ["FMI3EventsInstance"]
 
@@ -18,8 +20,8 @@ class _Steps(FMI3Events):
 
     steps_by_itself = True
 
-    def __init__(self, instance: ExchangeInstance) -> None:
-        self._begin(instance)
+    def __init__(self, instance: Instance, set_clocked: SetClocked) -> None:
+        self._begin(instance, set_clocked)
         self.number_of_states = self.number_of_indicators = 0
         self.completes = False
 

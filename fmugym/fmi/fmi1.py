@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from fmpy.fmi1 import FMU1Slave
 
-from fmugym.fmi.instance import Initialize, Instance, Span
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import MessageLog, fmi1_callbacks
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status
 
 _TRUE: Final = b"\x01"

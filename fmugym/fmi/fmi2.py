@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 from fmpy.fmi2 import FMU2Slave
 
-from fmugym.fmi.instance import Initialize, Instance, Span
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import MessageLog, fmi2_callbacks
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status, sane
 
 __all__ = ["FMI2Instance"]

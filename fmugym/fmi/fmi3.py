@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 import numpy as np
 from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback
 
-from fmugym.fmi.instance import Initialize, Instance, Span
+from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import MessageLog, fmi3_log_message
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status
 
 __all__ = ["FMI3Instance"]

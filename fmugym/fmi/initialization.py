@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from fmugym.errors import SimulationError
-from fmugym.fmi.instance import Span
 from fmugym.fmi.kept import KeptStart
 from fmugym.fmi.loops import NotSolvedError, solve_loop
 from fmugym.fmi.parts import FailedError, Part, Parts, carried, shared_out
+from fmugym.fmi.span import Span
 from fmugym.fmi.status import Status
 from fmugym.systems.description import PartVariable
 from fmugym.systems.layout import Route, array_key
@@ -181,9 +181,8 @@ class Initialization:
         part.started = True
         part.instance.exchange = exchange
         try:
-            part.instance.initialize(*span, lambda: self._set_starts(index, values))
-        except SimulationError:
-            raise FailedError(self._parts.status_of(part), part.label) from None
+            with self._parts.blaming(index):
+                part.instance.initialize(*span, lambda: self._set_starts(index, values))
         finally:
             part.instance.exchange = None
 

@@ -13,7 +13,7 @@ import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,68 +21,13 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.derivatives import DerivativeCall
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.solver import Solving
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Phase, Status, sane
 
-__all__ = ["Initialize", "Instance", "SavedState", "Span"]
-
-
-class Span(NamedTuple):
-    """The data that the FMU gets at the start of a simulation; see ``Instance.initialize``."""
-
-    start_time: float
-    stop_time: float | None
-    tolerance: float | None
-
-    @property
-    def times(self) -> tuple[float, bool, float]:
-        """Start time, whether there is a stop time, and the stop time."""
-        return self.start_time, self.stop_time is not None, self.stop_time or 0.0
-
-    @property
-    def tolerances(self) -> tuple[bool, float]:
-        """Whether there is a tolerance, and the tolerance."""
-        return self.tolerance is not None, self.tolerance or 0.0
-
-
-Initialize = Callable[[Span, Callable[[], None]], None]
-"""Takes the span of the simulation and the function that sets the start values."""
-
-
-class _Moved(NamedTuple):
-    """Variables as FMI moves them: each array as a whole, and once.
-
-    Attributes:
-        references: The value references.
-        places: Where the value of each variable is among all values.
-        size: The number of these.
-    """
-
-    references: npt.NDArray[np.uint32]
-    places: list[int]
-    size: int
-
-    @classmethod
-    def of(cls, variables: Sequence[Variable]) -> _Moved:
-        """Find the places of variables."""
-        firsts: dict[Any, int] = {}
-        references, places, size = [], [], 0
-        for index, variable in enumerate(variables):
-            key = index if variable.array is None else variable.array
-            if key not in firsts:
-                firsts[key] = size
-                references.append(variable.value_reference)
-                size += variable.size
-            places.append(firsts[key] + variable.place)
-        return cls(np.array(references, np.uint32), places, size)
-
-    @property
-    def arguments(self) -> tuple[Any, ...]:
-        """The references and their number, for a call."""
-        return self.references.ctypes.data_as(ctypes.c_void_p), ctypes.c_size_t(
-            len(self.references)
-        )
+__all__ = ["Instance", "SavedState"]
 
 
 class Instance(ABC):
@@ -447,35 +392,18 @@ class Instance(ABC):
         result = np.zeros((len(unknowns), len(knowns)))
         if capabilities.provides_directional_derivatives:
             for column, known in zip(result.T, knowns, strict=True):
-                column[:] = self._derivatives("Directional", unknowns, [known])
+                call = DerivativeCall.directional(unknowns, known, self._trailing_arguments)
+                column[:] = self._derivatives(call)
         else:
             for row, unknown in zip(result, unknowns, strict=True):
-                row[:] = self._derivatives("Adjoint", [unknown], knowns)
+                call = DerivativeCall.adjoint(unknown, knowns, self._trailing_arguments)
+                row[:] = self._derivatives(call)
         return result
 
-    def _derivatives(
-        self, kind: str, unknowns: Sequence[Variable], knowns: Sequence[Variable]
-    ) -> npt.NDArray[np.float64]:
-        """Differentiate all unknowns by one known, or, adjoint, one unknown by all knowns."""
-        seeded, others = (_Moved.of(some) for some in (unknowns, knowns))
-        if kind == "Directional":
-            seeded, others = others, seeded
-        seed, sensitivity = np.zeros(seeded.size), np.zeros(others.size)
-        seed[seeded.places] = 1.0
-        first, second = (seeded, others) if kind == "Adjoint" else (others, seeded)
-        status = self._function(f"Get{kind}Derivative")(
-            self._component,
-            *first.arguments,
-            *second.arguments,
-            seed.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(seeded.size),
-            sensitivity.ctypes.data_as(ctypes.c_void_p),
-            *self._trailing_arguments(others.size),
-        )
-        word = "of" if kind == "Adjoint" else "by"
-        name = (unknowns if kind == "Adjoint" else knowns)[0].name
-        self.check(f"the derivative {word} {name!r}", status)
-        return sensitivity[others.places]
+    def _derivatives(self, call: DerivativeCall) -> npt.NDArray[np.float64]:
+        status = self._function(call.name)(self._component, *call.arguments)
+        self.check(call.doing, status)
+        return call.result
 
     # FMU state, where the FMU offers it (FMI 2.0 and 3.0).
 

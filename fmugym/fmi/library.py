@@ -11,7 +11,7 @@ from typing import Any, Final
 import fmpy
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.events import FMI3EventsInstance
 from fmugym.fmi.exchange import (

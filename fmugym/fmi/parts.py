@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -191,17 +192,23 @@ class Parts:
             if route.target_part == index:
                 self.carry(route)
 
+    @contextmanager
+    def blaming(self, index: int) -> Iterator[None]:
+        """Raise ``FailedError`` with the name of a component if one of its calls fails."""
+        try:
+            yield
+        except SimulationError:
+            part = self.all[index]
+            raise FailedError(self._status_of(part), part.label) from None
+
     def save(self, index: int) -> SavedState:
         """Save the state of a component.
 
         Raises:
             FailedError: If it cannot.
         """
-        part = self.all[index]
-        try:
-            return part.instance.save_state()
-        except SimulationError:
-            raise FailedError(self.status_of(part), part.label) from None
+        with self.blaming(index):
+            return self.all[index].instance.save_state()
 
     def restore(self, index: int, state: SavedState) -> None:
         """Restore the state of a component.
@@ -209,13 +216,10 @@ class Parts:
         Raises:
             FailedError: If it cannot.
         """
-        part = self.all[index]
-        try:
-            part.instance.restore_state(state)
-        except SimulationError:
-            raise FailedError(self.status_of(part), part.label) from None
+        with self.blaming(index):
+            self.all[index].instance.restore_state(state)
 
-    def status_of(self, part: Part) -> int:
+    def _status_of(self, part: Part) -> int:
         """The status of a component of which a call has failed."""
         return Status.FATAL if part.instance.phase is Phase.DEAD else Status.ERROR
 

@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 from fmugym.fmi.fmi1 import FMI1Instance
 from fmugym.fmi.fmi2 import FMI2Instance
-from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.solver import Memory, Mode
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status, sane
 
 __all__ = ["RAMPED_CLASSES"]

@@ -8,18 +8,18 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final
 
-from fmugym.archive.variable import Variable
-from fmugym.fmi.clocks import TICKS_SIZE, CallError, ClockCalls, Ticks, Timetable
+from fmugym.fmi.clocks import TICKS_SIZE, CallError, Ticks, Timetable
+from fmugym.fmi.crossings import Bracket, crosses
+from fmugym.fmi.equations import Equations
 from fmugym.fmi.methods import METHODS, State
 from fmugym.fmi.status import Status
 
-__all__ = ["CallError", "Equations", "Events", "Memory", "Mode", "Solver", "Solving"]
+__all__ = ["Memory", "Mode", "Solver", "Solving"]
 
 _MOST_UPDATES: Final = 1000
 _MOST_EVENTS: Final = 100_000
@@ -104,78 +104,6 @@ class Memory:
         places = range(_MEMORY.size, len(data), TICKS_SIZE)
         ticks = tuple(Ticks.from_bytes(data[i : i + TICKS_SIZE]) for i in places)
         return cls(time, next_event, step, Mode(mode), bool(terminated), ticks)
-
-
-class Events(NamedTuple):
-    """What the FMU tells after one update of its discrete states."""
-
-    again: bool
-    terminate: bool
-    next_event: float
-
-
-class Equations(ClockCalls):
-    """The functions of model exchange of one instance. All raise ``CallError`` for a bad status."""
-
-    steps_by_itself: bool = False
-    """Whether the FMU does its steps, as in co-simulation with event mode."""
-    clocks: Sequence[Variable] = ()
-    number_of_states: int
-    number_of_indicators: int
-    completes: bool
-    """Whether the FMU wants to know of complete steps."""
-
-    @abstractmethod
-    def set_time(self, time: float) -> None:
-        """Set the time."""
-
-    @abstractmethod
-    def set_states(self, x: State) -> None:
-        """Set the continuous states."""
-
-    @abstractmethod
-    def get_states(self) -> State:
-        """Get the continuous states."""
-
-    @abstractmethod
-    def get_rates(self) -> State:
-        """Get the derivatives of the states."""
-
-    @abstractmethod
-    def get_indicators(self) -> State:
-        """Get the event indicators."""
-
-    @abstractmethod
-    def get_nominals(self) -> State:
-        """Get the nominal values of the states."""
-
-    @abstractmethod
-    def enter_events(self) -> None:
-        """Enter event mode."""
-
-    @abstractmethod
-    def update(self) -> Events:
-        """Update the discrete states once."""
-
-    @abstractmethod
-    def enter_continuous(self) -> None:
-        """Enter continuous-time mode."""
-
-    @abstractmethod
-    def complete(self) -> tuple[bool, bool]:
-        """Tell that a step is complete; return whether the FMU wants an event, and to stop."""
-
-    def step(self, time: float, size: float) -> tuple[float, bool, bool]:
-        """Let the FMU step.
-
-        Returns:
-            The time that it reached, whether it wants an event, and whether it wants to stop.
-        """
-        raise NotImplementedError
-
-    @abstractmethod
-    def differentiate_by(self, state: int) -> State | None:
-        """The derivatives of all rates by one state; None if the FMU does not provide them."""
 
 
 class Solver:
@@ -313,14 +241,14 @@ class Solver:
         time, step = self.time, end - self.time
         resolution = 4.0 * _EPSILON * max(abs(time), abs(end)) / step
         width = max(_SHARP * self._solving.tolerance, resolution)
-        bracket = _Bracket(0.0, 1.0, 1.0, 1.0, self._z, z_after)
+        bracket = Bracket(0.0, 1.0, 1.0, 1.0, self._z, z_after)
         for guesses in range(_MOST_GUESSES):
             if not bracket.high - bracket.low > width:
                 break
             guess = bracket.next_guess(guesses, 0.5 * width)
             self._go_to(end, guess)
             z = self._indicators()
-            bracket = bracket.narrowed(guess, z, _crosses(self._z, z))
+            bracket = bracket.narrowed(guess, z, crosses(self._z, z))
         if bracket.high == 1.0:
             self._place(end, after)
             return end, after
@@ -452,7 +380,7 @@ class Solver:
         size = end - self.time
         after = [x + size * rate for x, rate in zip(self.x, self.rates, strict=True)]
         self._place(end, after)
-        return (end, after) if _crosses(self._z, self._indicators()) else None
+        return (end, after) if crosses(self._z, self._indicators()) else None
 
     def _step_to(self, until: float) -> None:
         """Take one step, to this time or the first event."""
@@ -464,7 +392,7 @@ class Solver:
             if self._method.end_rates is None:  # the last stage of the others was there
                 self._place(end, after)
             z = self._indicators()
-            event = _crosses(self._z, z)
+            event = crosses(self._z, z)
             if event:
                 end, after = self._locate(end, after, z)
         self._move_on(end, after, z, event)
@@ -528,45 +456,3 @@ class Solver:
                 self._remember(time=max(self.time, until))
                 return Status.OK
         return Status.TERMINATED
-
-
-def _crosses(before: State, after: State) -> bool:
-    """Whether an indicator becomes positive or ceases to be: FMI's events."""
-    return any((a > 0.0) != (b > 0.0) for a, b in zip(before, after, strict=True))
-
-
-class _Bracket(NamedTuple):
-    """An interval of fractions of a step: nothing has crossed at low, something has at high.
-
-    The weight of an end is halved while it stays where it is (Illinois method).
-    """
-
-    low: float
-    high: float
-    low_weight: float
-    high_weight: float
-    low_z: State
-    high_z: State
-
-    def _first_crossing(self) -> float:
-        """The fraction at which straight lines between the ends cross first."""
-        first = 1.0
-        for low, high in zip(self.low_z, self.high_z, strict=True):
-            a, b = self.low_weight * low, self.high_weight * high
-            if (a > 0.0) != (b > 0.0) and a / (a - b) < first:
-                first = a / (a - b)
-        return self.low + first * (self.high - self.low)
-
-    def next_guess(self, guesses: int, least: float) -> float:
-        """A guess that moves an end by at least this much; each fourth halves the interval."""
-        middle = 0.5 * (self.low + self.high)
-        guess = middle if guesses % 4 == 3 else self._first_crossing()
-        if not guess > self.low + least:
-            return min(self.low + least, middle)
-        return guess if guess < self.high - least else max(self.high - least, middle)
-
-    def narrowed(self, guess: float, z: State, crossed: bool) -> _Bracket:
-        """Move the end to a guess on whose side it is."""
-        if crossed:
-            return _Bracket(self.low, guess, 0.5 * self.low_weight, 1.0, self.low_z, z)
-        return _Bracket(guess, self.high, 1.0, 0.5 * self.high_weight, z, self.high_z)

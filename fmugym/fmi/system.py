@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import struct
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,10 +21,11 @@ from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.chain import chained_jacobian
 from fmugym.fmi.control import Repeatable, StepControl
 from fmugym.fmi.initialization import Initialization
-from fmugym.fmi.instance import Initialize, Instance, SavedState, Span
+from fmugym.fmi.instance import Instance, SavedState
 from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.master import Master
 from fmugym.fmi.parts import FailedError, Memory, Part, Parts, scaled
+from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Phase, Status, failed_call
 from fmugym.systems.description import MASTER, PartVariable, SystemDescription
 from fmugym.systems.layout import Layout
@@ -333,9 +335,18 @@ class SystemInstance(Instance, Repeatable):
         if not self._description.capabilities.can_get_and_set_fmu_state:
             raise SimulationError(f"{self._description.model_name} cannot get and set its state")
         self._require(Phase.STEPPING, "save the FMU state")
-        states = tuple(part.instance.save_state() for part in self._parts.all)
-        memory = Memory(*self._parts.slots(), self._parts.fresh, states)
-        return self._own(memory)
+        with self._failing("saving the FMU state"):
+            return self.keep()
+
+    @contextmanager
+    def _failing(self, doing: str) -> Iterator[None]:
+        """Fail as a whole if a component does."""
+        self._who = ""
+        try:
+            yield
+        except FailedError as failure:
+            status = self.judge(self._tell(failure))
+            raise SimulationError(self.describe_failure(doing, status)) from None
 
     def _own(self, memory: Memory) -> SavedState:
         saved = _SystemState(memory)
@@ -346,19 +357,19 @@ class SystemInstance(Instance, Repeatable):
         """See ``Instance.restore_state``."""
         if self.phase is Phase.DEAD:
             raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
-        memory: Memory = state.memory
-        for part, own in zip(self._parts.all, memory.states, strict=True):
+        for part in self._parts.all:
             part.started = True
-            part.instance.restore_state(own)
-        self._parts.put_slots(memory)
+        with self._failing("restoring the FMU state"):
+            self.go_back(state)
         self.phase = Phase.STEPPING
 
     def serialize(self, state: SavedState) -> bytes:
         """See ``Instance.serialize``; the native pool writes the same."""
         memory: Memory = state.memory
         data = [memory.inputs, memory.outputs, struct.pack("=d", memory.fresh)]
-        for part, own in zip(self._parts.all, memory.states, strict=True):
-            own_data = part.instance.serialize(own)
+        for index, own in enumerate(memory.states):
+            with self._failing("serializing a state"), self._parts.blaming(index):
+                own_data = self._parts.all[index].instance.serialize(own)
             data += [struct.pack("=Q", len(own_data)), own_data]
         return b"".join(data)
 
@@ -369,9 +380,10 @@ class SystemInstance(Instance, Repeatable):
         states = []
         try:
             fresh = struct.unpack("=d", data[place - 8 : place])[0] != 0.0
-            for part in self._parts.all:
+            for index, part in enumerate(self._parts.all):
                 size = struct.unpack("=Q", data[place : place + 8])[0]
-                states.append(part.instance.deserialize(data[place + 8 : place + 8 + size]))
+                with self._failing("deserializing a state"), self._parts.blaming(index):
+                    states.append(part.instance.deserialize(data[place + 8 : place + 8 + size]))
                 place += 8 + size
         except struct.error:
             place = -1

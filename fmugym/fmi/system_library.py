@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.instance import Instance

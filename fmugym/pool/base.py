@@ -263,10 +263,15 @@ class Pool(ABC):
     def plays_alone(self) -> bool:
         """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
 
-        Then it also offers ``roll_out``, ``prepare_single`` and ``start_of_play``, and starts
-        episodes within the steps in which others end.
+        Then it also offers ``start_of_play`` and ``reset_of_play``, and starts episodes within the
+        steps in which others end.
         """
         return False
+
+    @property
+    def rolls_out(self) -> bool:
+        """Whether ``roll_out`` does many steps of compiled hooks in one call."""
+        return self.plays_alone
 
     def prepare_play(
         self,
@@ -289,7 +294,7 @@ class Pool(ABC):
         """Do many steps of the prepared play in one call; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
+            SimulationError: If the pool does not support it; see ``rolls_out``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
@@ -297,7 +302,7 @@ class Pool(ABC):
         """Make the functions that do whole steps of a single environment; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
+            SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
@@ -315,6 +320,16 @@ class Pool(ABC):
 
     def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes outside of a step; see ``NativePool``.
+
+        Raises:
+            SimulationError: If the pool does not support it; see ``plays_alone``.
+        """
+        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
+
+    def reset_of_play(
+        self,
+    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
+        """The function that does whole resets with a mask; see ``NativePool``.
 
         Raises:
             SimulationError: If the pool does not support it; see ``plays_alone``.

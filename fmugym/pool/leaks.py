@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable
 from typing import Final, ParamSpec, TypeVar
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray

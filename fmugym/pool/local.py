@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.errors import FMULoadError
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.extension import has_native_pool

@@ -14,18 +14,15 @@ conversion:
 from __future__ import annotations
 
 import logging
-import shutil
 import weakref
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
@@ -40,13 +37,15 @@ from fmugym.pool.base import (
     names_of,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.callbacks import Listener, Receiver
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.pacing import last_initialization
+from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
-from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
+from fmugym.pool.reports import Failure, describe_failure, loading_failed
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.settings import (
     PlaceOfFMU,
@@ -58,12 +57,10 @@ from fmugym.pool.settings import (
     solving_settings,
     table_of,
     variable_settings,
-    variables_of,
 )
 from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.pool.systems import system_settings
-from fmugym.pool.tape import TAPE_ROWS, Effort, Judge, Rehearsals, Tape
-from fmugym.systems.description import SystemDescription
+from fmugym.pool.tape import TAPE_ROWS, Effort, Judge
 
 __all__ = ["NativePool", "prepare"]
 
@@ -134,7 +131,7 @@ class NativePool(SavingPool):
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
         self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
-        self._listener = _Listener(fmu.description, spec)
+        self._listener = Listener(fmu.description, spec)
         try:
             self._pool = self._open(log, private_libraries)
         except BaseException:
@@ -147,14 +144,15 @@ class NativePool(SavingPool):
         self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
-        self._reset_of_play = self.watched(self._pool.start)
+        self._start_of_play = self.watched(self._pool.start)
+        self._reset_of_play = self.watched(self._pool.reset_by)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
         paths = fmu.prepare_libraries()
         folder = fmu.extract()
         if private_libraries:
-            paths = _copy_libraries(fmu, folder, self.num_instances)
+            paths = copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
         try:
             return _native.Pool(
@@ -187,7 +185,7 @@ class NativePool(SavingPool):
                 },
                 count=self.num_instances,
                 threads=self.threads,
-                callback=_Receiver(log, description, self._first_index),
+                callback=Receiver(log, description, self._first_index),
                 listener=self._listener,
             )
         except OSError as error:
@@ -530,8 +528,10 @@ class NativePool(SavingPool):
                 each input the number of a start value, or -1 and a constant. ``results``, None if
                 only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
                 tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
-                empty one); and the shape and type of each array: float32 observations, or those
-                that the second program stores, then rewards, terminated and truncated.
+                empty one); the shape and type of each array: float32 observations, or those that
+                the second program stores, then rewards, terminated and truncated of a step, and
+                mask and drawn values (draws, N) of a reset; and the parts of a reset's infos: the
+                names of the drawn values and of the mask, and what ``LateDict.parts`` returns.
 
         Returns:
             A function of actions, drawn values (draws, N), last observations and started
@@ -603,6 +603,20 @@ class NativePool(SavingPool):
             observations, and the drawn values in the mask; ``given`` ones are read. It returns how
             many instances had trouble, and whether any episode of another one has ended.
         """
+        return self._start_of_play
+
+    def reset_of_play(
+        self,
+    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
+        """The function that does whole resets with a mask after ``prepare_play``.
+
+        Returns:
+            A function of the options of a reset. If they are a dict of nothing but
+            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
+            it starts these episodes and returns the result of the reset, and the numbers that the
+            function of ``start_of_play`` returns. Otherwise it does nothing and returns None. The
+            arrays of the result are new, or those of an earlier call that nobody holds any more.
+        """
         return self._reset_of_play
 
     @property
@@ -636,89 +650,8 @@ def prepare(
     )
 
 
-class _Receiver:
-    """Passes on the FMU's messages; it must not refer to the pool."""
-
-    def __init__(self, log: logging.Logger, description: ModelDescription, first: int) -> None:
-        self._log, self._model, self._first_index = log, description.model_identifier, first
-        self._parts = [""]
-        if isinstance(description, SystemDescription):
-            self._parts = [f".{component.name}" for component in description.plan.components]
-
-    def __call__(self, index: int, status: int, category: str, message: str) -> None:
-        instance, part = divmod(index, len(self._parts))
-        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
-        level, text = as_record(name, status, category, message)
-        self._log.log(level, "%s", text)
-
-
-class _Listener:
-    """Passes on recordings of episodes; it must not refer to the pool."""
-
-    def __init__(self, description: ModelDescription, spec: PoolSpec) -> None:
-        self._description = description
-        self._widths = len(spec.inputs), len(spec.outputs)
-        self.rehearsals: Rehearsals | None = None
-
-    def __call__(self, recording: _native.Recording) -> None:
-        if self.rehearsals is not None:
-            self.rehearsals.receive(self._tape(*recording))
-
-    def _tape(
-        self,
-        types: bytes,
-        elements: bytes,
-        starts: bytes,
-        first_outputs: bytes,
-        inputs: bytes,
-        outputs: bytes,
-        statuses: bytes,
-    ) -> Tape:
-        count, (width_in, width_out) = len(statuses), self._widths
-        references, places, _ = np.frombuffer(elements, np.uint32).reshape(-1, 3).T.tolist()
-        values = np.frombuffer(starts)
-        return Tape(
-            variables_of(self._description, types, references, places, values.tolist()),
-            values,
-            np.frombuffer(first_outputs),
-            np.frombuffer(inputs).reshape(count, width_in),
-            np.frombuffer(outputs).reshape(count, width_out),
-            np.frombuffer(statuses, np.int8),
-        )
-
-
 def _as_mask(mask: MaskArray | None) -> MaskArray | None:
     return None if mask is None else np.asarray(mask, np.bool_)
-
-
-def _copy_libraries(fmu: LoadableFMU, folder: Path, count: int) -> list[Path]:
-    """Copy the libraries of all parts for each instance; see ``_copy_library``."""
-    parts = fmu.parts or (fmu,)
-    folders = [part.extract() for part in fmu.parts] or [folder]
-    copies = [
-        _copy_library(place, Path(part.library), count)
-        for part, place in zip(parts, folders, strict=True)
-    ]
-    return [path for paths in zip(*copies, strict=True) for path in paths]
-
-
-def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
-    """Copy the library's folder: the system treats files with other paths and inodes as new.
-
-    The copies are in the FMU's temporary folder and are deleted with it.
-    """
-    paths = []
-    try:
-        for index in range(count):
-            copy = folder / "private" / str(index)
-            shutil.copytree(folder / library.parent, copy)
-            paths.append(copy / library.name)
-    except (OSError, shutil.Error) as error:
-        raise FMULoadError(
-            f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
-            f"failed: {error}; use fewer instances, or one process for each"
-        ) from None
-    return paths
 
 
 def _close(pool: _native.Pool, fmu: LoadableFMU) -> None:

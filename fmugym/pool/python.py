@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.log import fmu_calls

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.errors import FMULoadError
 from fmugym.pool.settings import PlaceOfFMU
 from fmugym.wine.prefix import Wine

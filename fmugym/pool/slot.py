@@ -19,6 +19,7 @@ from fmugym.pool.base import FloatArray, PoolSpec, names_of
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.pacing import Pacer
+from fmugym.pool.retries import step_with_retries
 from fmugym.pool.samples import Samples
 from fmugym.pool.spec import REUSING, ResetMethod, is_start_time
 
@@ -44,7 +45,6 @@ class Snapshot:
 
 _STEPPING = Phase.STEPPING
 _WARNING = int(Status.WARNING)
-_STATUSES = {Phase.FAILED: Status.ERROR, Phase.DEAD: Status.FATAL}
 
 
 def _all_finite(values: list[float]) -> bool:
@@ -336,42 +336,14 @@ class Slot:
         spec = self._spec
         time = spec.communication_point(self._count, self.start_time)
         if spec.fault_retries:
-            status = self._step_with_retries(time, self._step_size)
+            status = step_with_retries(
+                self._instance, time, self._step_size, spec.fault_retries, self._counts
+            )
         else:
             status = self._instance.step(time, self._step_size)
         self._count += 1
         if status and not _is_fine(status):
             self._note_failure(f"the step at t = {time:g} s", status)
-        return status
-
-    def _step_with_retries(self, time: float, step_size: float) -> int:
-        """Repeat a discarded step as smaller ones.
-
-        Each attempt begins at the state before the first, because no step may follow a discarded
-        one.
-        """
-        instance = self._instance
-        try:
-            before = instance.save_state()
-            status = instance.step(time, step_size)
-            for exponent in range(1, self._spec.fault_retries + 1):
-                if status != Status.DISCARD:
-                    break
-                instance.restore_state(before)
-                self._counts[[Column.RETRIES, Column.RETRIED]] += 1
-                status = self._step_in_parts(time, 2**exponent)
-            before.release()
-        except SimulationError:  # the state could not be saved or restored
-            status = Status.DISCARD
-            instance.forbid_steps()
-        return _STATUSES.get(instance.phase, status)
-
-    def _step_in_parts(self, time: float, parts: int) -> int:
-        size, status = self._step_size / parts, 0
-        for index in range(parts):
-            status = self._instance.step(time + index * size, size)
-            if status and not _is_fine(status):
-                break
         return status
 
     def _get_between_steps(self, *, is_start: bool) -> int:

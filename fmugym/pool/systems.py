@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.fmu import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.remote import Hosts, place_of, remote_settings
 from fmugym.pool.settings import (
     library_settings,

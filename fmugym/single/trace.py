@@ -19,19 +19,18 @@ from fmugym.task.results import FLOAT32_LIMIT
 from fmugym.task.values import EpisodeVariables
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Cell
 from fmugym.vector.hooks.lowering import Store, compile_graph
+from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
 from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
+from fmugym.vector.hooks.symbolic import SymbolicParameters, symbolic_outputs
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import (
     SeenArray,
-    SymbolicParameters,
     in_hook,
     require_unchanged,
-    symbolic_outputs,
     tables_of,
     to_integer,
 )

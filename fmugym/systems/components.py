@@ -13,6 +13,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.structure import Feedthrough
 from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import (
+    KnownArguments,
     check_count,
     check_flag,
     check_mapping,
@@ -30,7 +31,7 @@ _NO_NAME = set('/\\:*?"<>|')
 
 
 @dataclass(frozen=True)
-class Component:
+class Component(KnownArguments):
     """One FMU of an ``FMUSystem``.
 
     Attributes:
@@ -50,6 +51,7 @@ class Component:
 
     Raises:
         ConfigError: If a value does not fit.
+        ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
     """
 
     fmu: FMU | str | os.PathLike[str]
@@ -195,7 +197,7 @@ def start_number(name: str, variable: Variable, value: Any) -> float | str:
         return float(items[value])
     if isinstance(value, str) and items:
         raise unknown_name(f"item of {name}", value, items)
-    number = check_number(name, value)
+    number = check_number(name, value, may_be_boolean=variable.kind == "boolean")
     whole = variable.kind in {"integer", "enumeration"}
     if (whole and not number.is_integer()) or (variable.kind == "boolean" and number not in {0, 1}):
         raise ConfigError(f"{name} is of type {variable.type}, got {shown(value)}")

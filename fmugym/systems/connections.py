@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.checks import check_flag, check_number, check_text
+from fmugym.checks import KnownArguments, check_flag, check_number, check_text
 from fmugym.errors import ConfigError, shown
 
 __all__ = ["Connection"]
@@ -14,7 +14,7 @@ _ARROW: Final = "->"
 
 
 @dataclass(frozen=True)
-class Connection:
+class Connection(KnownArguments):
     """A connection of an ``FMUSystem``: ``target = gain * source + offset``.
 
     The value is converted from the unit of the source to that of the target, then ``gain`` and
@@ -30,6 +30,7 @@ class Connection:
 
     Raises:
         ConfigError: If a value does not fit.
+        ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
     """
 
     source: str

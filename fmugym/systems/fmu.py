@@ -11,7 +11,8 @@ from pathlib import Path
 
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, ExtractedFMU, LoadableFMU
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.errors import ConfigError, FMULoadError, shown

@@ -240,7 +240,9 @@ class EpisodePlan:
         for place in range(len(self._random_parameters), len(values)):
             if type(values[place]) is not float:
                 name = self.draws[place].name
-                values[place] = check_number(f"episode variable {name!r}", values[place])
+                values[place] = check_number(
+                    f"episode variable {name!r}", values[place], may_be_boolean=True
+                )
         return values
 
     def _episode(

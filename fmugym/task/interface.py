@@ -311,7 +311,7 @@ def _by_scalar(
     Raises:
         ConfigError: If a name is not that of any of the allowed variables.
     """
-    names = {variable.name for variable in allowed}
+    names = dict.fromkeys(variable.name for variable in allowed)
     arrays: dict[str, _Value] = {}
     scalars: dict[str, _Value] = {}
     for name, value in given.items():

@@ -58,7 +58,7 @@ def as_flag(hook: str, value: Any) -> bool:
         return bool(value)
     flag = _single(given(value, hook))
     if issubclass(type(flag), int | float | np.bool_ | np.number):
-        number = number_of(f"what {hook} returned", flag)
+        number = number_of(f"what {hook} returned", flag, may_be_boolean=True)
         if number in (0.0, 1.0):
             return bool(number)
     raise ConfigError(f"{hook} returned {shown(value)}, expected True or False")
@@ -72,7 +72,8 @@ def as_reward(value: Any) -> float:
     """
     if type(value) is np.float64 or type(value) is np.float32:
         return float(value)
-    return number_of("what _reward_policy returned", _single(given(value, "_reward_policy")))
+    single = _single(given(value, "_reward_policy"))
+    return number_of("what _reward_policy returned", single, may_be_boolean=True)
 
 
 def as_info(value: Any) -> dict[str, Any]:

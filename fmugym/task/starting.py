@@ -189,7 +189,7 @@ def checked_value(variable: Variable, value: Any) -> float:
     """
     if isinstance(value, str) and variable.items:
         return _item_value(variable, str.__str__(value))
-    number = check_number(repr(variable.name), value)
+    number = check_number(repr(variable.name), value, may_be_boolean=variable.kind == "boolean")
     if variable.kind == "string" and number not in dict(variable.items).values():
         raise ConfigError(f"{variable.name!r} is a String, got {shown(value)}")
     if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:

@@ -30,9 +30,10 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 ``--steps N``. All commands take ``--json``.
 
 ``info``, ``new``, ``skeleton``, ``stand-in`` and ``compile`` execute nothing of the FMU, the others
-do. Output is printable ASCII. The exit code is 0; 1 if something cannot be used (one line on the
-error stream says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments
-are wrong; 130 after Ctrl-C, which keeps what was written until then.
+do. Output is printable text; letters that the console lacks are escaped. The exit code is 0; 1 if
+something cannot be used (one line on the error stream says why), ``validate`` finds an error or
+``demo`` has not learned; 2 if the arguments are wrong; 130 after Ctrl-C, which keeps what was
+written until then.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -72,6 +73,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -118,6 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
     """
+    _escape_what_consoles_lack()
     arguments = _parsed(argv)
     try:
         code: int = arguments.run(arguments) or 0
@@ -131,6 +134,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         note(_told(error), "error")
         return 1
     return 0
+
+
+def _escape_what_consoles_lack() -> None:
+    """Names and descriptions of an FMU may have letters that an old console cannot show."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _told(error: Exception) -> str:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from statistics import stdev
 from time import perf_counter
 from typing import Any, Final
 
@@ -83,7 +84,7 @@ def confidence(values: Sequence[float]) -> float | None:
     count = len(values)
     if count < 2:
         return None
-    return _student(count - 1) * float(np.std(values, ddof=1)) / math.sqrt(count)
+    return _student(count - 1) * float(stdev(values)) / math.sqrt(count)
 
 
 def _student(freedom: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -169,12 +170,19 @@ def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
     show()
 
 
+def _for_any_file(text: str) -> str:
+    """A text whose letters are escaped unless standard output is UTF-8, as TOML and Python are."""
+    if codecs.lookup(sys.stdout.encoding or "ascii").name == "utf-8":
+        return text
+    return text.encode("ascii", "backslashreplace").decode()
+
+
 def write_text(text: str, output: Path | None, notes: Iterable[str]) -> None:
     """Write a text to a new file, or to standard output, and notes to the error stream."""
     if output is None:
-        print(text, end="")
+        print(_for_any_file(text), end="")
     else:
-        with output.open("x", encoding="ascii", newline="\n") as file:
+        with output.open("x", encoding="utf-8", newline="\n") as file:
             file.write(text)
     for one in notes:
         note(one)

@@ -173,12 +173,11 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
 
 
 def plain(text: object) -> str:
-    """Bring a text of a foreign file into one line of printable ASCII.
+    """Bring a text of a foreign file into one line, with letters of any language.
 
-    Other characters are escaped: an old console cannot show them, and a terminal may obey them.
+    Other characters are escaped: a terminal may obey them.
     """
-    line = printable(" ".join(str(text).split()))
-    return line.encode("ascii", "backslashreplace").decode()
+    return printable(" ".join(str(text).split()))
 
 
 def as_text(facts: Mapping[str, Any]) -> str:

@@ -84,7 +84,7 @@ class Proposal:
             yield f"the FMU does not run on this machine: {obstacle}"
 
     def text(self) -> str:
-        """The TOML file, ASCII."""
+        """The TOML file; only comments have letters beyond ASCII."""
         skeleton = self._skeleton
         head = _HEAD.format(
             file=plain(self._fmu.path.name),

@@ -245,7 +245,7 @@ class _Training:
         self._plan, self._venv, self._watch = plan, venv, watch
         self.scores: list[Score] = []
         self._due = max(1, plan.steps // _EVALUATIONS)
-        self._progress = {"best": -float("inf"), "next": self._due, "last": -1}
+        self._progress = {"best": -float("inf"), "next": self._due, "last": -1, "updates": -1}
         self._is_new = not resume
         if resume:
             self._load()
@@ -277,6 +277,7 @@ class _Training:
         """Train until the end, and evaluate once more."""
         self._log_to()
         remaining = self._plan.steps - self._steps
+        self._tell_of_long_rollouts(remaining)
         try:
             if remaining > 0:
                 self._model.learn(
@@ -289,6 +290,15 @@ class _Training:
         except KeyboardInterrupt:
             self.evaluate()
             raise
+
+    def _tell_of_long_rollouts(self, remaining: int) -> None:
+        """PPO and the like make a whole rollout before they learn for the first time."""
+        length, count = getattr(self._model, "n_steps", 0), self._plan.num_envs
+        if 0 < remaining < length * count:
+            self._watch.tell(
+                f"{self._plan.algorithm} learns after every {length * count} steps (n_steps="
+                f"{length} in {count} environments) and cannot stop before: give a smaller n_steps"
+            )
 
     def close(self) -> None:
         """Close all logs."""
@@ -318,11 +328,16 @@ class _Training:
     def _after_step(self) -> bool:
         self._watch.advance(self._steps - self._told)
         self._told = self._steps
-        if self._steps >= self._progress["next"]:
-            self._progress["next"] += self._due
+        if self._steps >= self._progress["next"] and self._has_learned:
+            self._progress["next"] = self._steps + self._due - self._steps % self._due
             self.evaluate()
             self._saved_at = -float("inf")  # before the next update
         return True
+
+    @property
+    def _has_learned(self) -> bool:
+        """Whether the agent has changed since the last evaluation, which would be the same."""
+        return bool(self._model._n_updates != self._progress.get("updates"))
 
     def _between_updates(self) -> None:
         if monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS:
@@ -339,7 +354,7 @@ class _Training:
         if steps == self._progress["last"] and self.scores:
             return
         is_new = steps != self._progress["last"]
-        self._progress["last"] = steps
+        self._progress |= {"last": steps, "updates": self._model._n_updates}
         make_policy = partial(policy_with, self._model, self._normalization())
         seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
         self.scores = []

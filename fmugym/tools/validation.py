@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -20,12 +20,12 @@ from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.systems.fmu import SystemFMU
 from fmugym.tools.accuracy import Replay
-from fmugym.tools.advice import Advice, Doubt, advise, lines_of
-from fmugym.tools.overview import plain
+from fmugym.tools.advice import Advice, Doubt, advise
+from fmugym.tools.findings import Finding, Report
 from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Finding", "Report", "validate"]
+__all__ = ["validate"]
 
 _MOST_STEPS: Final = 200
 _SECONDS: Final = 5.0
@@ -40,90 +40,6 @@ _FEWEST_ENVS: Final = 8
 
 _WIDE: Final = 100.0
 """An observation that is larger by this factor than another one hides it from most networks."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """The result of a check.
-
-    Attributes:
-        verdict: ``"ok"``, ``"warning"`` or ``"error"``.
-        check: What was checked.
-        text: What was found.
-        cure: What to do about it; empty if there is nothing to do.
-    """
-
-    verdict: str
-    check: str
-    text: str
-    cure: str = ""
-
-
-@dataclass(frozen=True)
-class Report:
-    """The results of all checks.
-
-    Attributes:
-        findings: The results in the order of the checks.
-        costs: Seconds of real time by name: ``step``, ``reset`` and ``restore`` of one environment.
-            None for a restore that the FMU does not allow.
-        hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
-        reset_method: How episodes begin.
-        recommended: Settings that suit the task, by name.
-        advices: Lines for the task file, of these settings.
-    """
-
-    findings: tuple[Finding, ...]
-    costs: Mapping[str, float | None]
-    hooks: str
-    reset_method: str
-    recommended: Mapping[str, Any]
-    advices: tuple[Advice, ...] = ()
-
-    @property
-    def verdict(self) -> str:
-        """The worst verdict."""
-        found = {finding.verdict for finding in self.findings}
-        return next(one for one in ("error", "warning", "ok") if one in found or one == "ok")
-
-    def as_dict(self) -> dict[str, Any]:
-        """The report in types that JSON has."""
-        return {
-            "schema": 1,
-            "verdict": self.verdict,
-            "findings": [asdict(finding) for finding in self.findings],
-            "costs": dict(self.costs),
-            "hooks": self.hooks,
-            "reset_method": self.reset_method,
-            "recommended": dict(self.recommended),
-            "lines": [asdict(one) | {"line": one.line} for one in self.advices],
-        }
-
-    def as_text(self) -> str:
-        """The report in lines of printable ASCII."""
-        lines = []
-        for one in self.findings:
-            lines.append(f"{one.verdict:8} {one.check}: {plain(one.text)}")
-            if one.cure:
-                lines.append(f"{'':8} cure: {plain(one.cure)}")
-        step, reset, restore = (_duration(self.costs[n]) for n in ("step", "reset", "restore"))
-        lines.append(f"a step takes {step}, a reset {reset}, to restore a state {restore}")
-        lines.append(f"episodes begin by {self.reset_method}")
-        lines.append(f"hooks in a vector environment: {self.hooks}")
-        if "envs" in self.recommended:
-            lines.append(f"recommended for a training: --envs {self.recommended['envs']}")
-        if self.advices:
-            lines += ["recommended for the task file:", *lines_of(self.advices)]
-        return "\n".join(lines)
-
-
-def _duration(seconds: float | None) -> str:
-    if seconds is None:
-        return "is not possible"
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.3g} us"
 
 
 @dataclass(frozen=True)

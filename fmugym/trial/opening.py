@@ -32,8 +32,7 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
-from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
-from fmugym.systems.fmu import SystemFMU
+from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     is_known_to_harm,
@@ -42,15 +41,14 @@ from fmugym.trial.known import (
     marks_of,
     note_harm,
     revise,
-    state_files,
 )
 from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.plan import Plan, is_alone
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
 from fmugym.trial.resuming import method_that_works
 from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
-from fmugym.wine.prefix import Wine
 
 __all__ = ["make_pool"]
 
@@ -114,7 +112,7 @@ def make_pool(
             raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         return BackendPool(fmu, spec, num_instances, backend)
     native = _is_native(backend)
-    plan = _Plan(native, reset_method, threads, private_libraries, isolation, workers)
+    plan = Plan(native, reset_method, threads, private_libraries, isolation, workers)
     plan = plan.checked(fmu, backend)
     spec, timeout = _with_locks(fmu, spec), math.inf
     if call_timeout is not None:
@@ -142,47 +140,6 @@ def make_pool(
     return Patience(spec.licence_wait, log).call(attempt)
 
 
-def _prepare_wine(
-    fmu: FMU, backend: str, private_libraries: bool | None, isolation: str | None
-) -> None:
-    """Refuse what is not possible in Wine, and make ready what every worker needs.
-
-    Raises:
-        FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
-    """
-    wishes = {
-        "backend='python'": backend == "python",
-        "private_libraries": private_libraries,
-        "isolation='none'": isolation == "none",
-        "preload": fmu.preload,
-    }
-    refused = [wish for wish, is_given in wishes.items() if is_given]
-    try:
-        if refused:
-            raise FMULoadError(
-                f"{fmu.path.name} has libraries for Windows only, which run here in worker "
-                f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
-            )
-        Wine.ready()
-    except BaseException:
-        fmu.close()
-        raise
-
-
-def _prepare_components(fmu: FMU) -> None:
-    """Make Wine ready for components that need it: this may take longer than a trial waits.
-
-    Raises:
-        FMULoadError: If Wine is missing.
-    """
-    if isinstance(fmu, SystemFMU) and "wine" in fmu.whereabouts_by_name.values():
-        try:
-            Wine.ready()
-        except BaseException:
-            fmu.close()
-            raise
-
-
 def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
     """Let all environments of the FMU keep to the limits of its licence together."""
     is_limited = spec.max_instances is not None or spec.initialization_interval > 0.0
@@ -195,7 +152,7 @@ def _open(
     spec: PoolSpec,
     num_instances: int,
     log: logging.Logger,
-    plan: _Plan,
+    plan: Plan,
     call_timeout: float | None,
     note_crash: Callable[[str], None],
 ) -> SavingPool:
@@ -223,7 +180,7 @@ def _open_now(
     spec: PoolSpec,
     num_instances: int,
     log: logging.Logger,
-    plan: _Plan,
+    plan: Plan,
     call_timeout: float | None,
     note_crash: Callable[[str], None],
 ) -> SavingPool:
@@ -271,7 +228,7 @@ def _rehearse(
     spec: PoolSpec,
     starts: Starts | None,
     verdict: Verdict,
-    plan: _Plan,
+    plan: Plan,
     log: logging.Logger,
 ) -> None:
     """Let the trial of resets be repeated in training, if it was made and can be repeated."""
@@ -302,7 +259,7 @@ class _Trust:
 
     @classmethod
     def of(
-        cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: _Plan, *, spare: bool
+        cls, fmu: FMU, spec: PoolSpec, starts: Starts | None, plan: Plan, *, spare: bool
     ) -> _Trust:
         """Look up what earlier trials have shown; without a spare instance there is no other."""
         candidate, tried = Candidate.of(fmu), _tried(spec)
@@ -335,167 +292,6 @@ def _is_native(backend: str) -> bool:
     return backend != "python" and has_native_pool()
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """How to open a pool: the caller's demands, completed with the results of a trial."""
-
-    native: bool
-    reset_method: str | None = None
-    threads: int | None = None
-    private_libraries: bool | None = None
-    isolation: str | None = None
-    workers: int | None = None
-    component_resets: tuple[ResetMethod, ...] = ()
-    one_initialization: bool = False
-    state_files: str = ""
-    own_files: bool = False
-
-    def checked(self, fmu: FMU, backend: str) -> _Plan:
-        """Refuse unknown names; in Wine, refuse what is not possible there."""
-        if self.isolation not in (None, *ISOLATIONS):
-            raise unknown_name("isolation", self.isolation, ISOLATIONS)
-        if self.reset_method not in (None, *ResetMethod):
-            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
-        if not fmu.in_wine:
-            _prepare_components(fmu)
-            return self
-        _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
-        return replace(self, native=True, threads=1, private_libraries=None, isolation="process")
-
-    @property
-    def method(self) -> ResetMethod:
-        """How episodes begin."""
-        return ResetMethod(self.reset_method or ResetMethod.RESET)
-
-    @property
-    def has_own_workers(self) -> bool:
-        """Whether the caller has decided which instances share a process."""
-        return self.isolation == "process" and self.workers is not None
-
-    def completed(
-        self, fmu: FMU, verdict: Verdict, num_instances: int, log: logging.Logger
-    ) -> _Plan:
-        """Decide what the caller has left open, and log every unusual choice."""
-        plan = self
-        if plan.reset_method is None:
-            method, components = verdict.reset_method, verdict.components
-            plan = replace(plan, reset_method=method, component_resets=components)
-            _tell_of_resets(fmu, verdict, log)
-        if plan.private_libraries is None and num_instances > 1 and not plan.has_own_workers:
-            if _is_alone(fmu):
-                plan = plan._in_processes(fmu, num_instances, log)
-            else:
-                neighbours = verdict.neighbours or Neighbours.INDEPENDENT
-                plan = plan._apart(fmu, neighbours, num_instances, log)
-        if verdict.isolate and plan.isolation is None:
-            why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
-            log.warning("%s harms its process%s. It runs in worker processes", fmu.path.name, why)
-            plan = replace(plan, isolation="process")
-        return plan._with_means_of_reset(num_instances)
-
-    def with_states(self, fmu: FMU, verdict: Verdict, log: logging.Logger) -> _Plan:
-        """Keep initial states where they give the same results to the last bit; log if not."""
-        obstacle = _obstacle_to_states(fmu, verdict, self.method)
-        if obstacle:
-            log.warning("%s: no initial state is kept: %s", fmu.path.name, obstacle)
-            return self
-        log.info("%s: initial states are kept for other instances and on disk", fmu.path.name)
-        return replace(self, state_files=state_files(fmu))
-
-    def _in_processes(self, fmu: FMU, num_instances: int, log: logging.Logger) -> _Plan:
-        """Give each instance a process, as the FMU demands, unless the caller insists."""
-        if self.isolation == "none":
-            what = "isolation='none' keeps more in it all the same"
-            plan = self
-        else:
-            what = "each gets a process with a copy of the FMU's files"
-            plan = self._with_a_process_each(num_instances)
-        level = logging.INFO if self.isolation == "process" else logging.WARNING
-        log.log(level, "a process may have one instance of %s: %s", fmu.path.name, what)
-        return plan
-
-    def _with_a_process_each(self, num_instances: int) -> _Plan:
-        workers = self.workers or num_instances
-        return replace(self, isolation="process", workers=workers, own_files=True)
-
-    def _apart(
-        self, fmu: FMU, neighbours: Neighbours, num_instances: int, log: logging.Logger
-    ) -> _Plan:
-        if neighbours is Neighbours.INDEPENDENT:
-            return self
-        if neighbours is Neighbours.ONE_INITIALIZATION:
-            log.info("%s: its instances are initialized one at a time", fmu.path.name)
-            return replace(self, one_initialization=True)
-        plan, what = replace(self, threads=1), "all are stepped by one thread"
-        in_process = self.isolation == "none"
-        if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):
-            plan, what = replace(self, private_libraries=True), "each gets a copy of the library"
-        elif neighbours is Neighbours.PROCESSES and in_process:
-            plan, what = self, "isolation='none' keeps them in one process all the same"
-        elif neighbours is not Neighbours.ONE_THREAD:
-            plan = self._with_a_process_each(num_instances)
-            what = "each gets a process with a copy of the FMU's files"
-        asked_for = self.isolation == "process"
-        level = logging.INFO if asked_for else logging.WARNING
-        log.log(level, "the instances of %s disturb each other: %s", fmu.path.name, what)
-        return plan
-
-    @property
-    def _can_copy_libraries(self) -> bool:
-        return self.native and self.isolation is None
-
-    def _with_means_of_reset(self, num_instances: int) -> _Plan:
-        """Provide the private libraries or the processes that the reset method needs."""
-        method = self.method
-        reloads = ResetMethod.LIBRARY in (method, *self.component_resets)
-        if reloads and (self.isolation == "process" or not self.native):
-            method = ResetMethod.PROCESS
-        elif reloads:
-            return replace(self, private_libraries=True)
-        if method is ResetMethod.PROCESS:
-            plan = replace(self, reset_method=method, component_resets=())
-            return replace(plan, isolation="process", workers=num_instances)
-        return replace(self, reset_method=method)
-
-
-def _obstacle_to_states(fmu: FMU, verdict: Verdict, method: ResetMethod) -> str:
-    """Why the initial states of an FMU must not be kept; "" if they may be."""
-    if not fmu.description.capabilities.can_serialize_fmu_state:
-        return "the FMU does not offer to serialize its state"
-    if verdict.states is None:
-        return "no trial has shown that they work in another process"
-    if method is not ResetMethod.RESTORE:
-        return f"episodes begin by the method {str(method)!r}, not by 'restore'"
-    if verdict.states is not Grade.BITWISE:
-        return f"in another process, the trial of a state {_GRADES[verdict.states]}"
-    return ""
-
-
-_GRADES: Final = {
-    Grade.TOLERANCE: "gives other results in the last digits",
-    Grade.WRONG: "gives other results",
-    Grade.FAILS: "fails",
-    Grade.ABSENT: "was not possible",
-}
-
-
-def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
-    """Log the reset methods that the FMU offers but that do not work correctly."""
-    wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
-    if not verdict.deterministic:
-        log.warning("%s gives other outputs each time, even if it begins afresh", fmu.path.name)
-    if ResetMethod.RESET in wrong:
-        log.warning(
-            "%s does not begin anew when it is reset; episodes begin by the method %r instead",
-            fmu.path.name,
-            str(verdict.reset_method),
-        )
-    elif verdict.resets:
-        log.info("%s: episodes begin by the method %r", fmu.path.name, str(verdict.reset_method))
-    for component, method in verdict.components_of(Candidate.of(fmu).plan).items():
-        log.info("%s: component %r begins by the method %r", fmu.path.name, component, method)
-
-
 def _tell_of_reading(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
     """Log what cannot be read, or not at any time."""
     if verdict.blind_start:
@@ -506,7 +302,7 @@ def _tell_of_reading(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
 
 
 def _verdict(
-    fmu: FMU, spec: PoolSpec, starts: Starts | None, num_instances: int, plan: _Plan
+    fmu: FMU, spec: PoolSpec, starts: Starts | None, num_instances: int, plan: Plan
 ) -> Verdict:
     """Get the verdict on an FMU from a trial, or from this process if trials are turned off."""
     candidate = Candidate.of(fmu)
@@ -514,7 +310,7 @@ def _verdict(
     if fmu.bundled:
         return Verdict(True, resets={ResetMethod.RESTORE: Grade.BITWISE})
     several = num_instances > 1 and plan.private_libraries is None and not plan.has_own_workers
-    several = several and not _is_alone(fmu)
+    several = several and not is_alone(fmu)
     isolated = plan.isolation == "process"
     if not candidate.exempt:
         remains = _remains(candidate)
@@ -524,11 +320,6 @@ def _verdict(
         verdict = examine(candidate, spec, several=True, alone=not isolated, must_survive=False)
         return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
     return Verdict()
-
-
-def _is_alone(fmu: FMU) -> bool:
-    """Whether the FMU says that a process may have only one instance."""
-    return fmu.description.capabilities.can_be_instantiated_only_once_per_process
 
 
 def _remains(candidate: Candidate) -> Remains:

@@ -221,6 +221,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if self.closed or self._background.is_pending:
             self._open_pool("reset")
+        if seed is None and self._is_ready:
+            try:
+                result = self._engine.reset_by(options)
+            except BaseException:
+                self._interrupt()
+                raise
+            if result is not None:
+                return result
         remaining, mask = split_options(options, self.num_envs)
         if not self._is_ready and not mask.all():
             when = "reset after an exception" if self._started else "first reset"
@@ -255,9 +263,16 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         if not self._is_ready or self.closed or self._background.is_pending:
             self._refuse_step("step")
-        if self._waits and self._engine.any_ended:
+        if not self._waits:
+            return self._step(actions)
+        engine = self._engine
+        if engine.any_ended:
             self._require_ready("step")
-        return self._step(actions)
+        try:
+            return engine.step(actions, None)
+        except BaseException:
+            self._interrupt()
+            raise
 
     def step_async(self, actions: Any) -> None:
         """Begin a step of all environments, which goes on while the caller computes.

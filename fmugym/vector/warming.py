@@ -17,8 +17,8 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.task.readings import Readings, reading
 from fmugym.task.warm_up import WarmUp
 from fmugym.vector.contents import borrowed
-from fmugym.vector.hooks.functions import exclusive
 from fmugym.vector.hooks.lowering import Store, compile_graph
+from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import Program, UntraceableError
 from fmugym.vector.hooks.symbols import LANES, Symbols, as_symbols, loaded, same_for_all
 from fmugym.vector.hooks.tables import tables_in

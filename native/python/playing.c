@@ -368,7 +368,10 @@ static bool results_fit(const PyPool *self, const Playing *playing) {
     const size_t seen = playing->judgement.program.number_of_seen;
     bool fit = results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
                results_size(r, TERMINATED_ARRAY) == s->count &&
-               results_size(r, TRUNCATED_ARRAY) == s->count;
+               results_size(r, TRUNCATED_ARRAY) == s->count &&
+               results_size(r, MASK_ARRAY) == s->count &&
+               results_size(r, DRAWN_ARRAY) ==
+                   playing->play.draws->count * s->count * sizeof(double);
 
     if (pool_observes(playing)) {
         return fit && results_size(r, 0) == s->count * s->num_observed * sizeof(float);

@@ -90,7 +90,8 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
 /* Whether a hook looked up an index outside of a table, which is an exception. */
 bool is_outside(const PyTurn *t);
 
-/* Returns false with an exception if nothing is prepared. */
+/* Both return false with an exception if nothing is prepared, or only rollouts. */
 bool is_prepared(const PyPool *self);
+bool has_results(const PyPool *self);
 
 #endif

@@ -278,25 +278,12 @@ typedef struct {
 static void do_look(PyPool *self, bool alone, void *context) {
     Looking *l = context;
     const Pool *pool = &self->pool;
-    const Record *record = pool->records == NULL ? NULL : &pool->records[l->index];
 
     (void)alone;
-    if (record == NULL || !record->whole) {
-        return;
+    if (record_is_whole(pool, l->index)) {
+        l->found = true;
+        l->out_of_memory = !record_copy(pool, l->index, &l->record);
     }
-    const size_t values = record->rows * pool->settings.inputs->count;
-    l->record = *record;
-    l->record.starts = malloc((record->number_of_starts + 1) * sizeof *record->starts);
-    l->record.inputs = malloc((values + 1) * sizeof *record->inputs);
-    l->out_of_memory = l->record.starts == NULL || l->record.inputs == NULL;
-    if (!l->out_of_memory) {
-        memcpy(l->record.starts, record->starts,
-               record->number_of_starts * sizeof *record->starts);
-        if (values > 0) {
-            memcpy(l->record.inputs, record->inputs, values * sizeof *record->inputs);
-        }
-    }
-    l->found = true;
 }
 
 static PyObject *starts_of(const Record *record) {
@@ -338,7 +325,6 @@ PyObject *py_record_of(PyObject *object, PyObject *index) {
         result = Py_BuildValue("(Nny#)", starts_of(&l.record), (Py_ssize_t)l.record.rows,
                                (const char *)l.record.inputs, (Py_ssize_t)size);
     }
-    free(l.record.starts);
-    free(l.record.inputs);
+    record_clear(&l.record);
     return result;
 }

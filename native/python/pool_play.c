@@ -150,7 +150,7 @@ bool is_outside(const PyTurn *t) {
 }
 
 /* Lets the step fill the arrays that it returns. */
-static void settle_results(const Playing *playing, const StepArrays *arrays, PyTurn *t) {
+static void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
     t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
     t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
     t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];
@@ -162,8 +162,8 @@ static void settle_results(const Playing *playing, const StepArrays *arrays, PyT
 
 /* The result, how many instances had trouble, how many episodes have ended, and how many of these
  * were followed. */
-static PyObject *turn_result(const Playing *playing, const StepArrays *arrays, const PyTurn *t) {
-    PyObject *tuple = PyTuple_New(4), *result = results_make(playing->results, arrays);
+static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
+    PyObject *tuple = PyTuple_New(4), *result = results_of_step(playing->results, arrays);
 
     if (tuple == NULL || result == NULL) {
         Py_XDECREF(tuple);
@@ -227,12 +227,12 @@ static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *con
 
 static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = playing_of(capsule);
-    StepArrays arrays;
+    ResultArrays arrays;
     PyTurn t;
     PyObject *result = NULL;
 
     clear_turn(playing, &t);
-    if (results_provide(playing->results, &arrays) && take_arrays(self, playing, args, &t)) {
+    if (results_provide_step(playing->results, &arrays) && take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         settle_results(playing, &arrays, &t);
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
@@ -249,7 +249,7 @@ bool is_prepared(const PyPool *self) {
     return self->playing != NULL;
 }
 
-static bool has_results(const PyPool *self) {
+bool has_results(const PyPool *self) {
     const Playing *playing = playing_of(self->playing);
 
     if (playing->results == NULL) {
@@ -282,60 +282,4 @@ PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nar
 
 PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return play_by(object, AFTER, args, nargs);
-}
-
-/* Starting episodes outside of a step */
-
-/* Sets ended to 1 if any episode is at its end now, 0 otherwise. */
-static void do_start(PyPool *self, bool alone, void *context) {
-    PyTurn *t = context;
-    const Play *play = t->turn.play;
-
-    t->call.alone = alone;
-    t->ends.outside = false;
-    t->troubled = pool_start(&self->pool, &t->call, &t->ends.outside);
-    t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
-}
-
-static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *const *args,
-                              PyTurn *t) {
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    Py_buffer *b = t->buffers;
-
-    return take_vector(args[0], &b[MASK], COPIED, "the mask", ITEM_BOOLEAN, n) &&
-           take_observations(self, playing, args[1], t) &&
-           take_matrix(args[2], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws->count, n);
-}
-
-/* How many instances had trouble, and whether any episode is at its end now. */
-static PyObject *start_result(const PyTurn *t) {
-    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, t->ends.ended ? Py_True : Py_False);
-}
-
-static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
-    const Playing *playing = playing_of(capsule);
-    PyTurn t;
-    bool done = false;
-
-    clear_turn(playing, &t);
-    if (take_start_arrays(self, playing, args, &t)) {
-        settle_turn(self, playing, &t);
-        t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};
-        done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
-    }
-    release_turn(playing, &t);
-    return done ? start_result(&t) : NULL;
-}
-
-PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-
-    if (!has_arguments(nargs, 3) || !is_prepared(self)) {
-        return NULL;
-    }
-    PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = start_with(self, playing, args);
-    Py_DECREF(playing);
-    return result;
 }

@@ -408,6 +408,7 @@ static bool take_array(const Prepared *p, PyObject *action) {
 typedef struct {
     const Prepared *prepared;
     Call call;
+    size_t troubled;
     SingleOutcome outcome;
     SingleResult result;
 } Stepping;
@@ -417,6 +418,20 @@ static void do_single(PyPool *self, bool alone, void *context) {
 
     s->call.alone = alone;
     s->outcome = single_step(&self->pool, &s->prepared->single, &s->call, &s->result);
+}
+
+static void do_before(PyPool *self, bool alone, void *context) {
+    Stepping *s = context;
+
+    (void)alone;
+    s->outcome = single_before(&self->pool, &s->prepared->single) ? SINGLE_DONE : SINGLE_REFUSED;
+}
+
+static void do_after(PyPool *self, bool alone, void *context) {
+    Stepping *s = context;
+
+    (void)alone;
+    s->outcome = single_after(&self->pool, &s->prepared->single, s->troubled, &s->result);
 }
 
 static PyObject *observation_of(const Prepared *p) {
@@ -464,6 +479,24 @@ static void replace_reference(PyObject **place, PyObject *object) {
     Py_XDECREF(before);
 }
 
+static void note_action(PyPool *self, PyObject *action) {
+    replace_reference(&self->actions[1], self->actions[0]);
+    self->actions[0] = Py_NewRef(action);
+}
+
+static PyObject *before_with(PyPool *self, const Prepared *p, PyObject *action) {
+    Stepping s = {.prepared = p};
+
+    if (!perform(self, ALWAYS_SHORT, do_before, &s)) {
+        return NULL;
+    }
+    if (s.outcome == SINGLE_REFUSED) {
+        Py_RETURN_NONE;
+    }
+    note_action(self, action);
+    Py_RETURN_TRUE;
+}
+
 static PyObject *step_with(PyPool *self, const Prepared *p, PyObject *action) {
     const Py_buffer *inputs = &self->buffers[INPUTS];
     Stepping s = {.prepared = p,
@@ -476,18 +509,18 @@ static PyObject *step_with(PyPool *self, const Prepared *p, PyObject *action) {
     if (s.outcome == SINGLE_REFUSED) {
         Py_RETURN_NONE;
     }
-    replace_reference(&self->actions[1], self->actions[0]);
-    self->actions[0] = Py_NewRef(action);
+    note_action(self, action);
     if (!report_messages(self)) {
         return NULL;
     }
     return s.outcome == SINGLE_TROUBLED ? PyBool_FromLong(0) : result_of(&s);
 }
 
-/* Takes an action, the attributes of the environment, and how many there must be. */
-PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
+typedef PyObject *WithAction(PyPool *self, const Prepared *prepared, PyObject *action);
 
+/* Takes an action, the attributes of the environment, and how many there must be. Returns None
+ * without any further work if they are not as they were prepared. */
+static PyObject *do_with(PyPool *self, WithAction *work, PyObject *const *args, Py_ssize_t nargs) {
     if (!has_arguments(nargs, 3)) {
         return NULL;
     }
@@ -501,9 +534,38 @@ PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nar
     const int same = PyErr_Occurred() ? -1 : is_as_before(p, args[1], size);
     PyObject *result = NULL;
     if (same == 1 && (p->is_integer ? take_integer(p, args[0]) : take_array(p, args[0]))) {
-        result = step_with(self, p, args[0]);
+        result = work(self, p, args[0]);
     } else if (same >= 0) {
         result = Py_NewRef(Py_None);
+    }
+    Py_DECREF(capsule);
+    return result;
+}
+
+PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return do_with((PyPool *)object, step_with, args, nargs);
+}
+
+PyObject *py_before_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    return do_with((PyPool *)object, before_with, args, nargs);
+}
+
+/* Takes how many instances had trouble in the step. */
+PyObject *py_after_single(PyObject *object, PyObject *troubled) {
+    PyPool *self = (PyPool *)object;
+    Stepping s = {.troubled = PyLong_AsSize_t(troubled)};
+
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    if (self->single == NULL) {
+        PyErr_SetString(PyExc_TypeError, "step_single was not prepared");
+        return NULL;
+    }
+    PyObject *capsule = Py_NewRef(self->single), *result = NULL;
+    s.prepared = PyCapsule_GetPointer(capsule, SINGLE);
+    if (perform(self, ALWAYS_SHORT, do_after, &s)) {
+        result = s.outcome == SINGLE_TROUBLED ? PyBool_FromLong(0) : result_of(&s);
     }
     Py_DECREF(capsule);
     return result;

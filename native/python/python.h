@@ -125,6 +125,7 @@ PyObject *py_seed(PyObject *module, PyObject *args);
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_exchange_play(PyObject *object, PyObject *other);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_reset_by(PyObject *object, PyObject *options);
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
@@ -132,6 +133,8 @@ PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t narg
 
 PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);
 PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_before_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_after_single(PyObject *object, PyObject *troubled);
 PyObject *py_begin_single(PyObject *object, PyObject *action);
 PyObject *py_actions_of_single(PyObject *object, PyObject *unused);
 

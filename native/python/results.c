@@ -40,10 +40,19 @@ typedef struct {
     unsigned oldest;
 } Maker;
 
+/* What is told of the episodes that a reset starts: dicts that are filled when somebody reads them. */
+typedef struct {
+    PyObject *name, *name_of_mask, *no_arguments;
+    PyTypeObject *class;
+    newfunc make;
+    PyObject *unfilled, *slot, *fill, *plan;
+} Telling;
+
 struct Results {
     PyObject *parts, *empty, *names;
-    PyTypeObject *class;
+    PyTypeObject *class, *class_of_arrays;
     allocfunc allocate;
+    Telling telling;
     bool looks_inside;
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS];
@@ -193,16 +202,40 @@ static bool take_class(Results *r) {
     return true;
 }
 
-static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *names, *shapes;
-
-    if (!PyArg_ParseTuple(parts, "OO!OO!;results", &r->empty, &PyType_Type, &r->class, &names,
-                          &PyTuple_Type, &shapes) ||
-        !take_class(r) || !take_makers(r, shapes) || !take_names(r, names)) {
+static bool take_telling(Telling *t, PyObject *parts) {
+    if (!PyArg_ParseTuple(parts, "UUO!UUOO;what is told of a reset", &t->name, &t->name_of_mask,
+                          &PyType_Type, &t->class, &t->unfilled, &t->slot, &t->fill, &t->plan)) {
         return false;
     }
+    t->make = (newfunc)PyType_GetSlot(t->class, Py_tp_new);
+    t->no_arguments = PyTuple_New(0);
+    if (t->make == NULL || !PyType_IsSubtype(t->class, &PyDict_Type)) {
+        PyErr_SetString(PyExc_TypeError, "what is told of a reset must be a dict");
+        return false;
+    }
+    return t->no_arguments != NULL;
+}
+
+/* Returns false with an exception if that is impossible. */
+static bool look_at_arrays(Results *r) {
+    PyObject *array = PyObject_CallFunction(r->empty, "((i))", 1);
+
+    if (array == NULL) {
+        return false;
+    }
+    r->class_of_arrays = (PyTypeObject *)Py_NewRef((PyObject *)Py_TYPE(array));
     r->looks_inside = knows_arrays(r->empty);
+    Py_DECREF(array);
     return true;
+}
+
+static bool take_parts(Results *r, PyObject *parts) {
+    PyObject *names, *shapes, *telling;
+
+    return PyArg_ParseTuple(parts, "OO!OO!O!;results", &r->empty, &PyType_Type, &r->class, &names,
+                            &PyTuple_Type, &shapes, &PyTuple_Type, &telling) &&
+           take_class(r) && take_makers(r, shapes) && take_names(r, names) &&
+           take_telling(&r->telling, telling) && look_at_arrays(r);
 }
 
 Results *results_take(PyObject *parts) {
@@ -231,6 +264,8 @@ void results_free(Results *r) {
             Py_XDECREF(r->makers[i].made[k].array);
         }
     }
+    Py_XDECREF(r->class_of_arrays);
+    Py_XDECREF(r->telling.no_arguments);
     Py_XDECREF(r->parts);
     free(r);
 }
@@ -286,17 +321,8 @@ static PyObject *provide(const Results *r, Maker *maker, char **memory) {
     return array;
 }
 
-bool results_provide(Results *r, StepArrays *a) {
-    for (size_t i = 0; i < RESULT_ARRAYS; i++) {
-        a->arrays[i] = NULL; /* whatever fails, these can be dropped */
-    }
-    for (size_t i = 0; i < r->number_of_seen; i++) {
-        a->arrays[i] = provide(r, &r->makers[i], &a->memory[i]);
-        if (a->arrays[i] == NULL) {
-            return false;
-        }
-    }
-    for (size_t i = REWARDS_ARRAY; i < RESULT_ARRAYS; i++) {
+static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) {
+    for (size_t i = begin; i < end; i++) {
         a->arrays[i] = provide(r, &r->makers[i], &a->memory[i]);
         if (a->arrays[i] == NULL) {
             return false;
@@ -305,18 +331,58 @@ bool results_provide(Results *r, StepArrays *a) {
     return true;
 }
 
-void results_drop(const Results *r, StepArrays *a) {
+/* Whatever fails, all arrays can be dropped. */
+static void clear(const Results *r, ResultArrays *a) {
+    memset(a->arrays, 0, r->number_of_seen * sizeof *a->arrays);
+    memset(a->arrays + MOST_SEEN, 0, (RESULT_ARRAYS - MOST_SEEN) * sizeof *a->arrays);
+}
+
+bool results_provide_step(Results *r, ResultArrays *a) {
+    clear(r, a);
+    return provide_some(r, 0, r->number_of_seen, a) &&
+           provide_some(r, REWARDS_ARRAY, TRUNCATED_ARRAY + 1, a);
+}
+
+bool results_provide_reset(Results *r, ResultArrays *a) {
+    clear(r, a);
+    return provide_some(r, 0, r->number_of_seen, a) &&
+           provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
+}
+
+void results_drop(const Results *r, ResultArrays *a) {
     for (size_t i = 0; i < r->number_of_seen; i++) {
         Py_XDECREF(a->arrays[i]);
     }
-    for (size_t i = REWARDS_ARRAY; i < RESULT_ARRAYS; i++) {
+    for (size_t i = MOST_SEEN; i < RESULT_ARRAYS; i++) {
         Py_XDECREF(a->arrays[i]);
     }
 }
 
+/* Whether an array of the caller is like the array of the mask. */
+static bool is_mask(const Results *r, PyObject *array) {
+    const Maker *own = &r->makers[MASK_ARRAY];
+
+    if (!r->looks_inside || Py_TYPE(array) != r->class_of_arrays) {
+        return false;
+    }
+    const Fields *f = fields_of(array);
+    return f->type == PyTuple_GetItem(own->arguments, 1) && f->dimensions == 1 &&
+           f->shape[0] == own->shape[0] && f->strides[0] == own->strides[0];
+}
+
+bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) {
+    const size_t size = r->makers[MASK_ARRAY].size;
+
+    if (!is_mask(r, mask)) {
+        return false;
+    }
+    memcpy(a->memory[MASK_ARRAY], fields_of(mask)->data, size);
+    return memchr(a->memory[MASK_ARRAY], 1, size) != NULL;
+}
+
 /* Returning */
 
-static PyObject *dict_of(const Results *r, const StepArrays *a) {
+static PyObject *dict_of(const Results *r, const ResultArrays *a) {
     PyObject *dict = PyDict_New();
 
     for (size_t i = 0; i < r->number_of_seen && dict != NULL; i++) {
@@ -327,7 +393,7 @@ static PyObject *dict_of(const Results *r, const StepArrays *a) {
     return dict;
 }
 
-static PyObject *tuple_of(const Results *r, const StepArrays *a) {
+static PyObject *tuple_of(const Results *r, const ResultArrays *a) {
     PyObject *tuple = PyTuple_New((Py_ssize_t)r->number_of_seen);
 
     for (size_t i = 0; i < r->number_of_seen && tuple != NULL; i++) {
@@ -336,7 +402,7 @@ static PyObject *tuple_of(const Results *r, const StepArrays *a) {
     return tuple;
 }
 
-static PyObject *observations_of(const Results *r, const StepArrays *a) {
+static PyObject *observations_of(const Results *r, const ResultArrays *a) {
     if (r->names == Py_None) {
         return Py_NewRef(a->arrays[0]);
     }
@@ -344,7 +410,7 @@ static PyObject *observations_of(const Results *r, const StepArrays *a) {
 }
 
 /* Makes the tuple without the constructor of its class, which takes several times as long. */
-PyObject *results_make(const Results *r, const StepArrays *a) {
+PyObject *results_of_step(const Results *r, const ResultArrays *a) {
     PyObject *observations = observations_of(r, a), *infos = PyDict_New();
     PyObject *result = observations == NULL || infos == NULL ? NULL : r->allocate(r->class, 5);
 
@@ -358,5 +424,40 @@ PyObject *results_make(const Results *r, const StepArrays *a) {
         PyTuple_SetItem(result, 1 + i, Py_NewRef(a->arrays[REWARDS_ARRAY + i]));
     }
     PyTuple_SetItem(result, 4, infos);
+    return result;
+}
+
+/* A dict that calls a function, with these arguments, when somebody reads or writes it. */
+static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
+    PyObject *filling = PyTuple_Pack(4, t->fill, t->plan, drawn, mask);
+    PyObject *dict = filling == NULL ? NULL : t->make(t->class, t->no_arguments, NULL);
+
+    if (dict != NULL && (PyObject_SetAttr(dict, t->slot, filling) < 0 ||
+                         PyDict_SetItem(dict, t->unfilled, Py_None) < 0)) {
+        Py_CLEAR(dict);
+    }
+    Py_XDECREF(filling);
+    return dict;
+}
+
+static PyObject *infos_of_reset(const Telling *t, const ResultArrays *a) {
+    PyObject *mask = a->arrays[MASK_ARRAY], *drawn = late_dict(t, a->arrays[DRAWN_ARRAY], mask);
+    PyObject *infos = drawn == NULL ? NULL : PyDict_New();
+
+    if (infos != NULL && (PyDict_SetItem(infos, t->name, drawn) < 0 ||
+                          PyDict_SetItem(infos, t->name_of_mask, mask) < 0)) {
+        Py_CLEAR(infos);
+    }
+    Py_XDECREF(drawn);
+    return infos;
+}
+
+PyObject *results_of_reset(const Results *r, const ResultArrays *a) {
+    PyObject *infos = infos_of_reset(&r->telling, a);
+    PyObject *observations = infos == NULL ? NULL : observations_of(r, a);
+    PyObject *result = observations == NULL ? NULL : PyTuple_Pack(2, observations, infos);
+
+    Py_XDECREF(observations);
+    Py_XDECREF(infos);
     return result;
 }

@@ -1,4 +1,4 @@
-/* The arrays that a step returns, and the tuple and the dicts that they are in. */
+/* The arrays that a step or a reset returns, and the tuple and the dicts that they are in. */
 
 #ifndef FMUGYM_RESULTS_H
 #define FMUGYM_RESULTS_H
@@ -6,20 +6,29 @@
 #include "python.h"
 #include "program.h"
 
-enum { REWARDS_ARRAY = MOST_SEEN, TERMINATED_ARRAY, TRUNCATED_ARRAY, RESULT_ARRAYS };
+enum {
+    REWARDS_ARRAY = MOST_SEEN,
+    TERMINATED_ARRAY,
+    TRUNCATED_ARRAY,
+    MASK_ARRAY,
+    DRAWN_ARRAY,
+    RESULT_ARRAYS
+};
 
 typedef struct Results Results;
 
-/* The arrays of one step, and their memory. Those of observations and infos come first. */
+/* The arrays of one step or reset, and their memory. Those of observations and infos come first. */
 typedef struct {
     PyObject *arrays[RESULT_ARRAYS];
     char *memory[RESULT_ARRAYS];
-} StepArrays;
+} ResultArrays;
 
 /* Takes a tuple: the function numpy.empty; the class of a step's result; what the observations are,
  * an array (None), a dict (the tuple of its keys) or a tuple of arrays that the caller replaces (an
- * empty tuple); and the shape and type of each array: those of observations and infos, then rewards,
- * terminated and truncated. Returns NULL with an exception if it does not fit. */
+ * empty tuple); the shape and type of each array: those of observations and infos, then rewards,
+ * terminated, truncated, mask and drawn values; and the parts of a reset's infos: the names of the
+ * drawn values and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns NULL with
+ * an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 
@@ -27,13 +36,20 @@ size_t results_number_of_seen(const Results *results);
 /* The bytes of an array. */
 size_t results_size(const Results *results, size_t array);
 
-/* Provides arrays for a step: new ones, or ones of an earlier step that nobody but the results
- * holds any more. Returns false with an exception if memory runs out. The caller drops them in any
- * case. */
-bool results_provide(Results *results, StepArrays *arrays);
-void results_drop(const Results *results, StepArrays *arrays);
+/* Provides the arrays of a step or of a reset: new ones, or ones of an earlier call that nobody but
+ * the results holds any more. Returns false with an exception if memory runs out. The caller drops
+ * them in any case. */
+bool results_provide_step(Results *results, ResultArrays *arrays);
+bool results_provide_reset(Results *results, ResultArrays *arrays);
+void results_drop(const Results *results, ResultArrays *arrays);
+
+/* Copies a mask to the array of the mask. Returns false if it is no array that this can be done
+ * with, or has no true element. */
+bool results_copy_mask(const Results *results, PyObject *mask, const ResultArrays *arrays);
 
 /* Returns the result of a step, with an empty dict of infos. */
-PyObject *results_make(const Results *results, const StepArrays *arrays);
+PyObject *results_of_step(const Results *results, const ResultArrays *arrays);
+/* Returns the observations and infos of a reset. */
+PyObject *results_of_reset(const Results *results, const ResultArrays *arrays);
 
 #endif

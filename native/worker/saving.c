@@ -159,26 +159,35 @@ void answer_unbundle(Worker *w, Reader *reader) {
 
 /* Records */
 
+static void write_record(Writer *writer, const Record *record, size_t width) {
+    write_integer(writer, (int64_t)record->number_of_starts);
+    for (size_t i = 0; i < record->number_of_starts; i++) {
+        write_integer(writer, record->starts[i].type);
+        write_integer(writer, record->starts[i].reference);
+        write_integer(writer, record->starts[i].place);
+        write_number(writer, record->starts[i].value);
+    }
+    write_integer(writer, (int64_t)record->rows);
+    write_bytes(writer, record->inputs, record->rows * width * sizeof(double));
+}
+
 /* Without a whole record the answer is empty. */
 void answer_record_of(Worker *w, Reader *reader) {
     const size_t index = (size_t)read_integer(reader);
-    const bool known = w->pool.records != NULL && index < w->settings.count;
-    const Record *record = known ? &w->pool.records[index] : NULL;
     Writer writer = {.bytes = NULL};
+    Record record;
 
-    if (record != NULL && record->whole) {
-        write_integer(&writer, (int64_t)record->number_of_starts);
-        for (size_t i = 0; i < record->number_of_starts; i++) {
-            write_integer(&writer, record->starts[i].type);
-            write_integer(&writer, record->starts[i].reference);
-            write_integer(&writer, record->starts[i].place);
-            write_number(&writer, record->starts[i].value);
-        }
-        write_integer(&writer, (int64_t)record->rows);
-        write_bytes(&writer, record->inputs,
-                    record->rows * w->settings.inputs->count * sizeof(double));
+    if (index >= w->settings.count || !record_is_whole(&w->pool, index)) {
+        send_result(&writer);
+        return;
     }
-    send_result(&writer);
+    if (record_copy(&w->pool, index, &record)) {
+        write_record(&writer, &record, w->settings.inputs->count);
+        send_result(&writer);
+    } else {
+        send_error("out of memory");
+    }
+    record_clear(&record);
 }
 
 void answer_replace_record(Worker *w, Reader *reader) {

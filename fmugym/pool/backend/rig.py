@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.texts import number_of
-from fmugym.errors import SimulationError
+from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
 
@@ -105,7 +105,7 @@ class Rig:
         self._hold: Callable[[], None] | None = getattr(backend, "hold", None)
         self._input_names = [variable.name for variable in spec.inputs]
         self._output_names = [variable.name for variable in spec.outputs]
-        self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
+        self._texts = [i for i, v in enumerate(spec.outputs) if v.kind == "string"]
         self._is_running = False
 
     @property
@@ -180,14 +180,25 @@ class Rig:
             if missing:
                 raise SimulationError(f"the outputs lack {', '.join(map(repr, missing))}")
             outputs = [outputs[name] for name in names]
-        if self._gives_texts:
-            outputs = [number_of(one) if isinstance(one, str) else one for one in outputs]
+        if self._texts and len(outputs) == len(names):
+            outputs = self._without_texts(outputs)
         values: list[float] = np.ravel(np.asarray(outputs, np.float64)).tolist()
         if len(values) != len(names):
             raise SimulationError(
                 f"there are {len(values)} outputs, expected {len(names)} ({', '.join(names)})"
             )
         return values
+
+    def _without_texts(self, outputs: Sequence[Any]) -> list[Any]:
+        """Put numbers in the place of the texts of Strings."""
+        found = list(outputs)
+        for place in self._texts:
+            text = found[place]
+            if not isinstance(text, str):
+                name = self._output_names[place]
+                raise SimulationError(f"the output {name!r} is a String, got {shown(text)}")
+            found[place] = number_of(text)
+        return found
 
 
 def _pair(result: Any) -> tuple[Any, int]:

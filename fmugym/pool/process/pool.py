@@ -16,7 +16,7 @@ import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,7 @@ from fmugym.pool.base import (
     FloatArray,
     MaskArray,
     PoolSpec,
+    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -41,10 +42,14 @@ from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
-from fmugym.pool.process.supervisor import Supervisor
+from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+
+if TYPE_CHECKING:
+    from fmugym.pool.process.play import PlayAround
+    from fmugym.pool.process.rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
 
@@ -95,6 +100,7 @@ class ProcessPool(SavingPool):
         self._spec = spec
         self._lock = RLock()
         self._numbers: dict[tuple[Variable, ...], int] = {}
+        self._play: PlayOfWorkers | None
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
@@ -113,6 +119,7 @@ class ProcessPool(SavingPool):
         threads = threads or max(1, available_processors() // self.workers)
         setup = replace(setup, native=native, threads=threads, own_files=own_files)
         self._setup, self._arrays = setup, arrays
+        self._plays, self._play = 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
@@ -251,11 +258,55 @@ class ProcessPool(SavingPool):
 
     def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
         """See ``Pool.prepare_play``."""
+        self._plays += 1
+        self._parts, self._play = (*parts, *named.values()), None
+        return self._around().prepare(*parts, **named)
+
+    @property
+    def rolls_out(self) -> bool:
+        """See ``Pool.rolls_out``; the program in Wine knows no loops of numpy."""
+        return self.can_play and self._setup.wine is None
+
+    def roll_out(self, *arrays: Any) -> int:
+        """See ``NativePool.roll_out``; each worker does all steps of its block."""
+        actions, seen, *judged, _ = arrays
+        play = self._play = self._play or self._describe_play()
+
+        def tell(supervisor: Supervisor) -> None:
+            block = supervisor.block
+            departure = play.departure(block, actions, seen)
+            supervisor.roll_out(self._plays, play.play, play.counts[block], departure)
+
+        with self._lock:
+            self._drop_recording()
+            replies = self._crew.run(ROLLOUT, self._crew.able, tell)
+            self._crew.note_lost()
+        own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
+        troubled = int(np.count_nonzero(self._crew.lost))
+        for supervisor, reply in replies.items():
+            if isinstance(reply, IndexError):
+                raise reply
+            troubled += reply[0]
+            for array, part in zip(own, reply[1], strict=True):
+                array[:, supervisor.block] = part
+        return troubled
+
+    def _describe_play(self) -> PlayOfWorkers:
+        from fmugym.pool.process.rollouts import PlayOfWorkers
+
+        return PlayOfWorkers(self._arrays, self._parts[1:])
+
+    def prepare_single(self, **groups: Any) -> SingleCalls:
+        """See ``Pool.prepare_single``."""
+        return self._around().prepare_single(self.step_own, groups)
+
+    def _around(self) -> PlayAround:
+        """Make what runs compiled hooks around the workers' steps."""
         if not self.can_play:
             raise SimulationError("compiled hooks need the native pool")
         from fmugym.pool.process.play import PlayAround
 
-        return PlayAround(self._setup, self._arrays, self._advance).prepare(*parts, **named)
+        return PlayAround(self._setup, self._arrays, self._advance)
 
     def _advance(
         self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray

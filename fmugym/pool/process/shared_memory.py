@@ -27,6 +27,7 @@ __all__ = [
     "make_arrays",
     "make_bell",
     "make_echo",
+    "make_progress",
     "offsets_of",
     "size_for",
 ]
@@ -39,6 +40,7 @@ ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
 
 _BELL: Final = np.dtype(np.uint64)
+_PROGRESS: Final = np.dtype(np.int64)
 
 
 class Arrays(NamedTuple):
@@ -86,7 +88,7 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
 
 def size_for(spec: PoolSpec, count: int, workers: int) -> int:
     """Return the bytes that a pool of ``count`` instances needs."""
-    return offsets_of(spec, count, workers)[-1]
+    return offsets_of(spec, count, workers)[-1] + _padded_size((count,), _PROGRESS)
 
 
 def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
@@ -122,6 +124,11 @@ def make_bell(memory: Memory, spec: PoolSpec, count: int, worker: int) -> memory
     """Return the count of the messages to a worker, as the only element of a view."""
     offset = offsets_of(spec, count, worker)[-1] + ECHO_SIZE
     return np.ndarray(1, _BELL, memory.map, offset).data
+
+
+def make_progress(memory: Memory, count: int) -> npt.NDArray[np.int64]:
+    """Return the steps of each episode in a rollout, shape (N,); they end the memory."""
+    return np.ndarray(count, _PROGRESS, memory.map, memory.size - _padded_size((count,), _PROGRESS))
 
 
 class Memory:

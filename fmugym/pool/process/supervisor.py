@@ -19,14 +19,15 @@ from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.last_words import describe_exit, is_crash
 from fmugym.pool.process.launcher import Process
 from fmugym.pool.process.output import Output
-from fmugym.pool.process.shared_memory import Memory, make_echo
+from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
 from fmugym.pool.process.transport import transport_for
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 
-__all__ = ["INSTANTIATION", "LostError", "Supervisor", "patience_with"]
+__all__ = ["INSTANTIATION", "ROLLOUT", "LostError", "Supervisor", "patience_with"]
 
 INSTANTIATION: Final = "the instantiation"
+ROLLOUT: Final = "a rollout"
 _SLOW: Final = (INSTANTIATION, "a reset")
 """What may take ten times as long as other calls: models may need minutes to initialize."""
 
@@ -92,6 +93,8 @@ class Supervisor:
         self._transport = transport_for(setup, memory)
         self._note_crash = note_crash
         self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
+        self._progress = make_progress(memory, setup.num_instances)[setup.block]
+        self._done = b""
         self._output = Output()
         self._deaths = 0
         self._process: Process | None = None
@@ -120,6 +123,7 @@ class Supervisor:
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
         self.known.clear()
+        self._play = -1
         self.tell("open", self._setup)
         self._opening = True
 
@@ -249,6 +253,21 @@ class Supervisor:
                 self._release()
             self._channel.send_object(Code.REQUEST, (name, arguments))
 
+    def roll_out(self, number: int, play: Any, steps: Any, departure: Any) -> None:
+        """Ask for a rollout; failures show in the reply.
+
+        Args:
+            number: The number of the play.
+            play: What surrounds the steps.
+            steps: Those of the episodes until now, shape of the block.
+            departure: See ``RollingWorker.roll_out``.
+        """
+        told = None if number == self._play else play
+        self._play = number
+        self._progress[:] = steps
+        self._done = self._progress.tobytes()
+        self.tell("roll_out", told, departure)
+
     def forget_output(self) -> None:
         """Forget what was printed, because it would not explain a later failure."""
         self._output.drain()
@@ -304,7 +323,7 @@ class Supervisor:
             left = deadline - time.monotonic() if deadline < math.inf else None
             if not self._channel.wait(left):
                 if time.monotonic() >= deadline and not _is_debugged(self.pid):
-                    self._end_hang(doing)
+                    deadline = self._extended(deadline, doing)
                 continue
             try:
                 code = self._channel.receive_code()
@@ -337,6 +356,15 @@ class Supervisor:
         if self._note_crash is not None and status is not None and is_crash(status):
             self._note_crash(f"a worker process {how} in {doing}")
         raise LostError(self.reason)
+
+    def _extended(self, deadline: float, doing: str) -> float:
+        """Give a rollout more time if it has done steps since it got time last; end what hangs."""
+        done = self._progress.tobytes()
+        if doing != ROLLOUT or done == self._done:
+            self._end_hang(doing)
+        patience = deadline - self._asked
+        self._done, self._asked = done, time.monotonic()
+        return self._asked + patience
 
     def _end_hang(self, doing: str) -> None:
         """End a worker that is late; messages that it has not sent yet are lost."""

@@ -17,13 +17,14 @@ import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.fmu import FMU, ExtractedFMU
+from fmugym.archive.fmu import FMU
+from fmugym.archive.loadable import ExtractedFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.texts import text_of
 from fmugym.archive.variable import Variable
@@ -35,12 +36,15 @@ from fmugym.pool.health import HealthArray
 from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.channel import Channel, Code
-from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo
+from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo, make_progress
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.description import SystemDescription
 from fmugym.systems.fmu import ExtractedSystem
 from fmugym.wine.prefix import Wine
+
+if TYPE_CHECKING:
+    from fmugym.pool.process.rollouts import Departure, Play
 
 __all__ = ["BlockWorker", "Setup", "run_worker"]
 
@@ -246,6 +250,7 @@ class BlockWorker:
         log.setLevel(setup.log_level)
         arrays = make_arrays(self._memory, setup.spec, setup.num_instances)
         self._block = arrays.block(setup.block)
+        self._progress = make_progress(self._memory, setup.num_instances)[setup.block]
         if setup.native:
             _native_echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
         self._pool = _make_pool(setup, log, self._block.counts)
@@ -311,6 +316,26 @@ class BlockWorker:
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
         self._pool.replace_record(index, record)
+
+    def roll_out(
+        self, play: Play | None, departure: Departure
+    ) -> tuple[int, tuple[npt.NDArray[Any], ...]] | IndexError:
+        """Do many steps with compiled hooks; see ``RollingWorker.roll_out``.
+
+        Args:
+            play: What surrounds the steps; None if it is that of the rollout before.
+            departure: Where the episodes are, and what they do.
+        """
+        from fmugym.pool.process.rollouts import RollingWorker
+
+        pool: Any = self._pool
+        if play is not None:
+            self._rolling = RollingWorker(pool, play, self._progress)
+        np.copyto(pool.inputs, self._block.inputs)
+        try:
+            return self._rolling.roll_out(departure)
+        except IndexError as error:  # a hook's; the parent raises it
+            return error
 
     def count_steps(self) -> None:
         """Add the steps until now to the shared counts."""

@@ -71,6 +71,17 @@ class Engine(ABC):
             options: As for a single environment.
         """
 
+    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
+        """Do a reset of some environments at once, after one of all.
+
+        Args:
+            options: What the caller has given to ``reset``, not checked yet.
+
+        Returns:
+            As ``reset``. None if ``reset`` has to do it; then nothing has happened.
+        """
+        return None
+
     @abstractmethod
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """Step the environments; those in the mask start an episode instead."""

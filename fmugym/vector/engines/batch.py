@@ -365,6 +365,7 @@ class BatchEngine(Engine):
         if isinstance(columns["streams"], np.ndarray):
             seeds = np.array(columns["seeds"], object)[whence]
             self._streams.put(indices, columns["streams"][whence], seeds)
+        self._streams.require_seeds()
         self.ended[where] = columns["ended"][whence]
         self.any_ended = bool(np.count_nonzero(self.ended))
         self._longest = max(self._longest, int(self.env.step_count.max()))

@@ -16,6 +16,7 @@ from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
+from fmugym.signals import is_of_signal_handler
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
@@ -85,7 +86,7 @@ class CompiledEngine(BatchEngine):
         """Give the pool everything it needs for a step, if it can draw the episodes."""
         plan, streams = self.env._plan, self._streams
         self._task = task
-        self._prepared = False
+        self._prepared = self._resets_at_once = self._is_whole = False
         if task is None or not _can_draw(task, plan):
             return
         self._left = task.left
@@ -96,11 +97,16 @@ class CompiledEngine(BatchEngine):
         in_pass = not self._draws_ahead and self.env._warm_ups is None
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
+        self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
+        self._resets_apart = self._resets_apart or not self._pool.plays_alone
         self._make_rows(task)
         layout = Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
-        n, flags = self._n, ((self._n,), _BOOL)
-        arrays = (*layout.shapes, ((n,), np.dtype(np.float64)), flags, flags)
+        self._is_whole = layout.divided is None and not task.left
+        self._resets_at_once = not (self._resets_apart or self._draws_ahead)
+        flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
+        arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
+        told = "drawn", "_drawn", *LateDict.parts(_told, plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -108,14 +114,15 @@ class CompiledEngine(BatchEngine):
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            {**self._surroundings(task), "results": (np.empty, StepResult, layout.names, arrays)},
+            self._surroundings(task)
+            | {"results": (np.empty, StepResult, layout.names, arrays, told)},
         )
         self._play_with_resets = self._pool.watched(self._play)
-        self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
-        self._resets_apart = self._resets_apart or not self._pool.plays_alone
         if not self._resets_apart:
             self._start = self._pool.start_of_play()
+            self._reset_by = self._pool.reset_of_play()
         self._prepared = True
+        self._not_drawn = np.empty(self._drawn_shape)
 
     def _make_rows(self, task: TracedTask) -> None:
         """Make the arrays that stay in place: variables, and what hooks read of the step before."""
@@ -224,12 +231,15 @@ class CompiledEngine(BatchEngine):
         super()._assign(attributes)
         task: TracedTask | None = None
         try:
-            task = trace_hooks(self.env, self._columns)
-            require_same(self.env, Readings.of(self.env), task)
+            found = trace_hooks(self.env, self._columns)
+            require_same(self.env, Readings.of(self.env), found)
+            task = found
         except Exception as reason:  # as in find_programs
+            if is_of_signal_handler(reason):
+                raise
             logger.info("the hooks cannot be compiled any more: %s", reason)
-            task = None
-        self._prepare(task)
+        finally:
+            self._prepare(task)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
@@ -249,6 +259,22 @@ class CompiledEngine(BatchEngine):
         if self._divided is None and not troubled and not self._left:
             return seen, infos
         return self._started(seen, infos, mask, troubled)
+
+    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
+        """See ``Engine.reset_by``."""
+        if not self._resets_at_once or self._any_foreign:
+            return None
+        try:
+            done = self._reset_by(options)
+        except BaseException:
+            self.has_moved = True
+            raise
+        if done is None:
+            return None
+        result, troubled, self.any_ended = done
+        if self._is_whole and not troubled:
+            return result
+        return self._started(*result, result[1]["_drawn"], troubled)
 
     def _started(
         self, seen: Any, infos: dict[str, Any], mask: MaskArray, troubled: int
@@ -328,6 +354,19 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
+        if resetting is not None or not self._is_whole or self._any_foreign or self.starts_at_ends:
+            return self._step_in_parts(actions, resetting)
+        result: StepResult
+        self.has_moved = True  # unless the call refuses its arguments
+        try:
+            result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
+        except _REFUSALS as error:
+            return self.step(self._converted(actions, error), None)
+        self.any_ended = ended > 0
+        return self._completed(result, troubled, None, None) if troubled else result
+
+    def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+        """Do a step for which one call of the pool may not be all."""
         warms_up = resetting is not None and self.env._warm_ups is not None
         if self._any_foreign or not self._prepared or warms_up:
             return self._step_on_arrays(actions, resetting)
@@ -382,7 +421,7 @@ class CompiledEngine(BatchEngine):
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
-        if not self._prepared or self._left or not self._pool.plays_alone:
+        if not self._prepared or self._left or not self._pool.rolls_out:
             return None
         horizon = len(actions)
         shape = horizon, self._n

@@ -14,16 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.extension import has_native_pool
+from fmugym.pool import ufuncs
 from fmugym.vector.hooks.program import UntraceableError
 
-if has_native_pool():
-    from fmugym import _native
-
 __all__ = ["has_known_sines", "loop_of", "squares_nearly_exactly"]
-
-_loops: dict[tuple[Any, tuple[Any, ...]], Any] = {}
-"""The capsules by function and types. They stay alive with the process."""
 
 
 def loop_of(ufunc: np.ufunc, types: tuple[np.dtype[Any], ...]) -> Any:
@@ -32,21 +26,10 @@ def loop_of(ufunc: np.ufunc, types: tuple[np.dtype[Any], ...]) -> Any:
     Raises:
         UntraceableError: If this numpy does not hand it out, or it needs the interpreter.
     """
-    key = ufunc, types
-    if key not in _loops:
-        _loops[key] = _resolved(ufunc, types)
-    return _loops[key]
-
-
-def _resolved(ufunc: Any, types: tuple[np.dtype[Any], ...]) -> Any:
     try:
-        found, capsule = ufunc._resolve_dtypes_and_context(types)
-        ufunc._get_strided_loop(capsule)
-    except Exception as error:  # the two methods are experimental
-        raise UntraceableError(f"numpy hands out no loop of {ufunc.__name__}") from error
-    if tuple(found) != types or not _native.is_free_loop(capsule):
-        raise UntraceableError(f"numpy.{ufunc.__name__} needs the interpreter")
-    return capsule
+        return ufuncs.loop_of(ufunc, types)
+    except ufuncs.LoopError as error:
+        raise UntraceableError(str(error)) from error
 
 
 @functools.cache

@@ -91,7 +91,8 @@ def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]
     try:
         array = np.asarray(value)
         if array.dtype == object:  # decimals, fractions and the like
-            array = np.array([number_of(hook, one) for one in array.flat]).reshape(array.shape)
+            numbers = [number_of(hook, one, may_be_boolean=True) for one in array.flat]
+            array = np.array(numbers).reshape(array.shape)
         if array.ndim > 1 and array.size == count:
             array = array.reshape(count)
         if array.dtype.kind in _NUMBERS:

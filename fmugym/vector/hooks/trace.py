@@ -21,17 +21,16 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues, ParameterValues
 from fmugym.vector.contents import Contents, borrowed
-from fmugym.vector.hooks.functions import exclusive, numpy_of
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
+from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
-    lift,
     loaded,
     same_for_all,
     spread,
@@ -40,7 +39,6 @@ from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
 __all__ = [
     "SeenArray",
-    "SymbolicParameters",
     "TracedTask",
     "Tracer",
     "in_hook",
@@ -167,7 +165,7 @@ class Tracer:
         for name, table in self._tables.items():
             vars(self._env)[name] = table.view(Table)
         for name, row in self._attributes.items():
-            names = _names((), "attribute", name)
+            names = element_names((), "attribute", name)
             vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
         symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
         self._contents = Contents(self._env)
@@ -430,104 +428,6 @@ def _placed(env: FMUEnv, name: str, error: Exception) -> str:
     lines = [f.lineno for f in frames if code is not None and f.filename == code.co_filename]
     where = f", line {lines[-1]}" if lines else ""
     return f"{name}{where}: {what}"
-
-
-def _names(shape: tuple[int, ...], *head: Any) -> npt.NDArray[Any]:
-    """The rows of an array: a name for each element."""
-    names = np.empty(shape, object)
-    for index, place in enumerate(np.ndindex(shape)):
-        names[place] = (*head, index)
-    return names
-
-
-def symbolic_readings(
-    env: FMUEnv, graph: Graph, variables: Mapping[str, np.dtype[Any]], judging: bool
-) -> Readings:
-    """Make readings in which symbols stand for what programs load.
-
-    Args:
-        env: The prototype.
-        graph: Records the operations.
-        variables: The types of the episode variables.
-        judging: Whether the FMU has stepped.
-    """
-
-    def rows(shape: tuple[int, ...], *head: Any, dtype: Any = np.float64) -> Any:
-        return loaded(graph, "row", _names(shape, *head), dtype)
-
-    values = rows((len(env.out),), "output")
-    state = values[: env._output_count]
-    names = EpisodeVariables(env.config.episode_variables)
-    for name, dtype in variables.items():
-        shape = np.shape(env.config.episode_variables[name])
-        names[name] = rows(shape, "before" if judging else "variable", name, dtype=dtype)
-    missing = np.array("it reads self.done before there is one", object)
-    return Readings(
-        values=values,
-        out=symbolic_outputs(env, values),
-        state=state,
-        previous_state=rows((len(env.out),), "kept")[: env._output_count] if judging else state,
-        inputs=rows((len(env._interface.inputs),), "input"),
-        action=_symbolic_action(env, graph, "action"),
-        previous_action=_symbolic_action(env, graph, "previous_action"),
-        step_count=rows((), "step_count", dtype=np.int64),
-        done=loaded(graph, "missing", missing, np.bool_),
-        after_end=lift(graph, np.zeros(LANES, np.bool_)),
-        parameters=MappingProxyType(
-            SymbolicParameters(
-                {n: rows((), "parameter", n) for n in env._interface.parameters},
-                env.fmu.description.strings,
-            )
-        ),
-        variables=names,
-    )
-
-
-def symbolic_outputs(env: FMUEnv, values: Any) -> NamedValues:
-    """Symbols by the names of outputs; Strings have none."""
-    strings = env.fmu.description.strings.intersection(env.out)
-    return _SymbolicOutputs(list(env.out), strings, lambda: values)
-
-
-class _SymbolicOutputs(NamedTexts):
-    """The symbols of outputs; hooks that read a String cannot be traced."""
-
-    def _shown(self, name: str, value: Any) -> Any:
-        raise UntraceableError(f"it reads the String {name!r}")
-
-
-class SymbolicParameters(ParameterValues):
-    """The symbols of parameters; Strings have none, and hooks that read one cannot be traced.
-
-    Args:
-        symbols: The symbols by name; those of Strings are not used.
-        strings: The names of the Strings.
-    """
-
-    def __init__(self, symbols: Mapping[str, Any], strings: frozenset[str]) -> None:
-        super().__init__(symbols)
-        self._strings = strings
-
-    def __getitem__(self, name: str) -> Any:
-        self._require_number(name)
-        return super().__getitem__(name)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """Do what ``dict.get`` does."""
-        self._require_number(name)
-        return super().get(name, default)
-
-    def _require_number(self, name: Any) -> None:
-        if name in self._strings:
-            raise UntraceableError(f"it reads the String {name!r}")
-
-
-def _symbolic_action(env: FMUEnv, graph: Graph, kind: str) -> Symbols:
-    space: Any = env.action_space
-    names = np.empty(space.shape or (), object)
-    for index, place in enumerate(np.ndindex(names.shape)):
-        names[place] = index
-    return loaded(graph, kind, names, space.dtype)
 
 
 def tables_of(env: FMUEnv) -> Iterator[tuple[str, npt.NDArray[Any]]]:

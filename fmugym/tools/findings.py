@@ -1,0 +1,96 @@
+"""What ``validate`` reports: findings, costs and recommended settings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fmugym.tools.advice import Advice, lines_of
+from fmugym.tools.overview import plain
+
+__all__ = ["Finding", "Report"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of a check.
+
+    Attributes:
+        verdict: ``"ok"``, ``"warning"`` or ``"error"``.
+        check: What was checked.
+        text: What was found.
+        cure: What to do about it; empty if there is nothing to do.
+    """
+
+    verdict: str
+    check: str
+    text: str
+    cure: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results of all checks.
+
+    Attributes:
+        findings: The results in the order of the checks.
+        costs: Seconds of real time by name: ``step``, ``reset`` and ``restore`` of one environment.
+            None for a restore that the FMU does not allow.
+        hooks: How a vector environment calls the hooks: ``compiled``, ``array`` or ``per_env``.
+        reset_method: How episodes begin.
+        recommended: Settings that suit the task, by name.
+        advices: Lines for the task file, of these settings.
+    """
+
+    findings: tuple[Finding, ...]
+    costs: Mapping[str, float | None]
+    hooks: str
+    reset_method: str
+    recommended: Mapping[str, Any]
+    advices: tuple[Advice, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The worst verdict."""
+        found = {finding.verdict for finding in self.findings}
+        return next(one for one in ("error", "warning", "ok") if one in found or one == "ok")
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report in types that JSON has."""
+        return {
+            "schema": 1,
+            "verdict": self.verdict,
+            "findings": [asdict(finding) for finding in self.findings],
+            "costs": dict(self.costs),
+            "hooks": self.hooks,
+            "reset_method": self.reset_method,
+            "recommended": dict(self.recommended),
+            "lines": [asdict(one) | {"line": one.line} for one in self.advices],
+        }
+
+    def as_text(self) -> str:
+        """The report in lines of printable ASCII."""
+        lines = []
+        for one in self.findings:
+            lines.append(f"{one.verdict:8} {one.check}: {plain(one.text)}")
+            if one.cure:
+                lines.append(f"{'':8} cure: {plain(one.cure)}")
+        step, reset, restore = (_duration(self.costs[n]) for n in ("step", "reset", "restore"))
+        lines.append(f"a step takes {step}, a reset {reset}, to restore a state {restore}")
+        lines.append(f"episodes begin by {self.reset_method}")
+        lines.append(f"hooks in a vector environment: {self.hooks}")
+        if "envs" in self.recommended:
+            lines.append(f"recommended for a training: --envs {self.recommended['envs']}")
+        if self.advices:
+            lines += ["recommended for the task file:", *lines_of(self.advices)]
+        return "\n".join(lines)
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return "is not possible"
+    for unit, size in (("s", 1.0), ("ms", 1e-3)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds / 1e-6:.3g} us"

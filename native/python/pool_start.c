@@ -1,0 +1,141 @@
+/* The methods of the type Pool that start episodes outside of a step: see play.h. */
+
+#include "playing.h"
+
+#include <string.h>
+
+/* Sets ended to 1 if any episode is at its end now, 0 otherwise. */
+static void do_start(PyPool *self, bool alone, void *context) {
+    PyTurn *t = context;
+    const Play *play = t->turn.play;
+
+    t->call.alone = alone;
+    t->ends.outside = false;
+    t->troubled = pool_start(&self->pool, &t->call, &t->ends.outside);
+    t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
+}
+
+static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *const *args,
+                              PyTurn *t) {
+    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
+    Py_buffer *b = t->buffers;
+
+    return take_vector(args[0], &b[MASK], COPIED, "the mask", ITEM_BOOLEAN, n) &&
+           take_observations(self, playing, args[1], t) &&
+           take_matrix(args[2], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
+                       (Py_ssize_t)playing->play.draws->count, n);
+}
+
+/* How many instances had trouble, and whether any episode is at its end now. */
+static PyObject *start_result(const PyTurn *t) {
+    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, t->ends.ended ? Py_True : Py_False);
+}
+
+static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+    const Playing *playing = playing_of(capsule);
+    PyTurn t;
+    bool done = false;
+
+    clear_turn(playing, &t);
+    if (take_start_arrays(self, playing, args, &t)) {
+        settle_turn(self, playing, &t);
+        t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};
+        done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
+    }
+    release_turn(playing, &t);
+    return done ? start_result(&t) : NULL;
+}
+
+PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+
+    if (!has_arguments(nargs, 3) || !is_prepared(self)) {
+        return NULL;
+    }
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = start_with(self, playing, args);
+    Py_DECREF(playing);
+    return result;
+}
+
+/* The usual reset of some episodes, with nothing between the options and what the caller gets */
+
+/* The mask of a dict that holds nothing else, borrowed; NULL, maybe with an exception, if there is
+ * none. */
+static PyObject *mask_of(PyObject *options) {
+    static PyObject *name; /* of this process: other interpreters cannot load this extension */
+
+    if (!PyDict_CheckExact(options) || PyDict_Size(options) != 1) {
+        return NULL;
+    }
+    if (name == NULL) {
+        name = PyUnicode_InternFromString("reset_mask");
+    }
+    return name == NULL ? NULL : PyDict_GetItemWithError(options, name);
+}
+
+static void settle_reset(PyPool *self, const Playing *playing, const ResultArrays *arrays,
+                         PyTurn *t) {
+    settle_turn(self, playing, t);
+    t->call.mask = (Mask){arrays->memory[MASK_ARRAY], 1};
+    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
+    t->turn.seen = arrays->memory;
+    if (pool_observes(playing)) {
+        t->call.observations = (float *)(void *)arrays->memory[0];
+    }
+}
+
+static PyObject *reset_result(const Playing *playing, const ResultArrays *arrays,
+                              const PyTurn *t) {
+    PyObject *result = results_of_reset(playing->results, arrays);
+    PyObject *tuple = result == NULL ? NULL : PyTuple_New(3);
+
+    if (tuple == NULL) {
+        Py_XDECREF(result);
+        return NULL;
+    }
+    PyTuple_SetItem(tuple, 0, result);
+    PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
+    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended != 0));
+    return tuple;
+}
+
+/* The memory is provided first: that may run code that changes the caller's mask. */
+static PyObject *reset_by(PyPool *self, PyObject *capsule, PyObject *mask) {
+    const Playing *playing = playing_of(capsule);
+    ResultArrays arrays;
+    PyTurn t;
+    PyObject *result = NULL;
+
+    clear_turn(playing, &t);
+    if (results_provide_reset(playing->results, &arrays)) {
+        if (!results_copy_mask(playing->results, mask, &arrays)) {
+            result = Py_NewRef(Py_None);
+        } else {
+            settle_reset(self, playing, &arrays, &t);
+            if (perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self)) {
+                result = reset_result(playing, &arrays, &t);
+            }
+        }
+    }
+    results_drop(playing->results, &arrays);
+    return result;
+}
+
+PyObject *py_reset_by(PyObject *object, PyObject *options) {
+    PyPool *self = (PyPool *)object;
+
+    if (!is_prepared(self) || !has_results(self)) {
+        return NULL;
+    }
+    PyObject *mask = mask_of(options);
+    if (mask == NULL) {
+        return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
+    }
+    Py_INCREF(mask);
+    PyObject *playing = Py_NewRef(self->playing);
+    PyObject *result = reset_by(self, playing, mask);
+    Py_DECREF(playing);
+    Py_DECREF(mask);
+    return result;
+}

@@ -1,0 +1,221 @@
+"""What becomes of worker processes when they fork, or when the process that uses them ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+from process_tools import (
+    INTERRUPTIBLE,
+    fixture_faulty,  # noqa: F401  # the fixture "faulty"
+    fixture_opened,  # noqa: F401  # the fixture "opened"
+    is_alive,
+    linux_only,
+    posix_only,
+    processes_with,
+    wait_until,
+)
+from zoo_tools import ZooEnv, parameters, zoo_fmu
+
+from fmugym.archive.temporary import folder_name, make_folder, sweep
+
+HERE = Path(__file__).parent
+
+
+FORKING_PROGRAM = """
+import sys, time, zoo_tools
+env = zoo_tools.ZooEnv(
+    sys.argv[1], model_parameters=zoo_tools.parameters("fork", at=1), isolation="process"
+)
+env.reset()
+env.step([1.0])
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+@linux_only
+class TestForks:
+    """An FMU that forks: the new process has all that the worker has, its connection too."""
+
+    @pytest.fixture(name="make")
+    def fixture_make(self, tmp_path, opened):
+        def make(fault, **config):
+            config = {"isolation": "process", "call_timeout": 60.0} | config
+            return opened(
+                ZooEnv(zoo_fmu(tmp_path, 2), model_parameters=parameters(fault), **config)
+            )
+
+        return make
+
+    def test_a_death_is_noticed_at_once(self, make, temp_root):
+        env = make("fork_and_crash")
+        env.reset()
+        env.step([1.0])
+        begin = time.monotonic()
+        truncated, info = env.step([1.0])[3:]
+        assert time.monotonic() - begin < 10.0
+        assert truncated
+        assert "ended with signal SIGSEGV in a step" in info["fault"]
+        env.reset()
+        assert len(processes_with(temp_root)) == 1
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_death_between_two_calls(self, make):
+        env = make("fork")
+        env.reset()
+        for _ in range(2):
+            assert not env.step([1.0])[3]
+        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        assert "SIGKILL" in env.step([1.0])[4]["fault"]
+
+    @pytest.mark.parametrize("fault", ["fork", "fork_and_loop"])
+    def test_no_process_is_left(self, make, temp_root, fault):
+        env = make(fault, call_timeout=0.7 if fault == "fork_and_loop" else 60.0)
+        env.reset()
+        fine = [not env.step([1.0])[3] for _ in range(2)]
+        assert fine == [True, fault == "fork"]
+        if fault == "fork":
+            assert len(processes_with(temp_root)) == 2
+        env.close()
+        assert processes_with(temp_root) == []
+
+    def test_a_twin_does_not_take_part(self, make, temp_root):
+        """Its function returns in both processes."""
+        env = make("fork_a_twin")
+        for _ in range(3):
+            env.reset()
+            assert [env.step([1.0])[0].item() for _ in range(4)] == [0.5, 1.0, 1.5, 2.0]
+        wait_until(lambda: len(processes_with(temp_root)) == 1)
+
+    def test_a_killed_parent_leaves_none(self, tmp_path, temp_root):
+        zoo_fmu(tmp_path, 2)
+        program = subprocess.Popen(
+            [sys.executable, "-c", FORKING_PROGRAM, tmp_path / "Zoo.fmu"],
+            env=os.environ | {"PYTHONPATH": str(HERE)},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        with program:
+            assert program.stdout.readline() == "ready\n"
+            assert len(processes_with(temp_root)) == 2
+            program.kill()
+        wait_until(lambda: not processes_with(temp_root))
+
+
+PROGRAM = """
+import os, signal, sys, time
+import process_tools
+from fmugym.pool.process.launcher import _fork_server
+
+env = process_tools.FaultyEnv(sys.argv[1])
+env.reset()
+env.step([1.0])
+print(*env._pool.processes(), _fork_server().pid, flush=True)
+"""
+
+
+def program_that_ends(end):
+    return INTERRUPTIBLE + PROGRAM + textwrap.dedent(end)
+
+
+class TestEndOfParent:
+    @pytest.fixture(name="start")
+    def fixture_start(self, faulty, temp_root):
+        """Start a program; returns it and the numbers of its worker and of its fork server."""
+        programs = []
+
+        def start(end):
+            path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
+            program = subprocess.Popen(
+                [sys.executable, "-W", "error", "-c", program_that_ends(end), faulty],
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=os.environ | {"PYTHONPATH": path},
+                start_new_session=True,
+            )
+            programs.append(program)
+            return program, [int(pid) for pid in program.stdout.readline().split()]
+
+        yield start
+        for program in programs:
+            program.kill()
+            program.communicate()
+
+    @pytest.mark.parametrize("end", ["", "env.close()", "os._exit(0)", "sys.exit(0)", "del env"])
+    def test_ordinary(self, start, temp_root, end):
+        program, pids = start(end)
+        assert program.communicate()[1] == ""
+        wait_until(lambda: not any(map(is_alive, pids)))
+        assert list(temp_root.iterdir()) == []
+
+    @posix_only
+    @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+    def test_by_a_signal(self, start, temp_root, number):
+        """A Ctrl-C goes to all processes of the terminal."""
+        program, pids = start("time.sleep(60)")
+        send = os.killpg if number == signal.SIGINT else os.kill
+        send(program.pid, number)
+        stderr = program.communicate()[1]
+        assert "KeyboardInterrupt" in stderr if number == signal.SIGINT else stderr == ""
+        wait_until(lambda: not any(map(is_alive, pids)))
+        assert list(temp_root.iterdir()) == []
+
+    @linux_only
+    def test_while_the_fmu_hangs(self, start, temp_root):
+        end = "env.reset(options={'model_parameters': process_tools.start_values('hang', at=1)})"
+        program, pids = start(f"{end}; print('hanging', flush=True); env.step([1.0])")
+        assert program.stdout.readline() == "hanging\n"
+        program.kill()
+        wait_until(lambda: not any(map(is_alive, pids)))
+        wait_until(lambda: not list(temp_root.iterdir()))
+
+    @linux_only
+    def test_together_with_its_fork_server(self, start, temp_root):
+        """Only the folder remains, until the next process that needs one."""
+        program, pids = start("time.sleep(60)")
+        os.kill(pids[-1], signal.SIGKILL)
+        program.kill()
+        program.communicate()
+        wait_until(lambda: not any(map(is_alive, pids)))
+        (left,) = temp_root.iterdir()
+        sweep.cache_clear()
+        made = folder_name()
+        make_folder(made)
+        assert not left.exists()
+        sweep.cache_clear()
+        sweep()
+        assert made.exists()
+
+    @posix_only
+    def test_a_fork_of_it_leaves_the_pool_alone(self, start):
+        """The fork can neither use the pool nor take the folder away."""
+        program, _ = start(
+            """
+            child = os.fork()
+            if child == 0:
+                try:
+                    env.step([1.0])
+                except Exception as error:
+                    print(error, flush=True)
+                sys.exit(0)
+            os.waitpid(child, 0)
+            print(env.step([1.0])[0])
+            os.kill(env._pool.processes()[0], signal.SIGKILL)
+            print("SIGKILL" in env.step([1.0])[4]["fault"])
+            env.reset()
+            print(env.step([1.0])[0])
+            """
+        )
+        stdout, stderr = program.communicate()
+        lines = stdout.splitlines()
+        assert lines, stderr
+        assert "the process that this one was forked from" in lines[0]
+        assert lines[1:] == ["[1.]", "True", "[0.5]"]
+        assert "Error" not in stderr

@@ -1,0 +1,357 @@
+"""Resets with a mask: one call of the native pool does what the general way does.
+
+A mask that is a list takes the general way, an array the quick one.
+"""
+
+import gc
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from vector_tools import CART_POLE, Drawing, PushedCart, require_equal
+
+from fmugym import ConfigError, FMUVectorEnv, SimulationError, Uniform
+from fmugym.pool import has_native_pool
+from fmugym.vector.engines.compiled import CompiledEngine
+
+pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+
+
+class Pictured(Drawing):
+    """The observation is a small picture."""
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(0, 255, (2, 3), np.uint8)
+
+    def _get_observation(self):
+        angle = np.clip(self.state[0] * 100 + 100, 0, 255)
+        steps, one = self.step_count, np.ones_like(angle)
+        return np.array([[angle, one, one], [steps, one, angle / 2]]).astype(np.uint8)
+
+
+class Nested(Drawing):
+    """A dict within a dict, and infos."""
+
+    def _get_observation_space(self):
+        box = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        return gym.spaces.Dict({"own": gym.spaces.Dict({"state": box}), "twice": box})
+
+    def _get_observation(self):
+        state = np.array([self.state[0], self.state[1]], np.float32)
+        return {"own": {"state": state}, "twice": 2 * state}
+
+    def _get_info(self):
+        return {"angle": self.state[0], "of": {"steps": self.step_count}}
+
+
+class Summing(Drawing):
+    """Reads episode variables, some of them drawn, actions and the state before the step."""
+
+    def __init__(self):
+        variables = {"target": Uniform(-1.0, 1.0), "sum": 0.0, "steps": 0}
+        super().__init__(episode_variables=variables, monitor_names=["theta_ddot"])
+
+    def _update(self):
+        error = self.variables["target"] - self.state[0]
+        self.variables["sum"] = self.variables["sum"] + error
+        self.variables["steps"] = self.variables["steps"] + 1
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (5,), np.float64)
+
+    def _get_observation(self):
+        moved = self.state[0] - self.previous_state[0]
+        own = self.variables["target"], self.variables["sum"], self.variables["steps"]
+        return np.array([*own, moved, self.action[0] - self.previous_action[0]])
+
+
+class Failing(PushedCart):
+    """Some episodes end by a fault."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=3, on_fault="terminate", fault_reward=-7.0)
+
+
+TASKS = [CART_POLE, Drawing, Summing, Pictured, Nested, Failing]
+
+
+def made(task, num_envs=5, **options):
+    envs = FMUVectorEnv(task, num_envs, autoreset_mode=AutoresetMode.DISABLED, **options)
+    envs.reset(seed=3)
+    return envs
+
+
+def require_same(first, second):
+    """Equal to the last bit, in the same order, with tuples and dicts of the same types."""
+    assert type(first) is type(second)
+    if isinstance(first, dict):
+        assert list(first) == list(second)
+        require_same(tuple(first.values()), tuple(second.values()))
+    elif isinstance(first, tuple):
+        assert len(first) == len(second)
+        for mine, other in zip(first, second, strict=True):
+            require_same(mine, other)
+    else:
+        require_equal(first, second)
+
+
+def masks(rng, ended):
+    """The environments that have ended, and some others now and then."""
+    return ended | (rng.random(len(ended)) < 0.2)
+
+
+def play_both(first, second, steps=40):
+    """Step two vector environments; one gets arrays as masks, the other one lists."""
+    rng, resets = np.random.default_rng(0), 0
+    first.action_space.seed(0)
+    for _ in range(steps):
+        actions = first.action_space.sample()
+        results = first.step(actions), second.step(actions)
+        require_same(tuple(results[0]), tuple(results[1]))
+        mask = masks(rng, results[0][2] | results[0][3])
+        if mask.any():
+            resets += 1
+            options = {"reset_mask": mask}
+            quick = first.reset(options=options)
+            assert list(options) == ["reset_mask"]
+            require_same(quick, second.reset(options={"reset_mask": mask.tolist()}))
+    require_same(first.get_attr("step_count"), second.get_attr("step_count"))
+    require_same(
+        tuple(first._engine.columns(np.arange(first.num_envs))["streams"]),
+        tuple(second._engine.columns(np.arange(first.num_envs))["streams"]),
+    )
+    return resets
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("num_envs", [1, 5, 140])
+def test_both_ways_do_the_same(task, num_envs):
+    first, second = made(task, num_envs), made(task, num_envs)
+    assert isinstance(first._engine, CompiledEngine)
+    assert play_both(first, second) >= 5
+    first.close()
+    second.close()
+
+
+@pytest.mark.parametrize(
+    "options", [{"isolation": "process"}, {"threads": 2}, {"private_libraries": True}]
+)
+def test_every_pool_does_the_same(options):
+    first, second = made(CART_POLE, **options), made(CART_POLE)
+    assert play_both(first, second) >= 5
+    first.close()
+    second.close()
+
+
+@pytest.mark.parametrize("task", [CART_POLE, Drawing, Summing, Pictured, Nested])
+def test_one_call_of_the_pool_does_it(task, monkeypatch):
+    envs = made(task)
+
+    def refuse(*_):
+        raise AssertionError("the general way")
+
+    monkeypatch.setattr(CompiledEngine, "reset", refuse)
+    for mask in np.eye(5, dtype=np.bool_):
+        envs.reset(options={"reset_mask": mask})
+    monkeypatch.undo()
+    envs.close()
+
+
+def test_environments_that_go_on_keep_their_observations():
+    envs = made(CART_POLE)
+    last = envs.step(np.ones(5, np.int64))[0].copy()
+    observations, infos = envs.reset(options={"reset_mask": np.array([0, 1, 0, 1, 1], np.bool_)})
+    kept = np.array([True, False, True, False, False])
+    require_equal(observations[kept], last[kept])
+    assert (observations[~kept] != last[~kept]).any(1).all()
+    require_equal(infos["_drawn"], ~kept)
+    require_equal(infos["drawn"]["x_0"][kept], np.zeros(2))
+    require_equal(infos["drawn"]["x_0"][~kept].astype(np.float32), observations[~kept, 0])
+    envs.close()
+
+
+@pytest.mark.parametrize("task", [CART_POLE, Pictured, Nested])
+def test_what_the_caller_holds_does_not_change(task):
+    """Infos are read only at the end, when their memory could have served many resets more."""
+    late, early = made(task), made(task)
+    rng, held, expected = np.random.default_rng(1), [], []
+    for _ in range(30):
+        mask = masks(rng, np.array([True, False, False, False, False]))
+        held.append(late.reset(options={"reset_mask": mask}))
+        result = early.reset(options={"reset_mask": mask})
+        expected.append((str(result), result))
+        if rng.random() < 0.5:
+            del held[-1], expected[-1]
+    for mine, (text, theirs) in zip(held, expected, strict=True):
+        require_same(mine, theirs)
+        assert str(mine) == text
+    late.close()
+    early.close()
+
+
+def test_memory_that_nobody_holds_serves_again():
+    envs, places = made(CART_POLE), set()
+    for mask in np.tile(np.eye(5, dtype=np.bool_), (4, 1)):
+        observations, infos = envs.reset(options={"reset_mask": mask})
+        places.add((observations.ctypes.data, infos["_drawn"].ctypes.data))
+        del observations, infos
+    assert len(places) <= 2
+    envs.close()
+
+
+def test_the_caller_may_go_on_with_its_mask():
+    envs, mask = made(CART_POLE), np.array([True, False, False, False, True])
+    infos = envs.reset(options={"reset_mask": mask})[1]
+    mask[:] = True
+    require_equal(infos["_drawn"], np.array([True, False, False, False, True]))
+    assert (infos["drawn"]["x_0"][1:4] == 0).all()
+    infos["_drawn"][:] = False  # it belongs to the caller, too
+    again = envs.reset(options={"reset_mask": mask})[1]
+    assert again["_drawn"].all()
+    envs.close()
+
+
+class Own(np.ndarray):
+    """An array with a class of its own."""
+
+
+def read_only(mask):
+    mask = mask.copy()
+    mask.flags.writeable = False
+    return mask
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        lambda mask: mask.astype(object).astype(np.bool_),
+        lambda mask: np.repeat(mask, 2)[::2],
+        lambda mask: mask[::-1].copy()[::-1],
+        lambda mask: mask.view(Own),
+        lambda mask: mask.astype(np.uint8).view(np.bool_),
+        lambda mask: tuple(mask.tolist()),
+        read_only,
+    ],
+)
+def test_masks_of_every_form(form):
+    mask = np.array([True, False, False, True, False])
+    first, second = made(CART_POLE), made(CART_POLE)
+    quick = first.reset(options={"reset_mask": form(mask)})
+    require_same(quick, second.reset(options={"reset_mask": mask.tolist()}))
+    first.close()
+    second.close()
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        np.zeros(5, np.bool_),
+        np.ones(4, np.bool_),
+        np.ones((5, 1), np.bool_),
+        np.ones(5, np.int64),
+        np.ones(5),
+        "all",
+        5,
+    ],
+)
+def test_a_mask_that_does_not_fit_changes_nothing(mask):
+    envs, twin = made(CART_POLE), made(CART_POLE)
+    with pytest.raises(ConfigError, match=r"reset_mask.*\(5,\).*True"):
+        envs.reset(options={"reset_mask": mask})
+    actions = np.ones(5, np.int64)
+    require_same(tuple(envs.step(actions)), tuple(twin.step(actions)))
+    envs.close()
+    twin.close()
+
+
+def test_ends_that_are_left_have_to_be_reset():
+    envs = FMUVectorEnv(CART_POLE, 3, autoreset_mode=AutoresetMode.DISABLED, max_episode_steps=2)
+    envs.reset(seed=0)
+    actions = np.zeros(3, np.int64)
+    envs.step(actions)
+    assert envs.step(actions).truncated.all()
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    with pytest.raises(SimulationError, match="environment 1"):
+        envs.step(actions)
+    envs.reset(options={"reset_mask": np.array([False, True, False])})
+    envs.step(actions)
+    envs.close()
+
+
+@pytest.mark.parametrize("ready", ["never", "closed"])
+def test_a_reset_with_a_mask_needs_a_reset_of_all(ready):
+    envs = FMUVectorEnv(CART_POLE, 3)
+    if ready == "closed":
+        envs.reset(seed=0)
+        envs.close()
+    with pytest.raises((ConfigError, SimulationError), match=r"all environments|closed"):
+        envs.reset(options={"reset_mask": np.array([True, False, True])})
+    envs.close()
+
+
+def test_parameters_given_before_count():
+    """Options put the constants of some episodes in the place of the plan's: the general way."""
+    first, second = made(CART_POLE), made(CART_POLE)
+    mask = np.array([True, True, False, False, False])
+    for envs in first, second:
+        envs.reset(options={"reset_mask": mask, "model_parameters": {"x_0": 0.5}})
+    assert play_both(first, second, 20) >= 5
+    first.set_attr("m_cart", [1.0, 2.0, 3.0, 4.0, 5.0])
+    second.set_attr("m_cart", [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert play_both(first, second, 20) >= 5
+    first.close()
+    second.close()
+
+
+class Dividing(Drawing):
+    """Its first observation is not finite in the second episodes."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"start": Uniform(0.0, 1.0)})
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def _get_observation(self):
+        return np.array([np.log(self.variables["start"] - self.bound)])
+
+    bound = 0.0
+
+
+def test_a_first_observation_that_is_not_finite():
+    texts = []
+    for form in np.array, np.ndarray.tolist:
+        envs = made(Dividing)
+        envs.set_attr("bound", 1.0)
+        mask = np.array([False, False, True, False, True])
+        with pytest.raises(SimulationError, match=r"environment 2.*nan") as caught:
+            envs.reset(options={"reset_mask": form(mask)})
+        texts.append(str(caught.value))
+        envs.set_attr("bound", 0.0)
+        with pytest.raises(SimulationError, match="exception"):
+            envs.step(envs.action_space.sample())
+        envs.reset()
+        envs.close()
+    assert texts[0] == texts[1]
+
+
+def test_references_do_not_leak():
+    envs, mask = made(CART_POLE), np.array([True, False, False, True, False])
+    engine, options = envs._engine, {"reset_mask": mask}
+    watched = (mask, options, engine.env._plan, CART_POLE, None, True, False, "drawn", "_drawn")
+
+    def play():
+        for _ in range(300):
+            observations, infos = envs.reset(options=options)
+        assert infos["drawn"]["x_0"].any()
+        del observations, infos
+        gc.collect()
+        return [sys.getrefcount(value) for value in watched], len(gc.get_objects())
+
+    play()
+    (before, objects), (after, left) = play(), play()
+    assert all(abs(b - a) < 50 for a, b in zip(before, after, strict=True))
+    assert abs(left - objects) < 100
+    envs.close()
