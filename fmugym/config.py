@@ -54,6 +54,11 @@ _POSITIVE: Final = (
 )
 _NAMES: Final = ("model_input_names", "model_output_names", "monitor_names", "preload")
 
+_ELSEWHERE: Final = dict.fromkeys(
+    ("render_mode", "backend", "hooks", "log_level"), "the environment's constructor"
+) | {"seed": "reset"}
+"""What is not said in a config, and where it is."""
+
 
 @dataclass(frozen=True)
 class EnvConfig:
@@ -189,6 +194,8 @@ class EnvConfig:
         items = check_mapping("config", config)
         known = [f.name for f in fields(cls)]
         for key in items:
+            if key in _ELSEWHERE:
+                raise ConfigError(f"{key!r} is no config key, but an argument of {_ELSEWHERE[key]}")
             if key not in known:
                 raise unknown_name("config key", key, known)
         for key in ("model_input_names", "model_output_names"):

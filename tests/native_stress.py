@@ -37,9 +37,6 @@ from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
 THREADS = 6
-TOLD = "drawn", "_drawn", *LateDict.parts(lambda _, drawn, mask: {"drawn": drawn * mask}, None)
-"""What is told of a reset."""
-
 PATIENCE = 120.0
 """Seconds after which a call counts as one that never returns."""
 
@@ -103,6 +100,8 @@ def draws(*rows):
 
 
 DRAWS = draws(0)
+TOLD = "drawn", "_drawn", *LateDict.parts(lambda _, drawn, mask: {"drawn": drawn * mask}, None)
+"""What a reset tells of the episodes that it starts."""
 
 
 class ReceiverError(Exception):

@@ -7,6 +7,7 @@ from contextlib import closing
 import exchange_tools
 import numpy as np
 import pytest
+import values_tools
 import wine_tools
 from pool_kinds import POOLS
 
@@ -169,6 +170,13 @@ class TestRefusals:
     def test_model_exchange(self, fmu_path):
         with pytest.raises(ConfigError, match="interpolate inputs"):
             Env(fmu_path(2, "", "ModelExchange"), CONFIG)
+
+    def test_arrays_are_taken_by_elements(self, tmp_path):
+        """The array stands for v[1] and v[2]; the FMU cannot interpolate."""
+        path = values_tools.feedthrough_fmu(tmp_path / "feedthrough.fmu", 2)
+        config = {"model_input_names": "v", "model_output_names": "w", "time_step": H}
+        with pytest.raises(ConfigError, match=r"'v\[1\]' can only hold"):
+            Env(path, config | {"input_interpolation": "linear"})
 
     def test_parameters(self, fmu_path):
         config = CONFIG | {"model_input_names": ["u", "k"], "bounds": {"u": (0, 1), "k": (0, 1)}}

@@ -6,9 +6,11 @@ import re
 from contextlib import closing
 
 import clocks_tools
+import fmu_tools
 import numpy as np
 import pytest
 import updates_tools
+import values_tools
 import wine_tools
 from fmpy import extract
 from fmpy.fmi3 import FMU3Slave, fmi3ValueReference
@@ -345,7 +347,7 @@ def test_environments(path):
     ("changes", "facts"),
     [
         ({"flags": ""}, ["'u'", "providesIntermediateUpdate"]),
-        ({"updated": ("x", "y")}, ["'u'", "intermediateUpdate"]),
+        ({"updated": ("x", "y")}, ["'u'", "(intermediateUpdate"]),
     ],
 )
 def test_inputs_that_cannot_be_linear_are_named(tmp_path, changes, facts):
@@ -397,3 +399,31 @@ def test_components_of_systems_have_linear_inputs(path, kind):
             ends.append(x)
         assert row == pytest.approx([np.mean(ends), x], rel=1e-12)
         before = action
+
+
+@pytest.fixture(name="arrays")
+def state_space(tmp_path):
+    path = values_tools.state_space_fmu(tmp_path / "plain.fmu", ("CoSimulation",))
+    kept = {"<CoSimulation ": f"<CoSimulation {updates_tools.PROVIDES} "}
+    kept |= {f'name="{name}"': f'name="{name}" intermediateUpdate="true"' for name in "ux"}
+    return fmu_tools.edited_fmu(path, tmp_path, kept)
+
+
+@all_but_wine
+def test_elements_of_arrays_are_told(arrays, kind):
+    """With u = 1, x[2] is (1 - exp(-2 t)) / 4, of which a step of 1 s gives the mean."""
+    fmu = FMU(arrays, probe_timeout=None)
+    outputs = tuple(map(fmu.variable, ("x[2]", "y[1]", "x[2]")))
+    spec = PoolSpec((fmu.variable("u[1]"),), outputs, 1.0, samplings=("mean", "mean", "last"))
+    with closing(opening.make_pool(fmu, spec, 2, LOG, **OPTIONS[kind])) as pool:
+        pool.reset((), np.zeros((0, 2)))
+        found = step(pool, [1.0, 1.0])
+    end = 0.25 * (1.0 - math.exp(-2.0))
+    np.testing.assert_allclose(found[0], 0.25 - end / 2, rtol=1e-4)
+    np.testing.assert_allclose(found[2], end, rtol=1e-9)
+
+
+def test_elements_of_arrays_cannot_be_linear(arrays):
+    config = {"model_input_names": "u", "model_output_names": "x", "time_step": H}
+    with pytest.raises(ConfigError, match=r"'u\[1\]' cannot be linear.*element"):
+        Env(arrays, config | {"input_interpolation": {"u": "linear"}})

@@ -48,6 +48,8 @@ def at_construction(error, match, **changes):
             ConfigError, "'gainn'; did you mean 'gain'", model_parameters={"gainn": 1.0}
         ),
         at_construction(ConfigError, "unknown config key 'timestep'; did you mean", timestep=0.1),
+        at_construction(ConfigError, "'render_mode' .*constructor", render_mode="human"),
+        at_construction(ConfigError, "'seed' .*reset", seed=3),
         at_construction(ConfigError, "in 'bounds' 'smu'; did you mean", bounds={"smu": (0, 1)}),
         at_construction(ConfigError, "names no output", model_output_names=[]),
         at_construction(ConfigError, "'a' is named twice", model_input_names=["a", "a"]),

@@ -137,3 +137,114 @@ def test_inputs_reach_the_environments_that_go_on():
     assert envs.get_attr("inputs") == tuple((float(action),) for action in actions[:, 0])
     envs.close()
     alone.close()
+
+
+class Breaking(Drawing):
+    """The observation, in one of several forms, or the reward breaks at an angle."""
+
+    form = "array"
+
+    def __init__(self):
+        starts = {"q_0": fmugym.Uniform(0.2, 1.0)}
+        changes = {"episode_variables": {"sum": 0.0}, "max_episode_steps": 30}
+        super().__init__(model_parameters=starts, **changes)
+
+    def _get_observation_space(self):
+        box = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        return spaces.Dict({"one": box, "two": box}) if self.form == "dict" else box
+
+    def _update(self):
+        self.variables["sum"] += self.state[0]
+
+    def _is_done(self):
+        return self.state[0] < 0.1
+
+    def _reward_policy(self):
+        breaks = self.form == "reward" and self.state[0] < 0.1
+        return np.float64(np.nan if breaks else self.variables["sum"])
+
+    def _get_observation(self):
+        q, q_dot = self.state
+        seen = np.float32([q_dot, np.inf if q < 0.1 and self.form != "reward" else q])
+        if self.form == "dict":
+            return {"one": np.float32(self.state), "two": seen}
+        return seen.tolist() if self.form == "list" else seen
+
+
+@pytest.mark.parametrize("form", ["array", "list", "dict", "reward"])
+def test_a_number_that_breaks_is_a_fault_as_in_single_environments(form, monkeypatch):
+    """Also where the hooks end the episode in that step; the variables are as before it."""
+    monkeypatch.setattr(Breaking, "form", form)
+    envs = FMUVectorEnv(Breaking, 6, hooks="per_env", autoreset_mode="disabled")
+    alone = [Breaking() for _ in range(6)]
+    envs.reset(seed=0)
+    for seed, env in enumerate(alone):
+        env.reset(seed=seed)
+    faults = 0
+    for _ in range(25):
+        seen, rewards, terminated, truncated, infos = envs.step(np.zeros((6, 1), np.float32))
+        for index, env in enumerate(alone):
+            row, *rest, info = env.step(np.zeros(1, np.float32))
+            assert rest == [rewards[index], terminated[index], truncated[index]]
+            for name in row if form == "dict" else [...]:
+                expected = row[name] if form == "dict" else row
+                np.testing.assert_array_equal(seen[name][index], expected)
+            if info:
+                assert infos["fault"][index] == info["fault"]
+                assert infos["fault_rate"][index] == info["fault_rate"]
+                faults += 1
+        assert envs.get_attr("variables") == tuple(env.variables for env in alone)
+        assert envs.get_attr("state") == tuple(env.state for env in alone)
+        ended = terminated | truncated
+        if ended.any():
+            envs.reset(options={"reset_mask": ended})
+            for index in np.flatnonzero(ended):
+                alone[index].reset()
+    assert faults >= 6
+    for env in (envs, *alone):
+        env.close()
+
+
+class Replacing(Drawing):
+    """A method replaces the default hook."""
+
+    def replace(self):
+        self._get_inputs = lambda: 0.5 * self.action[0]
+
+
+def test_inputs_are_asked_of_a_hook_that_was_set_later():
+    """Before, the actions were the inputs without any hook."""
+    envs = FMUVectorEnv(Replacing, 2, hooks="per_env")
+    envs.reset(seed=0)
+    actions = np.full((2, 1), 0.004, np.float32)
+    envs.step(actions)
+    plain = float(np.float32(0.004))
+    assert envs.get_attr("inputs") == ((plain,), (plain,))
+    envs.call("replace")
+    envs.step(actions)
+    assert envs.get_attr("inputs") == ((0.5 * plain,), (0.5 * plain,))
+    np.testing.assert_array_equal(envs._pool.inputs, [[0.5 * plain] * 2])
+    envs.close()
+
+
+class Informing(Drawing):
+    """Infos are whole numbers at the start of an episode and halves later."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=2)
+
+    def _get_info(self):
+        return {"part": self.step_count / 2 if self.step_count else 0}
+
+
+def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments():
+    envs = FMUVectorEnv(Informing, 2, hooks="per_env", autoreset_mode="next_step")
+    envs.reset(seed=0)
+    actions = np.zeros((2, 1), np.float32)
+    envs.step(actions)
+    envs._engine.ended[:] = [False, True]
+    envs._engine.any_ended = True
+    infos = envs.step(actions)[-1]
+    assert infos["part"].tolist() == [1.0, 0.0]
+    assert infos["part"].dtype == np.float64
+    envs.close()

@@ -52,9 +52,10 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     experiment = source.defaultExperiment
     _read_unsigned_limits(source, root)
     elements = {element.get("name"): element for element in root.find("ModelVariables")}
-    makes_updates = _offers(root, interface, "providesIntermediateUpdate")
+    capabilities = _capabilities(source, root, interface, offer)
+    updates = capabilities.provides_intermediate_update
     variables = {
-        v.name: _convert_variable(v, elements.get(v.name, {}), makes_updates)
+        v.name: _convert_variable(v, elements.get(v.name, {}), updates)
         for v in source.modelVariables
     }
     return ModelDescription(
@@ -70,7 +71,7 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         tolerance=_time(experiment, "tolerance"),
         step_size=_time(experiment, "stepSize"),
         fixed_internal_step_size=_time(offer, "fixedInternalStepSize"),
-        capabilities=_capabilities(source, root, interface, offer),
+        capabilities=capabilities,
         variables=variables,
         derivatives=_derivatives(source),
         findings=_findings(source),
@@ -234,6 +235,7 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         interface == "co_simulation"
         and source.fmiVersion.startswith("2")
         and offer.canInterpolateInputs,
+        _offers(root, interface, "providesIntermediateUpdate"),
     )
 
 
@@ -270,7 +272,7 @@ def _read_unsigned_limits(source: Any, root: Any) -> None:
             variable.min, variable.max = element.get("min"), element.get("max")
 
 
-def _convert_variable(source: Any, element: Any, makes_updates: bool) -> Variable:
+def _convert_variable(source: Any, element: Any, updates: bool) -> Variable:
     _check_reference(source)
     ticking = _ticking(source, element)
     return Variable(
@@ -296,7 +298,7 @@ def _convert_variable(source: Any, element: Any, makes_updates: bool) -> Variabl
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking),
         by_fractions=element.get("supportsFraction") in {"true", "1"},
-        updated=makes_updates and element.get("intermediateUpdate") in {"true", "1"},
+        updated=updates and not ticking and element.get("intermediateUpdate") in {"true", "1"},
     )
 
 

@@ -64,6 +64,7 @@ class Capabilities:
     needs_execution_tool: bool = False
     provides_adjoint_derivatives: bool = False
     can_interpolate_inputs: bool = False
+    provides_intermediate_update: bool = False
 
     @property
     def provides_derivatives(self) -> bool:
@@ -229,9 +230,11 @@ class ModelDescription:
         if self.uses_event_mode:
             return f"{name} cannot interpolate inputs in event mode, which it needs"
         if not variable.updated:
+            able = self.capabilities.provides_intermediate_update
+            missing = "intermediateUpdate of the variable" if able else "providesIntermediateUpdate"
             return (
                 f"{name} cannot interpolate inputs: it takes no values of {variable.name!r} within "
-                "a step (providesIntermediateUpdate, and intermediateUpdate of the variable)"
+                f"a step ({missing})"
             )
         return None
 

@@ -249,6 +249,7 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
         provides_directional_derivatives=False,
         provides_adjoint_derivatives=False,
         can_interpolate_inputs=False,
+        provides_intermediate_update=False,
     )
 
 

@@ -7,6 +7,7 @@ from math import hypot, isfinite
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, shown
@@ -54,6 +55,21 @@ class InputWriter:
             if len(inputs) == len(self._variables) and isfinite(hypot(*inputs)):
                 return inputs
         return self._flat(values, action)
+
+    def of_actions(self, actions: npt.NDArray[Any]) -> FloatArray | None:
+        """The inputs of M environments whose actions are their inputs.
+
+        Args:
+            actions: Shape (M, ...).
+
+        Returns:
+            Shape (M, k); None if ``checked`` would have to round them, or would refuse one.
+        """
+        if not self._are_float64 or actions.dtype.char not in "fd":
+            return None
+        rows = actions.reshape(len(actions), actions[:1].size).astype(np.float64)
+        fit = rows.shape[1] == len(self._variables) and np.isfinite(rows).all()
+        return rows if fit else None
 
     def _flat(self, values: Any, action: Any) -> tuple[float, ...]:
         flat = flat_inputs(values, self._variables, lambda values: _source(values, action))

@@ -177,9 +177,10 @@ class Interface:
             ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real
                 or Float64.
         """
-        names = self.config.ramped_inputs
-        inputs = {variable.name: variable for variable in self.inputs}
-        ramped = tuple(inputs[name] for name in names)
+        names = dict.fromkeys(self.config.ramped_inputs, True)
+        kind = "input in 'input_interpolation'"
+        linear = _by_scalar(self.description, names, self.inputs, kind)
+        ramped = tuple(variable for variable in self.inputs if variable.name in linear)
         for variable in ramped:
             unable = self.description.unable_to_interpolate(variable)
             if unable is not None:
@@ -188,10 +189,11 @@ class Interface:
                 )
             found = variable.variability, variable.causality, variable.is_scalar
             if found != ("continuous", "input", True) or variable.type not in {"Real", "Float64"}:
+                element = "" if variable.is_scalar else ", an element of an array"
                 raise ConfigError(
                     f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
-                    f"a {variable.variability} {variable.causality} of type {variable.type}, "
-                    "expected a continuous Real input"
+                    f"a {variable.variability} {variable.causality} of type {variable.type}"
+                    f"{element}; expected a continuous scalar input of type Real or Float64"
                 )
         return ramped
 

@@ -6,6 +6,7 @@ return: numbers, arrays or symbols. They share this order.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from fmugym.task.results import as_flag, as_reward
@@ -61,15 +62,8 @@ class Numbers:
         """See ``Form.update``."""
         env._update()
 
-    @staticmethod
-    def flags(hook: str, value: Any) -> bool:
-        """See ``Form.flags``."""
-        return as_flag(hook, value)
-
-    @staticmethod
-    def rewards(value: Any) -> float:
-        """See ``Form.rewards``."""
-        return as_reward(value)
+    flags = staticmethod(as_flag)
+    rewards: Callable[[Any], Any] = staticmethod(as_reward)
 
 
 NUMBERS: Final = Numbers()

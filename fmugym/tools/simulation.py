@@ -67,7 +67,7 @@ class Summary:
         kpis = "".join(f", {name} {value:.6g}" for name, value in self.kpis.items())
         return (
             f"seed {self.seed}: reward {self.total_reward:.6g}{cost} in {self.steps} steps "
-            f"({self.seconds:g} s), {self.end}{kpis}"
+            f"({self.seconds:.10g} s), {self.end}{kpis}"
         )
 
 

@@ -6,26 +6,29 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import repeat
+from itertools import chain, compress
+from operator import not_
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector.utils import iterate
 
-from fmugym.env import IN_POOL, FMUEnv
+from fmugym.env import IN_POOL, FMUEnv, Result
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
+from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
-from fmugym.vector.stacking import ArrayStack, make_stack
+from fmugym.vector.engines.outcomes import Outcomes, Unconverted
+from fmugym.vector.stacking import PoolStack, Stack, make_stack
 
 __all__ = ["PerEnvEngine"]
 
@@ -59,13 +62,25 @@ class PerEnvEngine(Engine):
         self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
-        space, shared = envs[0].observation_space, pool.observations
-        self._stack = stack = make_stack(space, len(envs))
-        is_default = self._together and all(env._pool_observes for env in envs)
+        self._stack = stack = self._make_stack()
+        self._observed = IN_POOL if isinstance(stack, PoolStack) else None
+        self._take = stack.take
+        self._form = Unconverted()
+        self._acts_directly: bool | None = None
+
+    def _make_stack(self) -> Stack | PoolStack:
+        space, shared = self._envs[0].observation_space, self._pool.observations
+        is_default = self._together and all(env._pool_observes for env in self._envs)
         fits = shared.dtype == space.dtype and shared.shape[1:] == space.shape
-        observes = is_default and fits
-        self._observed_by_pool = stack if isinstance(stack, ArrayStack) and observes else None
-        self._observed = None if self._observed_by_pool is None else IN_POOL
+        return PoolStack(shared) if is_default and fits else make_stack(space, len(self._envs))
+
+    def _are_direct(self) -> bool:
+        """Whether the actions are the inputs of all, so that no hook has to be asked for them."""
+        if self._acts_directly is None:
+            self._acts_directly = self._checks_all and all(
+                env._action_values is None and "_get_inputs" not in vars(env) for env in self._envs
+            )
+        return self._acts_directly and type(self._envs[0])._get_inputs is FMUEnv._get_inputs
 
     def close(self) -> None:
         """See ``Engine.close``."""
@@ -94,6 +109,7 @@ class PerEnvEngine(Engine):
     ) -> list[Any]:
         """See ``Engine.call``."""
         values = [attribute(self._envs[index], name) for index in indices]
+        self._acts_directly = None  # a method may replace a hook
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
 
     def evaluate(
@@ -123,8 +139,9 @@ class PerEnvEngine(Engine):
             seed = None if seeds is None else seeds[index]
             observation, infos[index] = self._reset(index, seed, options)
             self._stack.put(index, observation)
+        self._acts_directly = None  # a reset may have replaced hooks
         self.note_starts(mask)
-        return self._stack.copied(), gathered(infos, len(self._envs))
+        return self._stack.joined(), gathered(infos, len(self._envs))
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
@@ -143,38 +160,111 @@ class PerEnvEngine(Engine):
             raise
 
     def _results(self, items: Sequence[Any], idle: Sequence[bool]) -> StepResult:
-        infos: dict[int, dict[str, Any]] = {}
-        rewards, terminated, truncated = [], [], []
-        told = self._told() if self._together else repeat((0, ()))
-        if self._observed_by_pool is not None:
-            self._observed_by_pool.put_all(self._pool.observations)
-        each = zip(self._envs, items, told, strict=False)
-        for index, (env, action, (status, outputs)) in enumerate(each):
-            if idle[index]:
-                observation, info = self._reset(index, None, {})
-                reward, ended, cut_off = 0.0, False, False
-            else:
-                result = self._stepped(index, env, action, status, outputs)
-                observation, reward, ended, cut_off, info = result
-            if observation is not IN_POOL:
-                self._stack.put(index, observation)
-            rewards.append(reward)
-            terminated.append(ended)
-            truncated.append(cut_off or env.step_count >= self._limit)
-            if info:
-                infos[index] = info
-        ends = np.array(terminated, np.bool_), np.array(truncated, np.bool_)
-        self.note_ends(*ends)
-        gained = np.array(rewards, np.float64)
-        return StepResult(self._stack.copied(), gained, *ends, gathered(infos, len(items)))
+        outcomes = Outcomes(len(self._envs))
+        if isinstance(self._stack, PoolStack):
+            self._stack.refresh()
+        for index in compress(range(len(idle)), idle):
+            observation, info = self._reset(index, None, {})
+            self._note(outcomes, index, (observation, 0.0, False, False, info))
+        if self._together:
+            self._conclude(outcomes, idle)
+        else:
+            self._step_each(outcomes, items, idle)
+        rewards, terminated, truncated = outcomes.arrays()
+        self.note_ends(terminated, truncated)
+        infos = gathered(dict(sorted(outcomes.infos.items())), len(self._envs))
+        return StepResult(self._stack.joined(), rewards, terminated, truncated, infos)
 
-    def _told(self) -> Iterator[tuple[int, tuple[float, ...]]]:
-        """What the pool tells each environment after a step: the status and the outputs.
+    def _step_each(self, outcomes: Outcomes, items: Sequence[Any], idle: Sequence[bool]) -> None:
+        """Call the steps of environments that have their own."""
+        for index in _running(idle):
+            try:
+                result = self._envs[index].step(items[index])
+            except FMUGymError as error:
+                raise _located(error, index) from error
+            self._note(outcomes, index, result)
 
-        One call for all takes less time than one for each, and less memory is touched.
+    def _note(self, outcomes: Outcomes, index: int, result: Result) -> None:
+        """Note the result of a step of one environment, whose numbers are checked."""
+        observation, reward, ended, cut_off, info = result
+        if observation is not IN_POOL:
+            self._stack.put(index, observation)
+        outcomes.note(index, reward, ended, cut_off, info)
+        if self._envs[index].step_count >= self._limit:
+            outcomes.truncated[index] = True
+
+    def _conclude(self, outcomes: Outcomes, idle: Sequence[bool]) -> None:
+        """Ask the hooks of the environments whose FMUs have stepped for the results.
+
+        Most numbers are checked when all are there, which takes much less time.
         """
-        outputs = map(tuple, self._pool.outputs.T.tolist())
-        return zip(self._pool.statuses.tolist(), outputs, strict=True)
+        status_of = self._pool.statuses.tolist()
+        told = map(tuple, self._pool.outputs.T.tolist())  # Python's floats are faster
+        index = 0
+        try:
+            for index, (env, values) in enumerate(zip(self._envs, told, strict=True)):
+                if idle[index]:
+                    continue
+                env.step_count += 1
+                if status_of[index] or env._has_info or env.render_mode is not None:
+                    self._conclude_fully(outcomes, index, status_of[index], values)
+                else:
+                    self._judge(outcomes, index, env, values)
+                env._in_hooks = False
+            for index in outcomes.faulty(self._stack.finite()):
+                self._fault(outcomes, index)
+        except FMUGymError as error:
+            raise _located(error, index) from error
+
+    def _judge(
+        self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
+    ) -> None:
+        """Do what ``FMUEnv._conclude`` does, for one that has no info, without checking numbers."""
+        outcomes.values[index] = env._values
+        if env._own.update:
+            outcomes.variables[index] = env.variables.copy()
+        env._values = values
+        env.state = values if env._no_monitors else values[: env._output_count]
+        observed = self._observed
+        if observed is None and env._pool_observes:
+            observed = env._observation_row.copy()
+        steps = env.step_count
+        observation, reward, ended, cut_off = conclude(
+            env, self._form, False, steps >= env._step_limit, observed
+        )
+        if observation is not IN_POOL and not self._take(index, observation):
+            if env._is_finite(observation):
+                self._stack.put(index, observation)
+            else:
+                outcomes.misfits[index] = observation
+        outcomes.rewards[index] = reward
+        if ended or cut_off:
+            env._ended = True
+            outcomes.terminated[index], outcomes.truncated[index] = ended, cut_off
+        if steps >= self._limit:
+            outcomes.truncated[index] = True
+
+    def _conclude_fully(
+        self, outcomes: Outcomes, index: int, status: int, values: tuple[float, ...]
+    ) -> None:
+        """Let an environment conclude alone: it has infos or pictures, or its FMU a status."""
+        env = self._envs[index]
+        result = env._conclude(self._columns[index], status, values, self._observed)
+        self._note(outcomes, index, result)
+        env._in_hooks = False
+        if env.render_mode is not None:
+            env._note_for_picture(result[1])
+
+    def _fault(self, outcomes: Outcomes, index: int) -> None:
+        """End an episode because of a number that is not finite."""
+        env, reward = self._envs[index], float(outcomes.rewards[index])
+        observation = outcomes.misfits.get(index)
+        if observation is None:
+            observation = self._stack.row(index)
+        before = outcomes.values[index], outcomes.variables[index]
+        env._in_hooks = True
+        self._note(outcomes, index, env._fault_of_hooks(reward, observation, before))
+        env._in_hooks = False
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
@@ -190,49 +280,55 @@ class PerEnvEngine(Engine):
         except FMUGymError as error:
             raise _located(error, index) from error
 
-    def _stepped(
-        self, index: int, env: FMUEnv, action: Any, status: int, outputs: tuple[float, ...]
-    ) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        try:
-            if not self._together:
-                return env.step(action)
-            env.step_count += 1
-            result = env._conclude(self._columns[index], status, outputs, self._observed)
-        except FMUGymError as error:
-            raise _located(error, index) from error
-        env._in_hooks = False
-        if env.render_mode is not None:
-            env._note_for_picture(result[1])
-        return result
-
     def _step_pool(
         self, actions: Sequence[Any], idle: Sequence[bool], resetting: MaskArray | None
     ) -> None:
         """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
-        taken, inputs = [], []
+        running = [*_running(idle)]
+        rows = self._directly_taken(actions, running) if self._are_direct() else None
+        if rows is None:
+            self._take_actions(actions, running)
+            inputs = chain.from_iterable([self._envs[index].inputs for index in running])
+            rows = np.fromiter(inputs, np.float64).reshape(len(running), len(self._pool.inputs))
+        self._pool.inputs[:, ... if resetting is None else ~resetting] = rows.T
+        self._pool.step(None, resetting, self._pool.observations)
+
+    def _directly_taken(self, actions: Sequence[Any], running: list[int]) -> FloatArray | None:
+        """Let environments take actions that are their inputs, too; return these, shape (M, k).
+
+        None if the actions do not make inputs, so that each environment has to be asked.
+        """
+        rows = self._envs[0]._input_writer.of_actions(np.asarray(actions)[running])
+        if rows is None:
+            return None
+        for index, inputs in zip(running, map(tuple, rows.tolist()), strict=True):
+            env = self._envs[index]
+            env._in_hooks = True
+            env.previous_action, env.previous_state = env.action, env.state
+            env.action, env.inputs = actions[index], inputs
+        return rows
+
+    def _take_actions(self, actions: Sequence[Any], running: list[int]) -> None:
+        taken: list[Any] = []
         try:
-            for index, env in enumerate(self._envs):
-                if not idle[index]:
-                    env._in_hooks = True
-                    if not self._checks_all:
-                        env._require_usable(actions[index])
-                    taken.append((env, env._take_usable(actions[index])))
-                    inputs.append(env.inputs)
+            for index in running:
+                env = self._envs[index]
+                env._in_hooks = True
+                if not self._checks_all:
+                    env._require_usable(actions[index])
+                taken.append(env._take_usable(actions[index]))
         except BaseException as error:
-            for env, before in taken:
-                env._give_up(before)
+            for place, before in zip(running, taken, strict=False):
+                self._envs[place]._give_up(before)
             if isinstance(error, FMUGymError):
                 raise _located(error, index) from error
             raise
-        if inputs:
-            self._pool.inputs[:, ... if resetting is None else ~resetting] = np.transpose(inputs)
-        self._pool.step(None, resetting, self._pool.observations)
 
     def _actions(self, actions: Any) -> Sequence[Any]:
         """Copy the action of each environment, because hooks keep it."""
         space = self._envs[0].action_space
         if self._checks_all:
-            return list(checked_actions(space, len(self._envs), actions))
+            return cast(Sequence[Any], checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
         except Exception:  # users' actions may raise anything
@@ -265,7 +361,11 @@ class PerEnvEngine(Engine):
         """See ``Engine.observe``."""
         for index in indices.tolist():
             self._stack.put(index, self._envs[index]._observation_and_info()[0])
-        return self._stack.copied()
+        return self._stack.joined()
+
+
+def _running(idle: Sequence[bool]) -> Iterator[int]:
+    return compress(range(len(idle)), map(not_, idle))
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:
