@@ -305,6 +305,7 @@ class Pool:
         states: Array,
         episodes: Episodes,
         kept: Array,
+        done: Array | None,
         reads_kept: bool,
         copies: tuple[tuple[Array, Array], ...],
         variable_starts: tuple[tuple[Array, bytes], ...],

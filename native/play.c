@@ -143,6 +143,9 @@ void play_start_episode(const Turn *turn, size_t index) {
     const Play *play = turn->play;
 
     forget_actions(&play->actions, index);
+    if (play->done != NULL) {
+        play->done[index] = 0;
+    }
     for (size_t i = 0; i < play->number_of_inputs; i++) {
         const InputStart *start = &play->input_starts[i];
         play->input_rows[i * play->count + index] =
@@ -220,6 +223,9 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const uin
         ended[j] = terminated[j] | truncated[j];
         number += ended[j];
     }
+    if (play->done != NULL) {
+        memcpy(play->done + begin, terminated, count);
+    }
     return number;
 }
 
@@ -270,6 +276,9 @@ void play_observe(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
 void play_skip(const Turn *turn, size_t index) {
     turn->rewards[index] = 0.0;
     turn->terminated[index] = turn->truncated[index] = 0;
+    if (turn->play->done != NULL) {
+        turn->play->done[index] = 0;
+    }
     program_clear_seen(&turn->play->judgement, turn->seen, index);
     if (turn->started != NULL) {
         turn->started[index] = 0;

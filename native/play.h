@@ -78,6 +78,7 @@ typedef struct {
     int64_t *step_counts;
     int64_t limit;  /* steps after which an episode is truncated */
     uint8_t *ended; /* which environments start an episode instead of taking a step */
+    uint8_t *done;  /* where the latest step has ended the task, not only the episode; or NULL */
 } Play;
 
 /* One step of all environments, and where its results go. */

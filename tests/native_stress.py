@@ -32,6 +32,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
+from fmugym.task.values import LateDict
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
@@ -99,6 +100,8 @@ def draws(*rows):
 
 
 DRAWS = draws(0)
+TOLD = "drawn", "_drawn", *LateDict.parts(lambda _, drawn, mask: {"drawn": drawn * mask}, None)
+"""What a reset tells of the episodes that it starts."""
 
 
 class ReceiverError(Exception):
@@ -183,19 +186,20 @@ class Subject:
             (np.zeros(self.n, np.int64), np.zeros(self.n, np.bool_), 5),
             {
                 "kept": np.zeros_like(self.pool.outputs),
+                "done": np.zeros(self.n, np.bool_) if self.rng.random() < 0.5 else None,
                 "reads_kept": bool(self.rng.random() < 0.5),
                 "copies": ((variables[0], before[0]),),
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (np.empty, tuple, None, self.results()),
+                "results": (np.empty, tuple, None, self.results(), TOLD),
             },
         )
 
     def results(self):
-        """The shapes and types of what a step returns."""
-        flags = (self.n,), bool
-        return ((self.n, len(self.outputs)), np.float32), ((self.n,), float), flags, flags
+        """The shapes and types of what a step or a reset returns."""
+        flags, seen = ((self.n,), bool), ((self.n, len(self.outputs)), np.float32)
+        return seen, ((self.n,), float), flags, flags, flags, ((1, self.n), float)
 
     def draw(self):
         """Seed streams and draw from them while other threads play."""
@@ -218,6 +222,14 @@ class Subject:
         observations = np.empty((self.n, len(self.outputs)), np.float32)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
             self.pool._pool.start(self.mask(), observations, np.empty((1, self.n)))
+
+    def reset_by(self):
+        """Hold what some resets return, and read it later."""
+        with contextlib.suppress(ValueError):  # as above
+            result = self.pool.reset_of_play()({"reset_mask": self.mask()})
+            if result is not None and self.rng.random() < 0.5:
+                self.held = result
+                assert self.held[0][1]["drawn"]["drawn"].shape == (1, self.n)
 
     def save(self):
         self.snapshot = self.pool.save()
@@ -292,6 +304,7 @@ ACTIONS = (
         "play",
         "play",
         "start_episodes",
+        "reset_by",
         "save",
         "restore",
         "forget",

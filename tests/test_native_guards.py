@@ -188,6 +188,7 @@ def actions_of(n):
 def surroundings(pool):
     return {
         "kept": np.zeros_like(pool.outputs),
+        "done": None,
         "reads_kept": False,
         "copies": (),
         "drawn_variables": (),
@@ -335,11 +336,13 @@ class TestPrograms:
             {"variable_starts": ((np.zeros(3), b"1"),)},
             {"input_starts": ()},
             {"kept": np.zeros((1, 1))},
+            {"done": np.zeros(1, np.bool_)},
+            {"done": np.zeros(6)},
         ],
         ids=str,
     )
     def test_surroundings_that_do_not_fit(self, cart_poles, changes):
-        with pytest.raises(ValueError, match=r"must|differ|fit|float64"):
+        with pytest.raises((TypeError, ValueError), match=r"must|differ|fit|float64"):
             prepare(cart_poles, program(ACTION), **changes)
 
     @pytest.mark.parametrize("row", [1, 2**40])

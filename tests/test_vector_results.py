@@ -11,6 +11,7 @@ from vector_tools import CART_POLE, Drawing, sampled_actions
 
 from fmugym import ConfigError, FMUVectorEnv
 from fmugym.pool import has_native_pool
+from fmugym.task.values import LateDict
 
 pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 
@@ -175,20 +176,40 @@ def test_a_refused_step_and_an_error_leave_everything_in_order():
     envs.close()
 
 
+SEEN, REAL, FLAGS, DRAWN = ((3, 4), np.float32), ((3,), float), ((3,), bool), ((4, 3), float)
+ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN
+TOLD = "drawn", "_drawn", *LateDict.parts(dict, None)
+
+
+def test_results_that_fit_are_taken(monkeypatch):
+    require_refused((np.empty, tuple, None, ARRAYS, TOLD), monkeypatch, refused=False)
+
+
 @pytest.mark.parametrize(
     "results",
     [
-        (np.empty, tuple, None, ()),
-        (np.empty, tuple, None, (((3, 4), np.float32), ((3,), float), ((3,), bool))),
-        (np.empty, tuple, None, (((3, 5), np.float32), ((3,), float), *[((3,), bool)] * 2)),
-        (np.empty, tuple, None, (((3, 4), np.float32), ((3,), np.float32), *[((3,), bool)] * 2)),
-        (np.empty, tuple, ("a", "b"), (((3, 4), np.float32), ((3,), float), *[((3,), bool)] * 2)),
-        (np.empty, dict, None, (((3, 4), np.float32), ((3,), float), *[((3,), bool)] * 2)),
-        (np.empty, tuple, None, 7),
-        ("empty", tuple, None, (((3, 4), np.float32), ((3,), float), *[((3,), bool)] * 2)),
+        (np.empty, tuple, None, (), TOLD),
+        (np.empty, tuple, None, ARRAYS[:-1], TOLD),
+        (np.empty, tuple, None, ARRAYS[:3], TOLD),
+        (np.empty, tuple, None, (((3, 5), np.float32), *ARRAYS[1:]), TOLD),
+        (np.empty, tuple, None, (SEEN, ((3,), np.float32), *ARRAYS[2:]), TOLD),
+        (np.empty, tuple, None, (*ARRAYS[:-2], ((4,), bool), DRAWN), TOLD),
+        (np.empty, tuple, None, (*ARRAYS[:-1], ((5, 3), float)), TOLD),
+        (np.empty, tuple, ("a", "b"), ARRAYS, TOLD),
+        (np.empty, dict, None, ARRAYS, TOLD),
+        (np.empty, tuple, None, 7, TOLD),
+        ("empty", tuple, None, ARRAYS, TOLD),
+        (np.empty, tuple, None, ARRAYS),
+        (np.empty, tuple, None, ARRAYS, TOLD[:-1]),
+        (np.empty, tuple, None, ARRAYS, ("drawn", "_drawn", list, *TOLD[3:])),
+        (np.empty, tuple, None, ARRAYS, ("drawn", 7, *TOLD[2:])),
     ],
 )
 def test_results_that_do_not_fit_are_refused(results, monkeypatch):
+    require_refused(results, monkeypatch)
+
+
+def require_refused(results, monkeypatch, *, refused=True):
     envs = make(CART_POLE)
     prepare = envs._pool.prepare_play
 
@@ -196,6 +217,6 @@ def test_results_that_do_not_fit_are_refused(results, monkeypatch):
         return prepare(*parts[:-1], parts[-1] | {"results": results})
 
     monkeypatch.setattr(envs._pool, "prepare_play", with_others)
-    with pytest.raises((TypeError, ValueError)):
+    with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
         envs._engine._prepare(envs._engine._task)
     envs.close()

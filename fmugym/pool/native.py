@@ -527,7 +527,8 @@ class NativePool(SavingPool):
             episodes: Steps of each episode, shape (N,); which environments start an episode in
                 the next step, shape (N,); steps after which an episode is truncated.
             surroundings: ``kept``, for the outputs before the step; ``reads_kept``, whether
-                the second program reads them; ``copies``, pairs of rows: episode variables and what
+                the second program reads them; ``done``, for where the latest step has ended the
+                task, shape (N,), or None; ``copies``, pairs of rows: episode variables and what
                 they were before the step; ``drawn_variables``, rows and the numbers of their draws;
                 ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
                 each input the number of a start value, or -1 and a constant. ``results``, None if

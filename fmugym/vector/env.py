@@ -562,8 +562,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Read an attribute, or else a parameter of the FMU, of each environment.
 
-        Compiled steps do not keep ``action``, ``done`` and what hooks read of the step before.
-
         Raises:
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
             SimulationError: After ``close``.

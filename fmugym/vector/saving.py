@@ -114,7 +114,6 @@ def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     learn(columns.get("texts", {}))
-    env.done = env.done.copy()  # the caller holds this array
     for name in (*_FIRST, "step_count"):
         place_column(getattr(env, name), columns[name.lstrip("_")], sources, which)
 

@@ -195,6 +195,7 @@ class CompiledWarmUp:
                 (self._counts, self._ended, sys.maxsize),
                 {
                     "kept": self._kept,
+                    "done": None,
                     "reads_kept": True,
                     "copies": tuple(pairs),
                     "input_starts": ((-1, 0.0),) * len(pool.inputs),

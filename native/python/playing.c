@@ -157,6 +157,12 @@ static bool take_kept(PyPool *self, Playing *playing, PyObject *kept) {
                        (Py_ssize_t)s->outputs->count, (Py_ssize_t)s->count);
 }
 
+/* None stands for steps of which nobody asks for this later. */
+static bool take_done(PyPool *self, Playing *playing, PyObject *done) {
+    return done == Py_None || take_vector(done, &playing->buffers[DONE], WRITTEN, "done",
+                                          ITEM_BOOLEAN, (Py_ssize_t)self->pool.settings.count);
+}
+
 /* Takes a row that the pool writes. There is room for its buffer. */
 static bool take_row(PyPool *self, Playing *playing, PyObject *object, Row *row) {
     Py_buffer *buffer = &playing->row_buffers[playing->number_of_row_buffers++];
@@ -312,6 +318,7 @@ static void settle_play(PyPool *self, Playing *playing) {
     play->streams = b[STATES].buf;
     play->step_counts = b[COUNTS].buf;
     play->ended = b[ENDED].buf;
+    play->done = b[DONE].buf;
     play->source.statuses = s->status;
 }
 
@@ -330,7 +337,7 @@ static bool is_sound(const PyPool *self, const Play *play) {
 /* The arguments of prepare_play. */
 typedef struct {
     PyObject *start, *start_values, *inputs, *judgement, *actions, *draws, *states, *episodes;
-    PyObject *kept, *copies, *variable_starts, *drawn_variables, *input_starts, *results;
+    PyObject *kept, *done, *copies, *variable_starts, *drawn_variables, *input_starts, *results;
     int reads_kept;
 } Parts;
 
@@ -338,13 +345,13 @@ static bool parse(PyObject *args, PyObject *kwargs, Parts *p) {
     static char *names[] = {"start",         "start_values", "inputs",
                             "judgement",     "actions",      "draws",
                             "states",        "episodes",     "kept",
-                            "reads_kept",  "copies",       "variable_starts",
+                            "done",          "reads_kept",   "copies",       "variable_starts",
                             "drawn_variables", "input_starts", "results", NULL};
 
     return PyArg_ParseTupleAndKeywords(
-        args, kwargs, "$OOO!O!O!OOO!OpO!O!O!O!O:prepare_play", names, &p->start, &p->start_values,
+        args, kwargs, "$OOO!O!O!OOO!OOpO!O!O!O!O:prepare_play", names, &p->start, &p->start_values,
         &PyTuple_Type, &p->inputs, &PyTuple_Type, &p->judgement, &PyDict_Type, &p->actions,
-        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->reads_kept,
+        &p->draws, &p->states, &PyDict_Type, &p->episodes, &p->kept, &p->done, &p->reads_kept,
         &PyTuple_Type, &p->copies, &PyTuple_Type, &p->variable_starts, &PyTuple_Type,
         &p->drawn_variables, &PyTuple_Type, &p->input_starts, &p->results);
 }
@@ -401,6 +408,7 @@ static bool take_parts(PyPool *self, Playing *playing, const Parts *p) {
            take_actions(self, playing, p->actions) && take_programs(self, playing, p) &&
            take_draws(self, playing, p->draws, p->states) &&
            take_episodes(self, playing, p->episodes) && take_kept(self, playing, p->kept) &&
+           take_done(self, playing, p->done) &&
            take_variables(self, playing, p->copies, p->variable_starts, p->drawn_variables) &&
            take_input_starts(self, playing, p->input_starts) &&
            take_results(self, playing, p->results);

@@ -15,6 +15,7 @@ enum {
     PREVIOUS,
     NO_ACTION,
     KEPT,
+    DONE,
     PLAY_BUFFERS
 };
 

@@ -163,6 +163,7 @@ class RollingWorker:
             (counts, np.zeros(n, np.bool_), play.limit),
             {
                 "kept": kept,
+                "done": None,
                 "reads_kept": play.reads_kept,
                 "copies": tuple((rows[now], rows[before]) for now, before in play.copies),
                 "input_starts": ((-1, 0.0),) * len(pool.inputs),  # no episode starts

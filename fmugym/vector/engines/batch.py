@@ -285,7 +285,6 @@ class BatchEngine(Engine):
         env.previous_state[:, indices] = env.state[:, indices]
         no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
         env.action[..., indices] = env.previous_action[..., indices] = no_action
-        env.done = env.done.copy()  # the caller holds this array
         env.done[indices] = False
         for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
             row[indices] = (
@@ -500,6 +499,7 @@ class BatchEngine(Engine):
         wrong = not_finite(observations)
         if resetting is not None and wrong is not None:
             self._require_finite_start(observations, resetting)
+        env.done = terminated.copy()  # the caller may change what it gets
         self._handle_faults(result, statuses, has_faults, wrong)
         self.note_ends(terminated, truncated)
         return result
@@ -604,6 +604,7 @@ class BatchEngine(Engine):
             raise SimulationError(f"environment {index}: {reason}")
         for index, reason in reasons.items():
             env.logger.warning("environment %d: %s", index, reason)
+        env.done[faulty] = config.on_fault == "terminate"
         if (faulty & ~failed).any():
             self._undo(result, faulty & ~failed, reasons)
         texts = np.full(self._n, None, dtype=object)
@@ -631,7 +632,8 @@ class BatchEngine(Engine):
             )
         copy_rows(again, result.observations, mask)
         if env._has_info:
-            copy_rows(self._infos(np.ones(self._n, np.bool_)), result.infos, mask)
+            infos = self._infos(np.ones(self._n, np.bool_))
+            copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
 
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:

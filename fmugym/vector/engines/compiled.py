@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -14,13 +13,11 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.pool.bundle import IndexArray
 from fmugym.pool.extension import require_refusal
 from fmugym.signals import is_of_signal_handler
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
-from fmugym.task.snapshot import Columns
 from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.codec import coded
@@ -74,7 +71,7 @@ class CompiledEngine(BatchEngine):
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
-        self._kept = np.zeros_like(self._pool.outputs)
+        self._kept, self._done = np.zeros_like(self._pool.outputs), np.zeros(num_envs, _BOOL)
         shape = (num_envs, *(env.action_space.shape or ()))
         dtype = env.action_space.dtype
         self._actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
@@ -126,12 +123,10 @@ class CompiledEngine(BatchEngine):
 
     def _make_rows(self, task: TracedTask) -> None:
         """Make the arrays that stay in place: variables, and what hooks read of the step before."""
-        variables = self.env.variables
         self._rows, self._before = {}, {}
         for name, dtype in task.variables.items():
             self._rows[name] = np.ascontiguousarray(self._row(name), dtype).copy()
             self._before[name] = self._rows[name].copy()
-            variables[name] = self._rows[name]
         self._show()
 
     def _show(self) -> None:
@@ -140,13 +135,15 @@ class CompiledEngine(BatchEngine):
         env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
         self._kept[: env._output_count] = env.previous_state
         env.previous_state = self._kept[: env._output_count]
+        self._done[:] = env.done
+        env.done = self._done
+        env.variables.update(self._rows)
 
     def _take_over(self) -> None:
         """Take over what a step on arrays has left in arrays of its own."""
         env = self.env
         for name, row in self._rows.items():
             row[...] = env.variables[name]
-            env.variables[name] = row
         for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
             own[...] = np.moveaxis(theirs, -1, 0)
         self._show()
@@ -201,6 +198,7 @@ class CompiledEngine(BatchEngine):
         constants = plan.constant_variables
         return {
             "kept": self._kept,
+            "done": self._done,
             "reads_kept": task.judgement.loads("kept"),
             "copies": tuple(
                 pair for name in flat for pair in zip(flat[name], before[name], strict=True)
@@ -314,30 +312,6 @@ class CompiledEngine(BatchEngine):
         """See ``Engine.leave_starts``."""
         super().leave_starts()
         self._spare = None
-
-    @contextmanager
-    def single(self, index: int) -> Iterator[FMUEnv]:
-        """See ``Engine.single``."""
-        if self._prepared and not self.env._in_hooks:
-            self._find_done()
-        with super().single(index) as env:
-            yield env
-
-    def _find_done(self) -> None:
-        """Ask the hook on arrays for ``done``: few callers read it, so steps do not store it."""
-        env, env._in_hooks = self.env, True
-        try:
-            with np.errstate(all="ignore"):
-                done = results.flags("_is_done", env._is_done(), self._n)
-        finally:
-            env._in_hooks = False
-        env.done = (done | self._stopped(self._pool.statuses)) & (env.step_count > 0)
-
-    def columns(self, indices: IndexArray) -> Columns:
-        """See ``Engine.columns``."""
-        if self._prepared:
-            self._find_done()
-        return super().columns(indices)
 
     def call(
         self,
@@ -455,8 +429,6 @@ class CompiledEngine(BatchEngine):
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
-            if started is not None:
-                self.env.done[started] = False
         seen = result.rewards, result.observations
         if troubled or any(not_finite(values) is not None for values in seen):
             self._mend(result, resetting if started is None else started)
@@ -486,7 +458,7 @@ class CompiledEngine(BatchEngine):
         """Call the hooks that are not compiled, in their order."""
         env, left, n = self.env, self._left, self._n
         observations, infos = result.observations, result.infos
-        env.done, env._in_hooks = result.terminated.copy(), True
+        env._in_hooks = True
         idle = slice(0) if resetting is None else resetting
         try:
             if "_is_truncated" in left:
@@ -510,7 +482,6 @@ class CompiledEngine(BatchEngine):
     ) -> tuple[Any, dict[str, Any]]:
         """What the hooks that are not compiled observe where episodes have started."""
         env, left = self.env, self._left
-        env.done = env.done & ~starting  # a new array: the caller holds the old one
         env._in_hooks = True
         try:
             if "_get_observation" in left:
@@ -534,7 +505,12 @@ class CompiledEngine(BatchEngine):
 
     def _step_on_arrays(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         self._longest = self._limit  # steps of the pool are not counted there
-        result = super().step(actions, resetting)
+        try:
+            result = super().step(actions, resetting)
+        except BaseException:
+            if self._prepared:
+                self._show()  # a reset follows if the FMUs have stepped
+            raise
         if self._prepared:
             self._take_over()
         return result
@@ -551,7 +527,6 @@ class CompiledEngine(BatchEngine):
             self._require_started(np.flatnonzero(starting), statuses)
             self._require_finite_start(result.observations, starting)
         self._require_possible_inputs(starting)
-        env.done = result.terminated.copy()
         self._outputs_before, self._variables_before = self._kept, self._before
         env._in_hooks = True
         try:
@@ -561,7 +536,6 @@ class CompiledEngine(BatchEngine):
         self.note_ends(result.terminated, result.truncated)
         if starting is not None:
             self.note_starts(starting)
-            env.done[starting] = False
 
     def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
         """Refuse inputs that are not finite, which they also are outside of their type's range."""

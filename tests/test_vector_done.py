@@ -1,0 +1,236 @@
+"""``done`` of each environment, as a single environment has it, in every way of calling hooks."""
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from vector_tools import (
+    CART_POLE,
+    PushedCart,
+    each_mode,
+    require_equal,
+    require_same_infos,
+    sampled_actions,
+)
+
+import fmugym
+from fmugym import SimulationError
+from fmugym.pool import has_native_pool
+from fmugym.series import RecordVectorSeries
+from fmugym.vector import FMUVectorEnv
+
+pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+each_kind = pytest.mark.parametrize("hooks", ["compiled", "array"])
+
+
+class Faulty(PushedCart):
+    """Episodes end by the task, by their length, and by faults."""
+
+    policy = "terminate"
+
+    def __init__(self):
+        super().__init__(max_episode_steps=6, on_fault=self.policy, fault_reward=-7.0)
+
+
+class Truncating(Faulty):
+    """A fault is not the end of the task."""
+
+    policy = "truncate"
+
+
+class Raising(Faulty):
+    """A fault is an exception."""
+
+    policy = "raise"
+
+
+def pair(task, hooks, mode, num_envs=6):
+    return tuple(
+        FMUVectorEnv(task, num_envs, autoreset_mode=mode, hooks=way) for way in (hooks, "per_env")
+    )
+
+
+@each_kind
+@each_mode
+@pytest.mark.parametrize("task", [CART_POLE, Faulty, Truncating])
+def test_done_is_that_of_single_environments(task, mode, hooks):
+    ours, theirs = pair(task, hooks, mode)
+    seen = set()
+    for envs in ours, theirs:
+        envs.reset(seed=1)
+    for actions in sampled_actions(ours, 40):
+        result, _ = ours.step(actions), theirs.step(actions)
+        done = ours.get_attr("done")
+        assert done == theirs.get_attr("done")
+        assert all(type(value) is bool for value in done)
+        if mode is not AutoresetMode.SAME_STEP:
+            assert list(done) == result[2].tolist()
+        seen |= set(zip(result[2].tolist(), result[3].tolist(), strict=True))
+        ended = result[2] | result[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+            assert ours.get_attr("done") == theirs.get_attr("done") == (False,) * 6
+    assert len(seen) > 1
+    ours.close()
+    theirs.close()
+
+
+@each_kind
+def test_the_callers_array_is_not_done(hooks):
+    ours, theirs = pair(CART_POLE, hooks, AutoresetMode.NEXT_STEP)
+    for envs in ours, theirs:
+        envs.reset(seed=1)
+    for actions in sampled_actions(ours, 30):
+        terminated = ours.step(actions)[2]
+        expected = tuple(terminated.tolist())
+        terminated[:] = ~terminated
+        theirs.step(actions)
+        assert ours.get_attr("done") == theirs.get_attr("done") == expected
+    ours.close()
+    theirs.close()
+
+
+@each_kind
+def test_snapshots_have_done(hooks):
+    ours, theirs = pair(Faulty, hooks, AutoresetMode.DISABLED)
+    for envs in ours, theirs:
+        envs.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(8):
+        actions = (rng.random(6) < 0.3).astype(np.int64)
+        result, _ = ours.step(actions), theirs.step(actions)
+        ended = result[2] | result[3]
+        mine, other = (envs.save_state() for envs in (ours, theirs))
+        before = ours.get_attr("done")
+        assert before == theirs.get_attr("done")
+        if ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+        assert not any(ours.get_attr("done"))
+        for envs, snapshot in ((ours, other), (theirs, mine)):
+            envs.restore_state(snapshot)
+            assert envs.get_attr("done") == before
+        if ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array"])
+def test_rollouts_leave_done(hooks):
+    envs = FMUVectorEnv(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
+    envs.reset(seed=0)
+    while not any(done := envs.get_attr("done")):
+        envs.step(np.ones(4, np.int64))
+    candidate = envs.save_state(int(np.argmin(done)))
+    envs.rollout(candidate, np.ones((8, 30), np.int64))
+    assert envs.get_attr("done") == done
+    envs.close()
+
+
+@each_kind
+def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks):
+    """Such episodes are played on arrays, and an error may come within a step."""
+    ours, theirs = (
+        FMUVectorEnv(Raising, 3, autoreset_mode=AutoresetMode.DISABLED, hooks=way)
+        for way in (hooks, "per_env")
+    )
+    for envs in ours, theirs:
+        envs.reset(seed=4, options={"model_parameters": {"m_cart": 2.0}})
+        envs.step(np.zeros(3, np.int64))
+        with pytest.raises(SimulationError, match="environment 1"):
+            envs.step(np.array([0, 1, 0]))
+        envs.reset(seed=5)
+    for _ in range(12):
+        result, _ = (envs.step(np.zeros(3, np.int64)) for envs in (ours, theirs))
+        for name in ("done", "action", "step_count", "previous_state"):
+            assert ours.get_attr(name) == theirs.get_attr(name)
+        if (ended := result[2] | result[3]).any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+    ours.close()
+    theirs.close()
+
+
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "variables": {"angle": {"name": "q"}, "tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["angle", "q_dot"]},
+    "parameters": {"q_0": {"distribution": "uniform", "low": -1, "high": 1}},
+    "reward": {"end": "10 * done", "near": "-abs(angle)"},
+    "costs": {"last": "done"},
+    "terminated": "abs(angle) > 0.9",
+}
+
+
+@each_kind
+@each_mode
+def test_a_series_has_the_present_done(mode, hooks):
+    """Rows with what ends an episode, which reads ``done``, are those that the infos have."""
+    rows = []
+    for way in (hooks, "per_env"):
+        inner = FMUVectorEnv(
+            lambda: fmugym.load(TASK), 3, max_episode_steps=9, autoreset_mode=mode, hooks=way
+        )
+        envs = RecordVectorSeries(inner)
+        envs.reset(seed=2)
+        for actions in sampled_actions(envs, 40):
+            result = envs.step(actions)
+            ended = result[2] | result[3]
+            if mode is AutoresetMode.DISABLED and ended.any():
+                envs.reset(options={"reset_mask": ended})
+        rows.append(
+            {name: envs.series[name] for name in [column.name for column in envs.series.columns]}
+        )
+        assert rows[-1]["costs.last"].any()
+        envs.close()
+    require_equal(*rows)
+
+
+class Judged(PushedCart):
+    """Rewards are not numbers at times; the info tells what a hook reads then."""
+
+    policy = "terminate"
+
+    def __init__(self):
+        super().__init__(max_episode_steps=5, on_fault=self.policy, fault_reward=-7.0)
+
+    def _get_inputs(self):
+        return self.action
+
+    def _reward_policy(self):
+        return np.where(self.state[1] < -0.006, np.nan, 0.0)
+
+    def _get_info(self):
+        return {"done": self.done}
+
+
+class Cut(Judged):
+    """A fault is not the end of the task."""
+
+    policy = "truncate"
+
+
+@each_kind
+@each_mode
+@pytest.mark.parametrize("task", [Judged, Cut])
+def test_infos_of_faults_have_done(task, mode, hooks):
+    ours, theirs = pair(task, hooks, mode)
+    faults = 0
+    for envs in ours, theirs:
+        envs.reset(seed=1)
+    for actions in sampled_actions(ours, 30):
+        mine, other = ours.step(actions), theirs.step(actions)
+        require_equal(mine[2], other[2])
+        require_same_infos(mine[4], other[4])
+        infos = mine[4].get("final_info", mine[4])
+        faults += int(np.count_nonzero(infos.get("_fault", False)))
+        ended = mine[2] | mine[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+    assert faults
+    ours.close()
+    theirs.close()
