@@ -203,8 +203,10 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
     double *outputs = e->outputs + e->places[index] * e->number_of_outputs;
     Outcome outcome = {.stage = SETTING_INPUTS};
 
-    outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
-                              e->number_of_inputs, inputs, e->number_of_inputs);
+    if (e->number_of_inputs > 0) {
+        outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
+                                  e->number_of_inputs, inputs, e->number_of_inputs);
+    }
     if (outcome.status <= STATUS_WARNING) {
         outcome.stage = DOING_STEP;
         outcome.status = fmi->do_step(library, component, e->times[index], e->step, e->no_return);

@@ -119,7 +119,8 @@ static bool open_inside(Pool *pool, const Settings *settings, char *error, size_
     pool->step_size = settings->time_step / (double)settings->substeps;
     pool->no_return = !settings->restores && !settings->returns && settings->retries == 0;
     pool->direct = settings->substeps == 1 && settings->retries == 0 &&
-                   settings->sampling == NULL && access_is_plain(settings->inputs) &&
+                   settings->sampling == NULL &&
+                   (settings->inputs->count == 0 || access_is_plain(settings->inputs)) &&
                    access_is_plain(settings->outputs);
     pool->open = true;
     pool->floats = floats_now();

@@ -117,6 +117,16 @@ static ALWAYS_INLINE void solve(const double *restrict matrix, size_t n,
     }
 }
 
+/* The same for two rows. Both results are stored at once: the next stage loads them so, and must
+ * otherwise wait until each of two stores has reached the cache. */
+static ALWAYS_INLINE void solve_two(const double *restrict matrix, const uint32_t *restrict order,
+                                    const double *restrict b, double *restrict x) {
+    const double above = b[order[0]], below = b[order[1]] - matrix[2] * above;
+    const double second = below * matrix[3];
+
+    store_pair((above - matrix[1] * second) * matrix[0], second, x);
+}
+
 static void prepare_matrix(Solver *me, double size) {
     const double diagonal = 1.0 / (size * gamma_);
 
@@ -152,7 +162,11 @@ static ALWAYS_INLINE Status do_stage(Solver *me, size_t n, const int s, double e
         status = solver_rates(me, nodes[s] == 1.0 ? end : time + nodes[s] * size, me->next, rates);
     }
     couple(n, s, size, rates, me->slope, me->stages, side);
-    solve(me->matrix, n, me->order, side, me->stages + (size_t)s * n);
+    if (n == 2) {
+        solve_two(me->matrix, me->order, side, me->stages + (size_t)s * n);
+    } else {
+        solve(me->matrix, n, me->order, side, me->stages + (size_t)s * n);
+    }
     return status;
 }
 

@@ -252,7 +252,7 @@ static void foresee_reset(const Task *task, size_t index) {
     }
 }
 
-static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) {
+Status run_status(Pool *pool, Instance *me, double time, Outcome outcome) {
     if (outcome.status <= STATUS_WARNING) {
         return outcome.status;
     }
@@ -271,32 +271,36 @@ static size_t conclude_steps(Task *task, size_t begin, const LineUp *line, Scrat
     for (size_t i = 0; i < line->count; i++) {
         const size_t place = line->places[i], index = begin + place;
         const Status status =
-            status_of(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
+            run_status(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
         double *outputs = scratch_from(pool, scratch, place).outputs;
         troubled += conclude_step(task, index, status, outputs);
     }
     return troubled;
 }
 
+Exchange run_exchange(const Pool *pool, Scratch scratch) {
+    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
+
+    return (Exchange){.input_references = in->groups[0].references,
+                      .output_references = out->groups[0].references,
+                      .number_of_inputs = in->count,
+                      .number_of_outputs = out->count,
+                      .step = pool->step_size,
+                      .no_return = pool->no_return,
+                      .floats = &pool->floats,
+                      .inputs = scratch.inputs,
+                      .outputs = scratch.outputs};
+}
+
 static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
     const Pool *pool = task->pool;
-    const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
-    const Exchange e = {
-        .input_references = in->groups[0].references,
-        .output_references = out->groups[0].references,
-        .number_of_inputs = in->count,
-        .number_of_outputs = out->count,
-        .step = pool->step_size,
-        .no_return = pool->no_return,
-        .count = line->count,
-        .components = line->components,
-        .places = line->places,
-        .times = line->times,
-        .floats = &pool->floats,
-        .inputs = scratch.inputs,
-        .outputs = scratch.outputs,
-        .outcomes = line->outcomes,
-    };
+    Exchange e = run_exchange(pool, scratch);
+
+    e.count = line->count;
+    e.components = line->components;
+    e.places = line->places;
+    e.times = line->times;
+    e.outcomes = line->outcomes;
     if (!pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
         return conclude_steps(task, begin, line, scratch);
     }
@@ -345,17 +349,15 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
-/* Steps or resets a run, and leaves the outputs in the scratch memory. */
-static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
-    gather_inputs(task, begin, count, scratch.inputs);
-    records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
-    scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
-    size_t troubled = do_each(task, begin, count, scratch);
+/* Checks the outputs in the scratch memory, and hands them to whoever wants a copy. */
+static size_t hand_out(Task *task, size_t begin, size_t count, Scratch scratch,
+                       bool *fits_floats) {
+    size_t troubled = 0;
 
     *fits_floats =
         all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT);
     if (!*fits_floats) {
-        troubled += take_not_small(task, begin, count, scratch.outputs);
+        troubled = take_not_small(task, begin, count, scratch.outputs);
     }
     if (begin == 0 && task->pool->tape.state == TAPE_RECORDING) {
         record_step(task->pool, scratch);
@@ -364,6 +366,15 @@ static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, b
         write_observations(task, begin, count, scratch.outputs);
     }
     return troubled;
+}
+
+/* Steps or resets a run, and leaves the outputs in the scratch memory. */
+static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
+    gather_inputs(task, begin, count, scratch.inputs);
+    records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
+    scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
+    const size_t troubled = do_each(task, begin, count, scratch);
+    return troubled + hand_out(task, begin, count, scratch, fits_floats);
 }
 
 /* Takes over what other processes have left, as advance leaves it. Their outputs are finite. */
@@ -395,6 +406,15 @@ static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) 
     const size_t troubled = advance(task, begin, count, scratch, &fits_floats);
 
     keep_outputs(task, begin, count, scratch.outputs);
+    return troubled;
+}
+
+size_t run_conclude(Task *task, Status status, Scratch scratch) {
+    bool fits_floats;
+    const size_t failed = conclude_step(task, 0, status, scratch.outputs);
+    const size_t troubled = failed + hand_out(task, 0, 1, scratch, &fits_floats);
+
+    keep_outputs(task, 0, 1, scratch.outputs);
     return troubled;
 }
 

@@ -4,6 +4,7 @@
 #include <stdlib.h>
 
 #include "inside.h"
+#include "lone.h"
 #include "rollouts.h"
 #include "threads.h"
 
@@ -86,15 +87,21 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     return troubled;
 }
 
-/* Works on a chunk, on any thread. */
-static void work(void *context, size_t begin, size_t end) {
-    Task *task = context;
-    const uint64_t began = task->measured ? clock_now() : 0;
-
+static size_t work_inside(Task *task, size_t begin, size_t end) {
     begin_inside(task->pool);
     const size_t troubled = work_with_memory(task, begin, end);
     floats_restore(&task->pool->floats);
     end_inside();
+    return troubled;
+}
+
+/* Works on a chunk, on any thread. */
+static void work(void *context, size_t begin, size_t end) {
+    Task *task = context;
+    const uint64_t began = task->measured ? clock_now() : 0;
+    const size_t troubled =
+        lone_fits(task) ? lone_step(task) : work_inside(task, begin, end);
+
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);
     }

@@ -27,4 +27,15 @@ static ALWAYS_INLINE void move_by_sums(size_t n, const double *restrict x, doubl
     }
 }
 
+/* Stores two neighbours at once. */
+static ALWAYS_INLINE void store_pair(double first, double second, double *to) {
+#if defined __GNUC__
+    typedef double Pair __attribute__((vector_size(16), aligned(8), may_alias));
+    *(Pair *)(void *)to = (Pair){first, second};
+#else
+    to[0] = first;
+    to[1] = second;
+#endif
+}
+
 #endif

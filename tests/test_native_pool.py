@@ -145,8 +145,9 @@ class Pair:
         self.reset(np.array(rows, float).reshape(-1, self.count), self.mask())
 
     def random_step(self):
-        inputs = 0.1 * self.rng.normal(size=(self.inputs, self.count))
-        skip = self.mask()
+        self.step(0.1 * self.rng.normal(size=(self.inputs, self.count)), self.mask())
+
+    def step(self, inputs, skip):
         self.compare(
             [
                 pool.step(inputs, skip, observations)
@@ -183,41 +184,63 @@ class Pair:
 
 @pytest.mark.parametrize("options", [{}, {"substeps": 3, "start_time": 0.3}, {"warm_up_steps": 2}])
 @pytest.mark.parametrize(("model", "version"), BUNDLED)
-@pytest.mark.parametrize("seed", range(2))
-def test_agrees_with_python_pool(model, version, options, seed):
+@pytest.mark.parametrize(("seed", "count"), [(0, 7), (1, 7), (2, 1)])
+def test_agrees_with_python_pool(model, version, options, seed, count):
     inputs, outputs, start = INTERFACES[model]
-    pair = Pair(bundled_fmu(model, version), inputs, outputs, start, 7, seed, **options)
+    pair = Pair(bundled_fmu(model, version), inputs, outputs, start, count, seed, **options)
     try:
         pair.random_reset()
-        pair.reset(np.array([[START_VALUES[n][0]] * 7 for n in start], float), None)
+        pair.reset(np.array([[START_VALUES[n][0]] * count for n in start], float), None)
         pair.play(120)
     finally:
         pair.close()
 
 
+@pytest.mark.parametrize("count", [9, 1])
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_agrees_on_all_types_and_faults(probe, version):
+def test_agrees_on_all_types_and_faults(probe, version, count):
     inputs = ["a", "n", "on", "c", "mode", "n_free"]
     outputs = ["sum", "n_out", "mix", "on_out", "mode_out", "steps", "end"]
     if version == 3:
         inputs += ["Float32_in", "Int8_in", "UInt16_in", "Int64_in"]
         outputs += ["Float32_out", "Int8_out", "UInt16_out", "Int64_out"]
     limits = {"n": 5, "on": 2, "mode": 3, "Int8_in": 100, "UInt16_in": 60000, "Int64_in": 2**40}
-    pair = Pair(probe(version), inputs, outputs, ["fault", "fault_step", "gain"], 9, version)
+    pair = Pair(probe(version), inputs, outputs, ["fault", "fault_step", "gain"], count, version)
     rng = np.random.default_rng(version)
     try:
         for _ in range(60):
-            faults = rng.choice([0, 0, 2, 3, 4, 5, 6, 7], 9)
-            values = np.array([faults, rng.integers(1, 5, 9), rng.choice([1.0, 2.0], 9)], float)
-            pair.reset(values, rng.random(9) < 0.7)
+            faults = rng.choice([0, 0, 2, 3, 4, 5, 6, 7], count)
+            values = np.array(
+                [faults, rng.integers(1, 5, count), rng.choice([1.0, 2.0], count)], float
+            )
+            pair.reset(values, rng.random(count) < 0.7)
             for _ in range(4):
                 rows = [
-                    rng.integers(0, limits[n], 9) if n in limits else rng.normal(size=9).round(3)
+                    rng.integers(0, limits[n], count)
+                    if n in limits
+                    else rng.normal(size=count).round(3)
                     for n in inputs
                 ]
-                rows[inputs.index("n_free")] = rng.integers(-(2**31), 2**31, 9)
+                rows[inputs.index("n_free")] = rng.integers(-(2**31), 2**31, count)
                 given = np.array(rows, float)
                 pair.compare([pool.step(given) for pool in (pair.oracle, pair.native)])
+    finally:
+        pair.close()
+
+
+@pytest.mark.parametrize("width", [2, 70])
+@pytest.mark.parametrize("count", [1, 3])
+def test_agrees_on_values_beyond_those_of_observations(probe, count, width):
+    """Outputs may exceed a float32; with inputs that are not finite nothing is stepped."""
+    outputs = ["sum", "steps"] * (width // 2)
+    pair, exceeds = Pair(probe(2), ["a"], outputs, ["gain"], count, 0), False
+    try:
+        for a in (0.5, np.nan, 1e42, np.inf, 0.5):
+            pair.reset(np.full((1, count), 1.5), None)
+            with np.errstate(over="ignore"):
+                pair.step(np.full((1, count), a), None)
+            exceeds |= np.abs(pair.native.outputs).max() > np.finfo(np.float32).max
+        assert exceeds
     finally:
         pair.close()
 

@@ -12,12 +12,17 @@ bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
     return given == expected;
 }
 
-/* A call, the arrays that it keeps, and its result. The pool's own arrays need no new buffer. */
+/* A call and its result. */
 typedef struct {
     int operation;
     Call call;
-    Py_buffer inputs, mask, observations, values;
     size_t troubled;
+} Doing;
+
+/* The same with the arrays that it keeps. The pool's own arrays need no new buffer. */
+typedef struct {
+    Doing doing;
+    Py_buffer inputs, mask, observations, values;
 } PyCall;
 
 static void release_views(PyCall *c) {
@@ -42,7 +47,7 @@ static bool view_inputs(PyPool *self, PyObject *object, PyCall *c) {
             return false;
         }
     }
-    c->call.inputs = matrix_of(buffer);
+    c->doing.call.inputs = matrix_of(buffer);
     return true;
 }
 
@@ -54,7 +59,7 @@ static bool view_mask(PyPool *self, PyObject *object, PyCall *c) {
                      (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    c->call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
+    c->doing.call.mask = (Mask){c->mask.buf, c->mask.strides[0]};
     return true;
 }
 
@@ -72,7 +77,7 @@ static bool view_observations(PyPool *self, PyObject *object, PyCall *c) {
             return false;
         }
     }
-    c->call.observations = buffer->buf;
+    c->doing.call.observations = buffer->buf;
     return true;
 }
 
@@ -80,29 +85,33 @@ static bool view_start(PyPool *self, PyObject *access, PyObject *values, PyCall 
     if (!is_access(self, access)) {
         return false;
     }
-    c->call.start = &((PyAccess *)access)->access;
+    c->doing.call.start = &((PyAccess *)access)->access;
     if (!take_matrix(values, &c->values, COPIED, "values", ITEM_FLOAT64,
-                     (Py_ssize_t)c->call.start->count, (Py_ssize_t)self->pool.settings.count)) {
+                     (Py_ssize_t)c->doing.call.start->count, (Py_ssize_t)self->pool.settings.count)) {
         return false;
     }
-    c->call.start_values = matrix_of(&c->values);
+    c->doing.call.start_values = matrix_of(&c->values);
     return true;
 }
 
 static void do_call(PyPool *self, bool alone, void *context) {
     static size_t (*const functions[])(Pool *, const Call *) = {
         [STEP] = pool_step, [RESET] = pool_reset, [MIXED] = pool_step_or_reset};
-    PyCall *c = context;
+    Doing *d = context;
 
-    c->call.alone = alone;
-    c->troubled = functions[c->operation](&self->pool, &c->call);
+    d->call.alone = alone;
+    d->troubled = functions[d->operation](&self->pool, &d->call);
+}
+
+static PyObject *result_of(PyPool *self, const Doing *d, bool done) {
+    return done && report_messages(self) ? PyLong_FromSize_t(d->troubled) : NULL;
 }
 
 static PyObject *finish(PyPool *self, PyCall *c) {
-    const bool done = perform(self, c->operation, do_call, c);
+    const bool done = perform(self, c->doing.operation, do_call, &c->doing);
 
     release_views(c);
-    return done && report_messages(self) ? PyLong_FromSize_t(c->troubled) : NULL;
+    return result_of(self, &c->doing, done);
 }
 
 static PyObject *give_up(PyCall *c) {
@@ -112,17 +121,17 @@ static PyObject *give_up(PyCall *c) {
 
 PyObject *py_step_own(PyObject *object, PyObject *unused) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.operation = STEP,
-                .call = {.inputs = matrix_of(&self->buffers[INPUTS]),
-                         .observations = self->buffers[OBSERVATIONS].buf}};
+    Doing d = {.operation = STEP,
+               .call = {.inputs = matrix_of(&self->buffers[INPUTS]),
+                        .observations = self->buffers[OBSERVATIONS].buf}};
 
     (void)unused;
-    return finish(self, &c);
+    return result_of(self, &d, perform(self, d.operation, do_call, &d));
 }
 
 PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.operation = STEP};
+    PyCall c = {.doing = {.operation = STEP}};
 
     if (has_arguments(nargs, 3) && view_inputs(self, args[0], &c) && view_mask(self, args[1], &c) &&
         view_observations(self, args[2], &c)) {
@@ -133,7 +142,7 @@ PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
 
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.operation = RESET};
+    PyCall c = {.doing = {.operation = RESET}};
 
     if (has_arguments(nargs, 4) && view_inputs(self, Py_None, &c) &&
         view_start(self, args[0], args[1], &c) && view_mask(self, args[2], &c) &&
@@ -145,7 +154,7 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
 
 PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
-    PyCall c = {.operation = MIXED};
+    PyCall c = {.doing = {.operation = MIXED}};
 
     if (has_arguments(nargs, 5) && view_inputs(self, args[0], &c) &&
         view_start(self, args[1], args[2], &c) && view_mask(self, args[3], &c) &&
