@@ -439,8 +439,9 @@ class CompiledEngine(BatchEngine):
         observations, infos = (last, {}) if self._divided is None else self._divided(last)
         is_array = isinstance(observations, np.ndarray)
         objects = (rows_as_objects if is_array else observations_of)(observations, started)
-        final = final_infos(objects, restricted(infos, started), started)
-        return _start_infos(self.env._plan, drawn, started) | final
+        told = _start_infos(self.env._plan, drawn, started)
+        told.update(final_infos(objects, restricted(infos, started), started))
+        return told
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
