@@ -264,7 +264,7 @@ def as_distribution(what: str, value: Any) -> Any:
 
 def is_distribution(value: object) -> bool:
     """Whether a value of a config is to be drawn anew at each reset."""
-    if isinstance(value, type):
+    if value is None or isinstance(value, (float, type)):  # quickly: `time` asks it
         return False
     return isinstance(value, _OURS) or has_method(value, "sample") or has_method(value, "rvs")
 

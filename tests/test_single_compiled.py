@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from fmu_tools import PlainEnv, probe_config
 from gymnasium.utils.env_checker import check_env
-from hypothesis import HealthCheck, Phase, given, settings
-from test_vector_program import EXPRESSIONS, hook_of
+from hypothesis import HealthCheck, Phase, example, given, settings
+from test_vector_program import EXPRESSIONS, NUMBERS_IN_LISTS, hook_of
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import Drawing
 
@@ -647,6 +647,7 @@ def expression_task(reward, observed, variable):
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(EXPRESSIONS, EXPRESSIONS, EXPRESSIONS)
+@example(*NUMBERS_IN_LISTS)
 def test_generated_expressions(reward, observed, variable):
     """Whatever can be traced gives what Python gives."""
     env = expression_task(reward, observed, variable)()

@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from vector_tools import Drawing, require_equal, require_same_infos, sampled_actions
 
@@ -132,6 +132,13 @@ BINARY = (
     *("np.select([self.state[0] > 0.2, self.state[1] > 0], [{}, {}], -1.0)",),
 )
 
+NUMBERS_IN_LISTS = (
+    "self.state[0]",
+    "np.cos(np.select([self.state[0] > 0.2, True], [self.state[0], self.action[0]], -1.0))",
+    "np.cos(np.choose(self.step_count % 2, [0.1, self.action[0]]))",
+)
+"""Numbers of Python in lists, which adapt to the types of other numbers as they do elsewhere."""
+
 
 def combined(children):
     return st.one_of(
@@ -183,6 +190,7 @@ def prototype():
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(EXPRESSIONS, EXPRESSIONS, EXPRESSIONS)
+@example(*NUMBERS_IN_LISTS)
 def test_generated_expressions(prototype, reward, observed, variable):
     """Whatever can be traced gives what numpy gives on arrays."""
     env, batch = prototype

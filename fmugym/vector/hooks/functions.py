@@ -24,6 +24,7 @@ from fmugym.vector.hooks.symbols import (
     handlers,
     has_symbols,
     lift,
+    stand_in,
 )
 
 __all__ = ["full_like"]
@@ -248,7 +249,7 @@ def _broadcast_arrays(*arrays: Any, subok: bool = False) -> Any:
 
 def _where(condition: Any, first: Any, second: Any) -> Symbols:
     graph = graph_of(condition, first, second)
-    dummies = [_dummy(graph, value) for value in (first, second)]
+    dummies = [stand_in(graph, value) for value in (first, second)]
     dtype = np.where(np.ones(1, np.bool_), *dummies).dtype
     letter_of(dtype)
     chosen = as_symbols(graph, condition).cast(np.bool_)
@@ -256,19 +257,10 @@ def _where(condition: Any, first: Any, second: Any) -> Symbols:
     return Symbols(graph, each(graph.choose, chosen.cells, *cells), dtype)
 
 
-def _dummy(graph: Graph, value: Any) -> Any:
-    """A number or array of the same type, of which numpy makes the same type of result."""
-    if type(value) in (int, float, bool):
-        return value
-    if isinstance(value, Symbols) and value.weak is not None:
-        return value.weak(1)
-    return np.ones(1, as_symbols(graph, value).dtype)
-
-
 def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
     graph = graph_of(condlist, choicelist, default)
     values = [*choicelist, default]
-    dtype = np.result_type(*(_dummy(graph, value) for value in values))
+    dtype = np.result_type(*(stand_in(graph, value) for value in values))
     result: Any = as_symbols(graph, default).cast(dtype)
     for condition, choice in zip(reversed(condlist), reversed(choicelist), strict=True):
         result = _where(condition, as_symbols(graph, choice).cast(dtype), result)

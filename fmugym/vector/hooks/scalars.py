@@ -241,16 +241,23 @@ def _require_few(ufunc: Any, values: Any) -> None:
 
 
 def _call_function(graph: Any, function: Any, args: Any, keywords: Any) -> Any:
-    args = tuple(map(_boxed, args))
-    keywords = {name: _boxed(value) for name, value in keywords.items()}
+    adapt = function in (np.select, np.choose)
+    args = tuple(_boxed(value, adapt) for value in args)
+    keywords = {name: _boxed(value, adapt) for name, value in keywords.items()}
     makes_arrays = function in _ARRAY_MAKERS
     return graph.follow(makes_arrays, lambda: handlers["function"](function, args, keywords))
 
 
-def _boxed(value: Any) -> Any:
-    """What the functions of symbolic arrays take: numbers of Python stay weak."""
+def _boxed(value: Any, adapt: bool = False) -> Any:
+    """What the functions of symbolic arrays take: numbers of Python stay weak.
+
+    Args:
+        value: An argument.
+        adapt: Whether numbers in lists stay weak, too. Where numpy makes an array of the list, they
+            do not.
+    """
     if isinstance(value, list | tuple):
-        return type(value)(_boxless_part(part) for part in value)
+        return type(value)(map(_boxed if adapt else _boxless_part, value))
     if not isinstance(value, Scalar):
         return value
     symbols = value.symbols.like(value.cell)

@@ -30,6 +30,7 @@ __all__ = [
     "loaded",
     "same_for_all",
     "spread",
+    "stand_in",
 ]
 
 LANES: Final = 5
@@ -382,6 +383,15 @@ def as_symbols(graph: Graph, value: Any) -> Symbols:
         cells = [part.cast(dtype).cells for part in parts]
         return Symbols(graph, np.stack(cells), dtype)
     return lift(graph, np.asarray(value))
+
+
+def stand_in(graph: Graph, value: Any) -> Any:
+    """A number or array of the same type, of which numpy makes the same type of result."""
+    if type(value) in (int, float, bool):
+        return value
+    if isinstance(value, Symbols) and value.weak is not None:
+        return value.weak(1)
+    return np.ones(1, as_symbols(graph, value).dtype)
 
 
 def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:

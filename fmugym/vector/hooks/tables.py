@@ -22,6 +22,7 @@ from fmugym.vector.hooks.symbols import (
     handlers,
     has_symbols,
     lift,
+    stand_in,
 )
 
 __all__ = [
@@ -195,7 +196,7 @@ def _choose(a: Any, choices: Any, out: Any = None, mode: Any = "raise") -> Any:
         raise UntraceableError("it uses an argument of numpy.choose")
     graph = graph_of(a, choices)
     parts = [as_symbols(graph, choice) for choice in choices]
-    dtype = np.result_type(*(part.dtype for part in parts))
+    dtype = np.result_type(*(stand_in(graph, choice) for choice in choices))
     index = as_symbols(graph, a).cast(_INTEGER)
     checked: Any = np.where(index < 0, len(parts), index)  # numpy.choose knows no negative index
     cells = [part.cast(dtype).cells for part in parts]
