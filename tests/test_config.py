@@ -90,7 +90,6 @@ class TestValuesForVariables:
         [
             ("gain", 2, 2.0),
             ("gain", np.float32(0.5), 0.5),
-            ("gain", True, 1.0),
             ("n", 3, 3.0),
             ("n", 3.0, 3.0),
             ("n", np.int8(-3), -3.0),
@@ -119,6 +118,7 @@ class TestValuesForVariables:
             ("gain", math.inf, "'gain' must be finite"),
             ("gain", "1.0", "'gain' must be a number, got '1.0'"),
             ("gain", None, "'gain' must be a number, got None"),
+            ("gain", True, "'gain' must be a number, got True"),
             ("gain", [1.0], "'gain' must be a number"),
             ("gain", np.ones(1), "'gain' must be a number"),
             ("gain", 1j, "'gain' must be a number"),
