@@ -264,7 +264,7 @@ void results_free(Results *r) {
             Py_XDECREF(r->makers[i].made[k].array);
         }
     }
-    Py_XDECREF(r->class_of_arrays);
+    Py_XDECREF((PyObject *)r->class_of_arrays);
     Py_XDECREF(r->telling.no_arguments);
     Py_XDECREF(r->parts);
     free(r);
