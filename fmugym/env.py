@@ -17,7 +17,7 @@ from fmugym.archive.texts import text_of
 from fmugym.checks import check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown, unknown_argument
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool import Pool
 from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
@@ -208,7 +208,7 @@ class FMUEnv(Constructed):
     @staticmethod
     def _reset_pool(pool: Pool, plan: EpisodePlan, episode: Episode) -> None:
         pool.reset(plan.model_variables, episode.start_values)
-        if pool.statuses.item(0) > Status.WARNING:
+        if pool.statuses.item(0) > WARNING_CODE:
             raise failed_reset(pool.failure(0))
 
     def _begin_with_warm_up(

@@ -20,7 +20,7 @@ from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import fmu_calls
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.fmi.system_library import open_library
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
@@ -256,7 +256,7 @@ class _InstanceInWine:
         self.close = self._pool.close
         try:
             self._pool.reset(tuple(start), np.array([list(start.values())], float).T)
-            if self._pool.statuses[0] > Status.WARNING:
+            if self._pool.statuses[0] > WARNING_CODE:
                 raise SimulationError(self._pool.failure(0))
         except BaseException:
             self.close()

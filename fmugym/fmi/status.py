@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import enum
+from typing import Final
 
-__all__ = ["Phase", "Status", "failed_call", "sane"]
+__all__ = ["TERMINATED_CODE", "WARNING_CODE", "Phase", "Status", "failed_call", "sane"]
 
 
 class Status(enum.IntEnum):
@@ -19,6 +20,12 @@ class Status(enum.IntEnum):
     """The FMU asked to stop; its outputs are valid."""
     NOT_FINITE = 7
     """An output is NaN or infinite."""
+
+
+WARNING_CODE: Final = int(Status.WARNING)
+TERMINATED_CODE: Final = int(Status.TERMINATED)
+"""What arrays of statuses are compared with. Numpy asks the class of an enumeration for attributes,
+and drops what a signal handler raises meanwhile."""
 
 
 class Phase(enum.Enum):

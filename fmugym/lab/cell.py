@@ -15,7 +15,7 @@ from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
 from fmugym.checks import check_mapping
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.lab.acting import Acting
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance
@@ -168,7 +168,7 @@ class Cell:
         parameters = {name: changes.get(name, self._parameters[name]) for name in self._parameters}
         values = np.array([[*position, *parameters.values()]], float).T
         _, statuses = pool.reset(self._start_variables, values)
-        if statuses[0] > Status.WARNING:
+        if statuses[0] > WARNING_CODE:
             raise SimulationError(f"cell {self.cell_id} cannot start: {pool.failure(0)}")
         self._read(pool)
 

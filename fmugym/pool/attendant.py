@@ -13,7 +13,7 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import LicenceError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
@@ -119,7 +119,7 @@ class Attendant(Attending):
 
 def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
     """The texts of the instances among the chosen ones that got no licence."""
-    failed = np.flatnonzero(chosen & (pool.statuses > Status.WARNING)).tolist()
+    failed = np.flatnonzero(chosen & (pool.statuses > WARNING_CODE)).tolist()
     texts = {index: pool.failure(index) for index in failed}
     return {index: text for index, text in texts.items() if speaks_of_licence(text)}
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.tape import Effort, Judge, Recorder, Rehearsals, Tape
@@ -152,7 +152,7 @@ class CountedPool(Pool):
         if tape is not None:
             self._hand_over(tape)
         elif recorder.turn(int(self._counts[0, Column.STEPS])):
-            if self.statuses[0] <= Status.WARNING:
+            if self.statuses[0] <= WARNING_CODE:
                 recorder.begin(variables, values[:, 0], self.outputs[:, 0])
             else:
                 recorder.drop()

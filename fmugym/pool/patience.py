@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Final, TypeVar
 
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
 
 __all__ = ["Patience", "failed_reset", "licence_errors", "require_licence", "speaks_of_licence"]
@@ -66,7 +66,7 @@ def require_licence(pool: Pool) -> None:
     Raises:
         LicenceError: If it got no licence.
     """
-    if pool.statuses[0] > Status.WARNING:
+    if pool.statuses[0] > WARNING_CODE:
         failure = pool.failure(0)
         if speaks_of_licence(failure):
             raise LicenceError(failure)

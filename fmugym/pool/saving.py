@@ -14,7 +14,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, Record, SaveMethod
@@ -88,7 +88,7 @@ class SavingPool(AttendedPool):
 
     def _copies(self, indices: IndexArray) -> Copies | None:
         """Copy the states of all instances; None if some are not asked for, or cannot be copied."""
-        every = len(indices) == self.num_instances and np.all(self.statuses <= Status.WARNING)
+        every = len(indices) == self.num_instances and np.all(self.statuses <= WARNING_CODE)
         if self.save_method is not SaveMethod.COPY or not every:
             return None
         try:
@@ -155,7 +155,7 @@ class SavingPool(AttendedPool):
             self.restore(bundle.copies.snapshot, mask)
         except SimulationError:
             return False
-        if np.any(self.statuses[indices] > Status.WARNING):
+        if np.any(self.statuses[indices] > WARNING_CODE):
             return False
         for source, index in zip(sources.tolist(), indices.tolist(), strict=True):
             record = bundle.records[source]
@@ -173,7 +173,7 @@ class SavingPool(AttendedPool):
     def _records(self, indices: IndexArray) -> list[Record | None]:
         records: list[Record | None] = []
         for index in indices.tolist():
-            failed = self.statuses[index] > Status.WARNING
+            failed = self.statuses[index] > WARNING_CODE
             record = None if failed else self.record_of(index)
             if record is None and not failed:
                 raise SimulationError(
@@ -223,7 +223,7 @@ class SavingPool(AttendedPool):
         places = {int(index): place for place, index in enumerate(indices)}
         for index in replayed:
             same = np.array_equal(self.outputs[:, index], wanted[:, places[index]])
-            if not same and self.statuses[index] <= Status.WARNING:
+            if not same and self.statuses[index] <= WARNING_CODE:
                 logger.warning(
                     "instance %d: played again, its episode has led to other outputs", index
                 )

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.attendant import AttendedPool, Attending, InitialState, Reset
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.spec import PoolSpec
@@ -173,7 +173,7 @@ class InitialStates(Attending):
         if state is None:
             first = indices[0]
             reset(variables, values, np.arange(pool.num_instances) == first)
-            if pool.statuses[first] > Status.WARNING:
+            if pool.statuses[first] > WARNING_CODE:
                 return [first]
             state = pool.pack(first)
             if state is None:

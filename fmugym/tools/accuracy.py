@@ -19,7 +19,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.task.opening import PoolOpening
@@ -120,7 +120,7 @@ class Replay:
             return None
         with closing(pool):
             pool.reset(self.variables, self.starts)
-            return None if pool.statuses[0] > Status.WARNING else self._played(pool)
+            return None if pool.statuses[0] > WARNING_CODE else self._played(pool)
 
     def _played(self, pool: Pool) -> Course:
         real = [i for i, one in enumerate(self.spec.outputs) if one.kind == "real"]
@@ -131,7 +131,7 @@ class Replay:
             begin = time.perf_counter()
             pool.step(inputs[:, np.newaxis])
             times.append(time.perf_counter() - begin)
-            if pool.statuses[0] > Status.WARNING:
+            if pool.statuses[0] > WARNING_CODE:
                 break
             row[:] = pool.outputs[real, 0]
             if sum(times) > _SECONDS:

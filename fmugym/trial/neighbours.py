@@ -21,7 +21,7 @@ from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.access import Access
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.library import Library
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.fmi.system_library import open_library
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.pacing import Pacer
@@ -156,7 +156,7 @@ def _trajectory(
     require_licence(pool)
     rows = [outputs[:, 0].copy()]
     for step in range(inputs.shape[1]):
-        if statuses[0] > Status.WARNING:
+        if statuses[0] > WARNING_CODE:
             break
         outputs, statuses = pool.step(inputs[:, step].T)
         rows.append(outputs[:, 0].copy())

@@ -18,7 +18,7 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.attendant import AttendedPool, InitialState
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.patience import require_licence
@@ -220,7 +220,7 @@ class Rehearsal:
             self.is_frugal = True
         rows = [outputs[:, 0].copy()]
         for row in self._inputs[:steps]:
-            if statuses[0] > Status.WARNING:
+            if statuses[0] > WARNING_CODE:
                 break
             outputs, statuses = pool.step(row[:, None])
             rows.append(outputs[:, 0].copy())

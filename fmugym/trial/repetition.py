@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from fmugym.errors import FMUGymError, LicenceError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.seats import Seats, taking
@@ -191,7 +191,7 @@ def _played(pool: Pool, tape: Tape) -> _Run:
     outputs, statuses = pool.reset(tape.variables, tape.starts[:, None])
     rows, codes = [outputs[:, 0].copy()], []
     for row in tape.inputs:
-        if statuses[0] > Status.WARNING:
+        if statuses[0] > WARNING_CODE:
             break
         outputs, statuses = pool.step(row[:, None])
         rows.append(outputs[:, 0].copy())

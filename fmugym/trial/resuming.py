@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import FMUGymError, LicenceError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.bundle import Bundle, SaveMethod
 from fmugym.pool.patience import require_licence
@@ -164,7 +164,7 @@ def _play(pool: SavingPool, request: Request, amplitude: float) -> Halfway | Non
 def _rows(pool: SavingPool, halfway: Halfway) -> FloatArray:
     pool.restore_instances(halfway.state, _ONE, _ONE)
     rows: list[Any] = []
-    if pool.statuses[0] <= Status.WARNING:
+    if pool.statuses[0] <= WARNING_CODE:
         _step(pool, halfway.inputs, rows)
     return np.array(rows)
 
@@ -174,6 +174,6 @@ def _step(pool: SavingPool, inputs: FloatArray, rows: list[Any]) -> bool:
     for row in inputs:
         outputs, statuses = pool.step(row[:, None])
         rows.append(outputs[:, 0].copy())
-        if statuses[0] > Status.WARNING:
+        if statuses[0] > WARNING_CODE:
             return False
-    return bool(pool.statuses[0] <= Status.WARNING)
+    return bool(pool.statuses[0] <= WARNING_CODE)

@@ -25,7 +25,7 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.instance import Instance
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.patience import require_licence
@@ -197,7 +197,7 @@ def _reset_and_step(pool: Pool, spec: PoolSpec, notes: Notes) -> None:
     notes.stage("initialization")
     _, statuses = pool.reset((), np.zeros((0, 1)))
     require_licence(pool)
-    if statuses[0] <= Status.WARNING:  # otherwise it may need the caller's values
+    if statuses[0] <= WARNING_CODE:  # otherwise it may need the caller's values
         notes.stage("the first step")
         pool.step(start_inputs(spec)[:, None])
 
@@ -285,7 +285,7 @@ def _can_read(request: Request, outputs: tuple[Variable, ...]) -> bool:
     pool = trial_pool(request.candidate.open(), spec, 1, logging.getLogger(__name__))
     try:
         _, statuses = pool.reset(starts.variables, starts.column(0))
-        return bool(statuses[0] <= Status.WARNING)
+        return bool(statuses[0] <= WARNING_CODE)
     finally:
         pool.close()
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
@@ -63,7 +63,7 @@ class PoolColumn(Pool):
         """See ``Pool.step_own``."""
         self.step()
         self.observations[0] = self.outputs[: self.observations.shape[1], 0]
-        return int(self.statuses[0] > Status.WARNING)
+        return int(self.statuses[0] > WARNING_CODE)
 
     def save(self) -> Any:
         """See ``Pool.save``."""

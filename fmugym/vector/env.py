@@ -17,7 +17,7 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import MaskArray, Pool
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.saving import require_saving
@@ -550,7 +550,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         statuses = self._pool.restore_instances(bundle, sources, indices)
-        for index in indices[statuses[indices] > Status.WARNING].tolist():
+        for index in indices[statuses[indices] > WARNING_CODE].tolist():
             raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
 
     @cached_property

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import SimulationError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.spec import START_TIME
@@ -247,7 +247,7 @@ class _Perturbation:
     # What may be wrong
 
     def _require_fine(self, what: str, indices: IndexArray) -> None:
-        for index in indices[self._pool.statuses[indices] > Status.WARNING].tolist():
+        for index in indices[self._pool.statuses[indices] > WARNING_CODE].tolist():
             raise SimulationError(f"{what} fails: {self._pool.failure(index)}")
 
     def _require_states(self, found: FloatArray, wanted: FloatArray) -> None:

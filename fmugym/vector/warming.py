@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.readings import Readings, reading
@@ -240,7 +240,7 @@ class CompiledWarmUp:
         inputs = pool.inputs[:, skip]
         left, before = self._warm_up.steps, self._pool.exchange_play(self._play)
         try:
-            while left and not np.any(pool.statuses[indices] > Status.WARNING):
+            while left and not np.any(pool.statuses[indices] > WARNING_CODE):
                 steps = min(left, _STEPS_AT_ONCE)
                 self._roll_out(steps, skip)
                 left -= steps

@@ -17,7 +17,7 @@ from fmugym.archive.texts import text_among
 from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.backend.clock import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
@@ -213,7 +213,7 @@ class BackendPool(CountedPool):
     def step_own(self) -> int:
         """See ``Pool.step_own``."""
         self.step(None, None, self.observations)
-        return int(np.count_nonzero(self.statuses > Status.WARNING))
+        return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def save(self) -> Any:
         """Refuse: a real system cannot return to a state."""

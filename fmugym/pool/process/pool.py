@@ -26,7 +26,7 @@ from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -241,7 +241,7 @@ class ProcessPool(SavingPool):
         if not self._crew.any_lost and Code.TROUBLE not in replies.values():
             return 0
         self._crew.note_lost()
-        return int(np.count_nonzero(self.statuses > Status.WARNING))
+        return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     def _record_step(self, skip: MaskArray | None, seconds: float) -> None:
         if self._crew.lost[0]:  # something else may have ended the process

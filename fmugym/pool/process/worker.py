@@ -29,7 +29,7 @@ from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.texts import text_of
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
 from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.health import HealthArray
@@ -216,7 +216,7 @@ class BlockWorker:
     def _step_some(self) -> None:
         pool, block = self._pool, self._block
         pool.step(block.inputs, block.mask, pool.observations)
-        self._note(int(np.count_nonzero(pool.statuses > Status.WARNING)))
+        self._note(int(np.count_nonzero(pool.statuses > WARNING_CODE)))
 
     def _end_twin(self) -> None:
         """End this process if an FMU has forked it and returned in it as well."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
@@ -293,7 +293,7 @@ class BatchEngine(Engine):
 
     def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
         for index in indices.tolist():
-            if statuses[index] > Status.WARNING:
+            if statuses[index] > WARNING_CODE:
                 raise failed_reset(f"environment {index}: {self._pool.failure(index)}")
 
     def _place_episodes(
@@ -558,11 +558,11 @@ class BatchEngine(Engine):
         return infos
 
     def _stopped(self, statuses: StatusArray) -> MaskArray:
-        stopped: MaskArray = statuses == Status.TERMINATED
+        stopped: MaskArray = statuses == TERMINATED_CODE
         return stopped
 
     def _failed(self, statuses: StatusArray) -> MaskArray:
-        failed: MaskArray = (statuses > Status.WARNING) & (statuses != Status.TERMINATED)
+        failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
         return failed
 
     def _handle_faults(

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.fmi.status import Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.signals import is_of_signal_handler
 from fmugym.task.readings import Readings, reading
@@ -147,7 +147,7 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
         for _ in range(_STEPS):
             before = pool.outputs[:, 0].copy()
             pool.inputs[:, 0] = 0.1 * rng.uniform(size=len(pool.inputs))
-            if pool.statuses[0] <= Status.WARNING:
+            if pool.statuses[0] <= WARNING_CODE:
                 pool.step(None, ~mask)
             visited.append((before, pool.outputs[:, 0].copy(), pool.inputs[:, 0].copy()))
     return visited
