@@ -402,7 +402,9 @@ class TestSeries:
         assert read["String_told"].tolist() == told
         assert read.columns == series.columns
         np.testing.assert_array_equal(read.values, series.values)
-        frame = pytest.importorskip("pandas").read_parquet(tmp_path / "a.parquet")
+        frame = pytest.importorskip("pandas", reason="needs the extra pandas").read_parquet(
+            tmp_path / "a.parquet"
+        )
         assert frame["String_told"].tolist() == series.to_pandas()["String_told"].tolist() == told
 
     def test_another_process_knows_the_texts(self, feedthrough):
