@@ -467,3 +467,13 @@ class TestCommand:
             made = tmp_path / f"made{len(kind)}"
             assert main(["new", str(path), *kind, "--output", str(made)]) == 0
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")
+
+
+def test_a_misspelt_command_names_the_nearest(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["trian", "model.toml"])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert "'trian'" in said
+    assert "'train'" in said
+    assert "'dataset'" not in said

@@ -73,7 +73,7 @@ def test_every_command_has_an_example_or_a_link():
 def known_commands():
     from fmugym.tools.cli import _parser
 
-    (action,) = (one for one in _parser()._actions if one.dest == "==SUPPRESS==" or one.choices)
+    (action,) = (one for one in _parser()[0]._actions if one.dest == "==SUPPRESS==" or one.choices)
     return set(action.choices)
 
 

@@ -255,7 +255,7 @@ class TestJson:
             assert any("reward" in note for note in facts["notes"])
 
     def test_all_commands_have_it(self):
-        parser = _parser()
+        parser = _parser()[0]
         (commands,) = (action.choices for action in parser._actions if action.choices)
         for name, command in commands.items():
             assert any("--json" in action.option_strings for action in command._actions), name

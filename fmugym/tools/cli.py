@@ -80,7 +80,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Final
 
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, unknown_name
 from fmugym.tools.datasets import add_dataset
 from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
@@ -154,8 +154,11 @@ def _told(error: Exception) -> str:
 
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
-    parser = _parser()
-    arguments, rest = parser.parse_known_args(argv)
+    parser, commands = _parser()
+    given = sys.argv[1:] if argv is None else argv
+    if given and not given[0].startswith("-") and given[0] not in commands:
+        parser.error(str(unknown_name("command", given[0], commands)))
+    arguments, rest = parser.parse_known_args(given)
     more = [text for text in rest if not text.startswith("-")]
     if rest and (len(more) < len(rest) or not hasattr(arguments, "arguments")):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
@@ -164,7 +167,8 @@ def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     return arguments
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> tuple[argparse.ArgumentParser, Sequence[str]]:
+    """Make the parser; return it with the names of the commands."""
     parser = argparse.ArgumentParser(
         "fmugym", description="Look at an FMU, make a task of it, and run that."
     )
@@ -172,7 +176,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add in _COMMANDS:
         add(commands)
-    return parser
+    return parser, tuple(commands.choices)
 
 
 def _drop_output() -> None:
