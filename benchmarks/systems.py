@@ -137,8 +137,8 @@ def _alone(stack: ExitStack, model: Model, name: str) -> Pool:
 def _pass_on(model: Model, pools: Sequence[Pool]) -> None:
     """Let FMUs without connections take the same way as those of a system.
 
-    A step takes as long as its values make it: the sine of a pendulum at rest is faster than that of
-    one that turns.
+    How long a step takes depends on its values: the sine of a pendulum at rest is faster than that
+    of one that turns.
     """
     source, target = model.link
     for (one, other), name in zip(pairwise(pools), NAMES[1:], strict=True):
