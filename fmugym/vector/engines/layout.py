@@ -11,10 +11,7 @@ from fmugym.env import FMUEnv
 from fmugym.vector.codec import with_masks
 from fmugym.vector.hooks.trace import TracedTask
 
-__all__ = ["Divided", "Layout"]
-
-Divided = Callable[[Any], tuple[Any, dict[str, Any]]]
-"""Returns the observations and a new dict of infos that some arrays hold."""
+__all__ = ["Layout"]
 
 
 class Layout:
@@ -30,8 +27,8 @@ class Layout:
             empty.
         form: That of the observations and that of the infos, as the pool takes them: the number of
             an array, or a tuple of names and forms.
-        divided: Makes observations and infos of such arrays. None if what ``new_arrays`` makes
-            are the observations.
+        divided: Returns the observations and a new dict of infos that such arrays hold. None if
+            what ``new_arrays`` makes are the observations.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
@@ -39,7 +36,7 @@ class Layout:
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
         self.names: tuple[str, ...] | None = ()
-        self.divided: Divided | None = self._tree
+        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
         if not task.seen and env._pool_observes:
             self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
             self.names, self.divided = None, None
