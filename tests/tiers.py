@@ -51,6 +51,7 @@ SLOW_MODULES = {
     "test_value_arrays",
     "test_value_sizes",
     "test_value_types",
+    "test_vector_ends",
     "test_vector_masks",
     "test_systems",
     "test_systems_apart",
