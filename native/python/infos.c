@@ -153,15 +153,16 @@ static PyObject *dict_of(Infos *in, const Form *form, Origin *origin) {
     return dict;
 }
 
+static PyObject *item_of(Infos *in, const Form *form, Origin *origin) {
+    return form->is_array ? value_of(in, form->array, origin) : dict_of(in, form, origin);
+}
+
 static bool add_items(Infos *in, const Form *form, Origin *origin, PyObject *dict) {
     for (size_t i = 0; i < form->count; i++) {
         const Form *item = &form->items[i];
         PyObject *mask = mask_of(in, origin);
         origin->item++;
-        PyObject *value = item->is_array ? value_of(in, item->array, origin)
-                                         : dict_of(in, item, origin);
-        const bool has_value = set(dict, item->name, value);
-        if (!has_value || mask == NULL) {
+        if (mask == NULL || !set(dict, item->name, item_of(in, item, origin))) {
             Py_XDECREF(mask);
             return false;
         }
