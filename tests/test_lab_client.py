@@ -19,8 +19,6 @@ import fmugym
 from fmugym import ConfigError, FMUGymError
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, User, current_lab
 
-DOUBLES = ["DoublePendulum", "Acrobot", "Pendubot"]
-
 
 def strict(**changes):
     user = User(name="Ada", **changes)
