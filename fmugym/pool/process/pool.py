@@ -31,6 +31,7 @@ from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
     MaskArray,
+    Played,
     PoolSpec,
     SingleCalls,
     StatusArray,
@@ -256,7 +257,7 @@ class ProcessPool(SavingPool):
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
         return has_native_pool() and self._setup.native and not self._spec.licence_wait
 
-    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., Played]:
         """See ``Pool.prepare_play``."""
         self._plays += 1
         self._parts, self._play = (*parts, *named.values()), None
