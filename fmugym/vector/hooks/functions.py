@@ -320,7 +320,9 @@ def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> 
 def _flat(a: Any, axis: Any) -> tuple[Symbols, int]:
     """Symbols and an axis; without one, numpy takes all elements in a row."""
     symbols = as_symbols(graph_of(a), a)
-    return (symbols.ravel(), 0) if axis is None else (symbols, axis)
+    if axis is not None:
+        return symbols, axis
+    return symbols.like(symbols.cells.ravel()), 0
 
 
 def _accumulating(ufunc: Any) -> Callable[..., Any]:
