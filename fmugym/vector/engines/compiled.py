@@ -73,11 +73,11 @@ class CompiledEngine(BatchEngine):
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
-        """Give the pool everything it needs for a step, if it can draw the episodes."""
+        """Give the pool everything it needs for a step, if there are programs."""
         plan, streams = self.env._plan, self._streams
         self._task = task
         self._prepared = self._resets_at_once = self._is_whole = False
-        if task is None or not _can_draw(task, plan):
+        if task is None:
             return
         self._left = task.left
         self._drawn_shape = len(plan.draws), self._n
@@ -505,12 +505,6 @@ class CompiledEngine(BatchEngine):
 
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
-
-
-def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
-    """Whether all variables that are drawn have kept the type of a draw."""
-    types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
-    return all(dtype == np.float64 for dtype in types)
 
 
 def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
