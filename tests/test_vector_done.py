@@ -168,8 +168,8 @@ TASK = {
 
 @each_kind
 @each_mode
-def test_a_series_has_the_present_done(mode, hooks):
-    """Rows with what ends an episode, which reads ``done``, are those that the infos have."""
+def test_costs_in_a_series_have_the_done_of_their_step(mode, hooks):
+    """They come from the infos; where ``done`` is a cost, it is what the row says of the end."""
     rows = []
     for way in (hooks, "per_env"):
         inner = FMUVectorEnv(
@@ -186,6 +186,10 @@ def test_a_series_has_the_present_done(mode, hooks):
             {name: envs.series[name] for name in [column.name for column in envs.series.columns]}
         )
         assert rows[-1]["costs.last"].any()
+        is_step = rows[-1]["step"] > 0
+        np.testing.assert_array_equal(
+            rows[-1]["costs.last"][is_step], rows[-1]["terminated"][is_step]
+        )
         envs.close()
     require_equal(*rows)
 
