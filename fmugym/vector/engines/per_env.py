@@ -161,9 +161,7 @@ class PerEnvEngine(Engine):
                 env._ended = env._ended or self.has_moved  # its FMU has stepped without a result
             raise
 
-    def _results(
-        self, items: Sequence[Any], running: list[int], taken: Taken | None
-    ) -> StepResult:
+    def _results(self, items: Sequence[Any], running: list[int], taken: Taken | None) -> StepResult:
         outcomes = Outcomes(len(self._envs))
         if isinstance(self._stack, PoolStack):
             self._stack.refresh()
