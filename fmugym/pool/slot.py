@@ -225,7 +225,7 @@ class Slot:
         return True
 
     def _kept_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
-        """Keep the state if a later reset can use it; returns whether the instance can still step."""
+        """Keep the state if a later reset can use it; returns whether the instance can step."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
         if again and self._restores:
