@@ -21,6 +21,7 @@ __all__ = [
     "ISOLATIONS",
     "FloatArray",
     "MaskArray",
+    "Played",
     "Pool",
     "PoolSpec",
     "SingleCalls",
@@ -32,6 +33,9 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
+
+Played = tuple[Any, int, bool, MaskArray | None]
+"""What a step with compiled hooks returns; see ``NativePool.prepare_play``."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -282,7 +286,7 @@ class Pool(ABC):
         draws: Any,
         episodes: Any,
         surroundings: Any,
-    ) -> Callable[..., tuple[Any, int, int, int]]:
+    ) -> Callable[..., Played]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 
         Raises:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,11 +28,8 @@ from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.infos import (
-    final_infos,
     not_finite,
-    observations_of,
     restricted,
-    rows_as_objects,
 )
 from fmugym.vector.streams import given_draws
 
@@ -48,9 +44,6 @@ _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.f
 
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
-
-_make_result: Callable[[tuple[Any, ...]], StepResult] = partial(tuple.__new__, StepResult)
-"""Takes a third of the time of a NamedTuple's constructor."""
 
 
 class CompiledEngine(BatchEngine):
@@ -80,17 +73,16 @@ class CompiledEngine(BatchEngine):
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
-        """Give the pool everything it needs for a step, if it can draw the episodes."""
+        """Give the pool everything it needs for a step, if there are programs."""
         plan, streams = self.env._plan, self._streams
         self._task = task
         self._prepared = self._resets_at_once = self._is_whole = False
-        if task is None or not _can_draw(task, plan):
+        if task is None:
             return
         self._left = task.left
         self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
-        self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
         in_pass = not self._draws_ahead and self.env._warm_ups is None
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
@@ -99,7 +91,7 @@ class CompiledEngine(BatchEngine):
         self._make_rows(task)
         layout = Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
-        self._is_whole = layout.divided is None and not task.left
+        self._is_whole = not task.left
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
@@ -112,7 +104,7 @@ class CompiledEngine(BatchEngine):
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
             self._surroundings(task)
-            | {"results": (np.empty, StepResult, layout.names, arrays, told)},
+            | {"results": (np.empty, StepResult, *layout.form, arrays, told)},
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:
@@ -254,8 +246,9 @@ class CompiledEngine(BatchEngine):
         self.has_moved = True
         troubled, self.any_ended = self._start(mask, seen, drawn)
         infos = _start_infos(self.env._plan, drawn, mask)
-        if self._divided is None and not troubled and not self._left:
-            return seen, infos
+        if self._divided is not None:
+            seen, told = self._divided(seen)
+            infos = restricted(told, mask) | infos
         return self._started(seen, infos, mask, troubled)
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
@@ -275,11 +268,9 @@ class CompiledEngine(BatchEngine):
         return self._started(*result, result[1]["_drawn"], troubled)
 
     def _started(
-        self, seen: Any, infos: dict[str, Any], mask: MaskArray, troubled: int
+        self, observations: Any, infos: dict[str, Any], mask: MaskArray, troubled: int
     ) -> tuple[Any, dict[str, Any]]:
-        """Complete what a reset returns."""
-        observations, told = (seen, {}) if self._divided is None else self._divided(seen)
-        infos = restricted(told, mask) | infos if told else infos
+        """Call the hooks that are not compiled after a reset, and refuse impossible starts."""
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -294,24 +285,6 @@ class CompiledEngine(BatchEngine):
         if self._draws_ahead:
             drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
         return drawn
-
-    def _make_spare(self) -> tuple[FloatArray, Any, MaskArray | None]:
-        """Make arrays for the episodes that start in a step; they serve until one does.
-
-        Returns:
-            For the values drawn and, if episodes start where others end, for the last observations
-            and for which environments these are; otherwise None.
-        """
-        last, started = None, None
-        if self.starts_at_ends and self._starts_in_pass:
-            last, started = self._new_arrays(), np.empty(self._n, _BOOL)
-        self._spare = np.empty(self._drawn_shape), last, started
-        return self._spare
-
-    def leave_starts(self) -> None:
-        """See ``Engine.leave_starts``."""
-        super().leave_starts()
-        self._spare = None
 
     def call(
         self,
@@ -328,16 +301,21 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        if resetting is not None or not self._is_whole or self._any_foreign or self.starts_at_ends:
+        if resetting is not None or not self._is_whole or self._any_foreign:
             return self._step_in_parts(actions, resetting)
         result: StepResult
+        starts = self.starts_at_ends and self._starts_in_pass
+        play = self._play_with_resets if starts else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
+            result, troubled, self.any_ended, started = play(
+                actions, None if starts else self._not_drawn
+            )
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), None)
-        self.any_ended = ended > 0
-        return self._completed(result, troubled, None, None) if troubled else result
+        if troubled:
+            return self._completed(result, troubled, None, started)
+        return result
 
     def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """Do a step for which one call of the pool may not be all."""
@@ -347,22 +325,16 @@ class CompiledEngine(BatchEngine):
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
         result: StepResult
-        drawn, last, started = self._spare or self._make_spare()
-        drawn = drawn if resetting is None else self._draw_ahead(resetting)
-        play = self._play if resetting is started is None else self._play_with_resets
+        starts = resetting is None and self.starts_at_ends and self._starts_in_pass
+        drawn = self._not_drawn if resetting is None else self._draw_ahead(resetting)
+        play = self._play_with_resets if starts or resetting is not None else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, ended, begun = play(actions, drawn, last, started)
+            result, troubled, self.any_ended, started = play(actions, None if starts else drawn)
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
-        self.any_ended = ended > begun
-        if self._divided is not None:
-            observations, infos = self._divided(result.observations)
-            result = _make_result((observations, *result[1:4], infos))
         if resetting is not None:
             result.infos.update(_start_infos(self.env._plan, drawn, resetting))
-        elif begun:
-            result = self._with_ends(result, drawn, last, started)
         if troubled or self._left:
             return self._completed(result, troubled, resetting, started)
         return result
@@ -383,15 +355,6 @@ class CompiledEngine(BatchEngine):
         if converted is actions:
             raise error
         return converted
-
-    def _with_ends(
-        self, result: StepResult, drawn: FloatArray, last: Any, started: Any
-    ) -> StepResult:
-        """Add the infos on the episodes that have ended and on those that have followed them."""
-        self._spare = None
-        late = LateDict.of(self._infos_at_ends, drawn, last, started)
-        infos = result.infos | late if result.infos else late
-        return _make_result((*result[:4], infos))
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -433,15 +396,6 @@ class CompiledEngine(BatchEngine):
         if troubled or any(not_finite(values) is not None for values in seen):
             self._mend(result, resetting if started is None else started)
         return result
-
-    def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
-        """The infos of a step in which episodes have followed others."""
-        observations, infos = (last, {}) if self._divided is None else self._divided(last)
-        is_array = isinstance(observations, np.ndarray)
-        objects = (rows_as_objects if is_array else observations_of)(observations, started)
-        told = _start_infos(self.env._plan, drawn, started)
-        told.update(final_infos(objects, restricted(infos, started), started))
-        return told
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
@@ -551,12 +505,6 @@ class CompiledEngine(BatchEngine):
 
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
-
-
-def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
-    """Whether all variables that are drawn have kept the type of a draw."""
-    types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
-    return all(dtype == np.float64 for dtype in types)
 
 
 def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -25,6 +25,8 @@ class Layout:
         shapes: The shape and type of each array.
         names: None if the observations are the only array; the keys if they are a dict; otherwise
             empty.
+        form: That of the observations and that of the infos, as the pool takes them: the number of
+            an array, or a tuple of names and forms.
         divided: Returns the observations and a new dict of infos that such arrays hold. None if
             what ``new_arrays`` makes are the observations.
     """
@@ -43,6 +45,9 @@ class Layout:
         elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
             self.names, self.divided = tuple(path[-1] for path in self._paths), None
 
+        observations, infos = self._nested(range(len(self._paths)))
+        self.form = 0 if self.names is None else _pairs(observations), _pairs(infos)
+
     def new_arrays(self) -> Any:
         """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
         arrays = tuple(np.empty(shape, dtype) for shape, dtype in self.shapes)
@@ -52,12 +57,23 @@ class Layout:
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""
+        observations, infos = self._nested(arrays)
+        return observations, with_masks(infos, np.ones(self._n, np.bool_)) if infos else {}
+
+    def _nested(self, leaves: Iterable[Any]) -> tuple[Any, dict[str, Any]]:
+        """Something for each array, in the places of observations and infos."""
         tree: dict[str, Any] = {"observation": {}, "info": {}}
-        for path, array in zip(self._paths, arrays, strict=True):
+        for path, leaf in zip(self._paths, leaves, strict=True):
             *parents, name = path
             place = tree
             for parent in parents:
                 place = place.setdefault(parent, {})
-            place[name] = array
-        infos = with_masks(tree["info"], np.ones(self._n, np.bool_)) if tree["info"] else {}
-        return tree["observation"], infos
+            place[name] = leaf
+        return tree["observation"], tree["info"]
+
+
+def _pairs(tree: Any) -> Any:
+    """Make tuples of dicts."""
+    if not isinstance(tree, dict):
+        return tree
+    return tuple((name, _pairs(value)) for name, value in tree.items())

@@ -26,14 +26,17 @@ from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.results import type_of_variable
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
     loaded,
+    same_cells,
     same_for_all,
     spread,
+    writeable,
 )
 from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
@@ -155,6 +158,7 @@ class Tracer:
         self._env.done = self._whole(results[0], np.dtype(np.bool_))
         results.append(self._or_left("_is_truncated", self._flag_node, np.False_))
         results.append(self._or_left("_reward_policy", self._reward_node, np.float64(0.0)))
+        self._env.done = self._whole(self._only_active(results[0]), np.dtype(np.bool_))
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
@@ -196,6 +200,13 @@ class Tracer:
         flag = np.dtype(np.bool_)
         first = self._whole(node, flag).cells[0]
         return self._graph.apply(np.logical_or, (first, other), flag).node
+
+    def _only_active(self, node: int) -> int:
+        """A flag that is false where the FMU has not stepped: an episode starts there."""
+        flag = np.dtype(np.bool_)
+        active = self._graph.load("active", None, np.bool_, None)
+        flags = self._whole(node, flag).cells[0], active
+        return self._graph.apply(np.logical_and, flags, flag).node
 
     # Inputs.
 
@@ -248,14 +259,16 @@ class Tracer:
         if not self._env._own.update:
             return [], ()
         before = dict(self._env.variables)
-        self._call("_update", lambda value: None)
+        old = {name: symbols.copy() for name, symbols in before.items()}
+        with writeable(before.values()):
+            self._call("_update", lambda value: None)
         active = self._graph.load("active", None, np.bool_, None)
         stores, updated = [], []
-        for name, old in before.items():
+        for name, symbols in before.items():
             new = self._env.variables[name]
-            if new is old:
+            if new is symbols and same_cells(new, old[name]):
                 continue
-            kept = self._kept_where_idle(name, new, old, active)
+            kept = self._kept_where_idle(name, new, old[name], active)
             self._env.variables[name] = kept
             updated.append(name)
             nodes = same_for_all(kept).reshape(-1)
@@ -268,7 +281,7 @@ class Tracer:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
-        self._variables[name] = symbols.dtype
+        self._variables[name] = type_of_variable(self._env._plan, name, symbols.dtype)
         symbols = symbols.cast(old.dtype)
         choose = self._graph.choose
         cells: Any = np.empty(old.shape, object)
