@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-__all__ = ["main"]
+from fmugym.tools.ending import end_as_after_ctrl_c, exit_code
 
-_INTERRUPTED = 130
+__all__ = ["main"]
 
 
 def main() -> int:
@@ -16,10 +16,12 @@ def main() -> int:
         The exit code.
     """
     try:
+        end_as_after_ctrl_c()
         from fmugym.tools import cli
-    except KeyboardInterrupt:
-        return _INTERRUPTED
-    return cli.main()
+
+        return cli.main()
+    except KeyboardInterrupt as error:
+        return exit_code(error)
 
 
 if __name__ == "__main__":

@@ -316,13 +316,8 @@ class Pool:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
     def play(
-        self,
-        actions: Array,
-        drawn: Array,
-        last_observations: Array | None,
-        started: Array | None,
-        /,
-    ) -> tuple[Any, int, int, int]:
+        self, actions: Array, drawn: Array | None, /
+    ) -> tuple[Any, int, bool, tuple[Array, Array, tuple[Array, ...]] | None]:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:
@@ -331,18 +326,14 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
-    def play_before(
-        self, actions: Array, drawn: Array, last_observations: None, started: None, /
-    ) -> None:
+    def play_before(self, actions: Array, drawn: Array, /) -> None:
         """Do what comes before the FMUs' part of ``play``, where they run in other processes.
 
         Such a pool was made without paths of libraries. It draws the start values of the instances
         to be reset. The arguments and errors are those of ``play``.
         """
 
-    def play_after(
-        self, actions: Array, drawn: Array, last_observations: None, started: None, /
-    ) -> tuple[Any, int, int, int]:
+    def play_after(self, actions: Array, drawn: Array, /) -> tuple[Any, int, bool, None]:
         """Do what comes after the FMUs' part of ``play``.
 
         The outputs and statuses are those that the pool's arrays have. The arguments, results and

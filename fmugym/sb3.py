@@ -221,8 +221,8 @@ class FMUVecEnv(VecEnv):
         """
         env = self.vector_env
         given = dict.fromkeys(self._numbers(indices), value)
-        if not env._is_parameter(attr_name):
-            env._set_attribute(attr_name, given)
+        if not env._attributes.is_parameter(attr_name):
+            env._attributes.set_attribute(attr_name, given)
             return
         complete = self._all_values(attr_name, given)
         env.set_attr(attr_name, complete)

@@ -10,10 +10,6 @@ enum { MOST_GUESSES = 200 }; /* of the time of one event */
 
 static const double SHARP = 1e-3; /* part of the tolerance to which events are located */
 
-static bool good(Status status) {
-    return status <= STATUS_WARNING;
-}
-
 /* An interval of fractions of a step: no indicator has crossed zero at low, one has at high. */
 typedef struct {
     double low, high;

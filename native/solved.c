@@ -30,10 +30,6 @@ static const Fmi *fmi_of(const Solver *me) {
     return me->model->fmi;
 }
 
-static bool good(Status status) {
-    return status <= STATUS_WARNING;
-}
-
 static void forget_last(Solved *me) {
     for (int type = 0; type < NUMBER_OF_TYPES; type++) {
         me->last[type].references = NULL;

@@ -134,9 +134,23 @@ static inline bool solver_crosses(const Solver *me, const double *before, const 
 Status solver_fail(const Solver *me, const char *format, ...);
 void solver_restore_floats(const Solver *me);
 
+/* Whether the work goes on. */
+static inline bool good(Status status) {
+    return status <= STATUS_WARNING;
+}
+
+/* Like Python's max and min. Those of C are slow calls, because they care about NaN. */
+static inline double larger(double a, double b) {
+    return b > a ? b : a;
+}
+static inline double smaller(double a, double b) {
+    return b < a ? b : a;
+}
+
 /* For the methods: the rates at a time and state. */
 Status solver_rates(Solver *me, double time, const double *x, double *rates);
-/* Fills jacobian, row by row, and slope: the derivatives of the rates by state and time. */
+/* Fills jacobian, row by row, and slope: the derivatives of the rates by state and time. In
+ * differentials.c. */
 Status solver_differentiate(Solver *me, double step);
 /* The root mean square of errors, each divided by the tolerance of its state. */
 double solver_norm(const Solver *me, const double *errors);

@@ -44,10 +44,6 @@ static Atomic *stray_of(uint64_t environment) {
     return &strays[(environment ^ environment >> 32) % STRAYS];
 }
 
-static bool good(Status status) {
-    return status <= STATUS_WARNING;
-}
-
 /* Memory */
 
 static size_t number_of_watched(const Solving *s) {

@@ -210,13 +210,14 @@ class Subject:
 
     def play(self):
         actions = self.rng.integers(0, 2, self.n)
-        ends = [None, None]
+        drawn = np.empty((1, self.n))
         if self.rng.random() < 0.5:  # episodes start in the step that ends others
-            last = np.empty((self.n, len(self.outputs)), np.float32)
-            ends = last, np.empty(self.n, np.bool_)
+            drawn = None
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool._pool.play(actions, np.empty((1, self.n)), *ends)
+            result = self.pool._pool.play(actions, drawn)[0]
             counts["played"] += 1
+            if self.rng.random() < 0.5:
+                self.ends = result[4].get("final_obs")
 
     def start_episodes(self):
         observations = np.empty((self.n, len(self.outputs)), np.float32)

@@ -150,22 +150,24 @@ def steps_of(folder):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_ctrl_c_keeps_the_agent_and_a_checkpoint(task, tmp_path, capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_keep_the_agent_and_a_checkpoint(number, task, tmp_path, temp_root, capsys):
     folder = tmp_path / "agent"
     options = "--envs", "2", "--steps", "100000", "--episodes", "1", *ON_POLICY
     program = (
         "import sys; from fmugym.tools import training\n"
         "training._SECONDS_BETWEEN_CHECKPOINTS = 0.0\n"
-        "from fmugym.tools.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from fmugym.__main__ import main; sys.exit(main())"
     )
     command = [sys.executable, "-c", program, "train", str(task), "--output", str(folder), *options]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         deadline = time.monotonic() + 60
         while steps_of(folder) == 0 and time.monotonic() < deadline:
             time.sleep(0.05)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         process.wait(60)
-    assert process.returncode == 130
+    assert process.returncode == 128 + number
+    assert not list(temp_root.glob("fmugym-*"))
     assert (folder / "model.zip").exists()
     assert steps_of(folder) > 0
     code, out, _ = run(capsys, "simulate", task, "--agent", folder, "--episodes", "2", "--json")

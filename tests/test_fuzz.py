@@ -1,6 +1,7 @@
 """A short form of ``python tests/fuzz.py``; the full one is in docs/reliability.md."""
 
 import contextlib
+import time
 
 import fuzz
 import fuzz_driver
@@ -65,7 +66,15 @@ class TestDriver:
 
     def test_a_slow_case(self, monkeypatch):
         monkeypatch.setattr(fuzz_driver, "SLOW", 0.01)
-        assert self.run(lambda: sum(range(10**6))).total("failed") == 1
+
+        def work():
+            end = time.process_time() + 0.02
+            while time.process_time() < end:
+                pass
+
+        tally = self.run(work, lambda: time.sleep(0.02))
+        assert tally.total("failed") == 1
+        assert tally.failures[0].startswith("case 0")
 
     def test_a_case_is_repeated(self):
         """The random numbers of a case depend on its number and the seed alone."""

@@ -13,7 +13,7 @@ from vector_tools import CART_POLE, require_equal
 import fmugym
 from fmugym import FMUVectorEnv
 from fmugym.pool import has_native_pool
-from fmugym.vector import env as vector_env
+from fmugym.vector import episodes
 
 pytestmark = pytest.mark.skipif(
     not has_native_pool(), reason="hooks are compiled by the C extension"
@@ -43,7 +43,7 @@ def fixture_in_workers(monkeypatch):
     def refuse(*_):
         raise AssertionError("a rollout goes step by step")
 
-    monkeypatch.setattr(vector_env, "roll_out_by_steps", refuse)
+    monkeypatch.setattr(episodes, "roll_out_by_steps", refuse)
 
 
 def begun(envs, steps=2):

@@ -9,7 +9,12 @@ from urllib.request import url2pathname
 
 import numpy as np
 import pytest
-from lab_tools import TOKEN, experiment, track
+from lab_tools import (
+    TOKEN,
+    experiment,
+    fixture_lab,  # noqa: F401  # the fixture "lab"
+    track,
+)
 
 from fmugym import ConfigError
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, recording
@@ -17,12 +22,6 @@ from fmugym.rendering import palette
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="writes and reads the videos")
 Image = pytest.importorskip("PIL.Image", reason="writes and reads the animations")
-
-
-@pytest.fixture(name="lab")
-def fixture_lab():
-    with Lab("ideal", clock=ManualClock(), seed=0) as lab:
-        yield lab
 
 
 @pytest.fixture(name="no_ffmpeg")

@@ -7,17 +7,16 @@ import time
 
 import numpy as np
 import pytest
-from lab_tools import TOKEN, experiment, track
+from lab_tools import (
+    TOKEN,
+    experiment,
+    fixture_lab,  # noqa: F401  # the fixture "lab"
+    track,
+)
 
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock
 
 SINGLE = [CellType.SINGLE]
-
-
-@pytest.fixture(name="lab")
-def fixture_lab():
-    with Lab("ideal", clock=ManualClock(), seed=0) as lab:
-        yield lab
 
 
 @pytest.fixture(name="client")

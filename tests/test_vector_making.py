@@ -188,7 +188,7 @@ class Failing(Drawing):
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
 @pytest.mark.parametrize("hooks", ["array", "per_env"])
 def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, monkeypatch):
-    monkeypatch.setattr("fmugym.vector.env.find_difference", lambda env: None)
+    monkeypatch.setattr("fmugym.vector.choosing.find_difference", lambda env: None)
     vector = FMUVectorEnv(Failing, 3, hooks=hooks, autoreset_mode=mode)
     first = vector.reset(seed=1)[0]
     vector.step(NOTHING)

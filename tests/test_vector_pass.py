@@ -213,32 +213,20 @@ class TestGuards:
         yield envs._engine._pool._pool
         envs.close()
 
-    def arguments(self, **changes):
-        given = {
-            "actions": np.zeros(4, np.int64),
-            "drawn": np.empty((4, 4)),
-            "last": np.empty((4, 4), np.float32),
-            "started": np.empty(4, np.bool_),
-        }
-        return list((given | changes).values())
-
     def test_fitting_ones(self, pool):
-        assert pool.play(*self.arguments())[1:] == (0, 0, 0)
-        assert pool.play(*self.arguments(last=None, started=None))[1:] == (0, 0, 0)
+        actions = np.zeros(4, np.int64)
+        assert pool.play(actions, np.empty((4, 4)))[1:] == (0, False, None)
+        assert pool.play(actions, None)[1:] == (0, False, None)
 
-    @pytest.mark.parametrize(
-        "changes",
-        [
-            {"last": np.zeros((4, 3), np.float32)},
-            {"last": np.zeros((4, 4))},
-            {"started": np.zeros(3, np.bool_)},
-            {"started": None},
-        ],
-        ids=["shape of the last", "type of the last", "shape of started", "one alone"],
-    )
-    def test_others(self, pool, changes):
-        with pytest.raises((TypeError, ValueError)):
-            pool.play(*self.arguments(**changes))
+    @pytest.mark.parametrize("drawn", [np.empty((4, 3)), np.empty((4, 4))[:, ::-1], 7])
+    def test_others(self, pool, drawn):
+        with pytest.raises((TypeError, ValueError, BufferError)):
+            pool.play(np.zeros(4, np.int64), drawn)
+
+    @pytest.mark.parametrize("part", ["play_before", "play_after"])
+    def test_starts_at_ends_in_two_parts(self, pool, part):
+        with pytest.raises(TypeError, match="two parts"):
+            getattr(pool, part)(np.zeros(4, np.int64), None)
 
     @pytest.mark.parametrize("shapes", [((3,), (4, 4)), ((4,), (4, 3))])
     def test_starts(self, pool, shapes):

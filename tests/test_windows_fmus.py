@@ -6,6 +6,7 @@ That pools in Wine keep the contract of all pools is shown by test_pool.py.
 import contextlib
 import logging
 import os
+import shutil
 import signal
 import socket
 import subprocess
@@ -24,7 +25,7 @@ from vector_tools import run_side_by_side
 from wine_tools import exchange_fmu, for_windows
 
 import fmugym
-from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
+from fmugym import FMU, FMULoadError, FMUSystem, SimulationError, bundled_fmu
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.shared_memory import Memory, make_bell, size_for
@@ -145,6 +146,18 @@ class TestProgram:
         names = {path.name for path in program.sources()}
         assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names
 
+    def test_a_checkout_and_an_installed_package_share_it(self, monkeypatch, tmp_path):
+        digests = set()
+        for name in ("native", "native_sources"):
+            folder = tmp_path / name
+            (folder / "worker").mkdir(parents=True)
+            files = folder / "pool.h", folder / "worker" / "main.c"
+            for file in files:
+                file.write_text(f"/* {file.name} */")
+            monkeypatch.setattr(program, "sources", lambda files=files: files)
+            digests.add(program._digest.__wrapped__())
+        assert len(digests) == 1
+
     def test_without_a_compiler_one_that_was_built_before_is_used(self, bare, tmp_path):
         assert program.known_program() is None
         built = program.wine_folder() / f"worker-{program._digest()}-0.0.0.exe"
@@ -159,6 +172,14 @@ class TestProgram:
         with pytest.raises(FMULoadError, match="nonsense"):
             program.worker_program()
         assert not list(tmp_path.glob("wine/*.exe"))
+
+
+def test_a_system_whose_folder_is_gone_is_not_taken_for_one_in_wine():
+    """Another thread may close it; the worker program, which takes minutes, is not built then."""
+    paths = {name: bundled_fmu("Pendulum") for name in "ab"}
+    system = FMU.of(FMUSystem(paths, []))
+    shutil.rmtree(system.extract())
+    assert [part.in_wine for part in system.parts] == [False, False]
 
 
 class TestBell:

@@ -20,7 +20,9 @@ __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "ISOLATIONS",
     "FloatArray",
+    "Followed",
     "MaskArray",
+    "Played",
     "Pool",
     "PoolSpec",
     "SingleCalls",
@@ -32,6 +34,12 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
+
+Followed = tuple[MaskArray, FloatArray, tuple[npt.NDArray[Any], ...]]
+"""Where episodes have started in the step that ended others, what they have drawn, and the last
+observations of the others."""
+Played = tuple[Any, int, bool, Followed | None]
+"""What a step with compiled hooks returns; see ``NativePool.prepare_play``."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -282,7 +290,7 @@ class Pool(ABC):
         draws: Any,
         episodes: Any,
         surroundings: Any,
-    ) -> Callable[..., tuple[Any, int, int, int]]:
+    ) -> Callable[..., Played]:
         """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
 
         Raises:

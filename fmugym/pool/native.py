@@ -30,6 +30,7 @@ from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
+    Played,
     PoolSpec,
     SingleCalls,
     StatusArray,
@@ -507,7 +508,7 @@ class NativePool(SavingPool):
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
-    ) -> Callable[..., tuple[Any, int, int, int]]:
+    ) -> Callable[..., Played]:
         """Prepare the pool to do whole steps of a vector environment, hooks included.
 
         This replaces what was prepared before. Every step uses the given arrays in place.
@@ -540,14 +541,16 @@ class NativePool(SavingPool):
                 names of the drawn values and of the mask, and what ``LateDict.parts`` returns.
 
         Returns:
-            A function of actions, drawn values (draws, N), last observations and started
-            (Booleans). It does a step and fills all but the actions; of the drawn values, only
-            those of episodes that start; ``given`` ones are read. If the last two are arrays, an
-            episode that ends without a fault is followed by the next in the same step; if they are
-            None, in the next step. It returns the result with an empty dict of infos, how many
-            instances had trouble (a status worse than a warning, or numbers that are not finite),
-            how many episodes have ended, and how many of these were followed. The arrays of the
-            result are new, or those of an earlier step that nobody holds any more.
+            A function of actions and drawn values (draws, N). It does a step and fills the drawn
+            values of the episodes that start; ``given`` ones are read. With None in their place,
+            an episode that ends without a fault is followed by the next in the same step, otherwise
+            in the next step. It returns the result; how many instances had trouble (a status worse
+            than a warning, or numbers that are not finite); whether any episode has ended that was
+            not followed; and None or, if some were followed, for which environments (N,), what the
+            next ones have drawn (draws, N), and the arrays with the last observations of those that
+            have ended. The infos of the result are empty unless some were followed; then they are
+            those of Gymnasium's mode ``SAME_STEP``, but empty with a tuple of observations. All
+            arrays are new, or those of an earlier step that nobody holds any more.
         """
         start = self._access(variables)
         prepare(self._pool, start, programs, actions, start_values, draws, episodes, surroundings)

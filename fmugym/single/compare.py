@@ -16,9 +16,9 @@ from fmugym.single.trace import SingleTask, kind_of
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import conclude
 from fmugym.task.values import EpisodeVariables
-from fmugym.vector.contents import Contents, borrowed
+from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.hooks.check import sample_of
-from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
+from fmugym.vector.hooks.program import Program, Row, UntraceableError, evaluate, writes_variable
 
 __all__ = ["require_equal"]
 
@@ -82,26 +82,50 @@ class _Comparison:
         self._actions = np.array(actions[:_COUNT]), np.array(actions[_COUNT:])
         self._before = {name: self._drawn(name, rng) for name in task.variables}
         self._after = {name: values.copy() for name, values in self._before.items()}
+        self._outside: set[int] = set()
         self._run()
 
     def _drawn(self, name: str, rng: np.random.Generator) -> npt.NDArray[Any]:
         """A row for each element of an episode variable."""
         kind = self._task.variables[name]
         values = 3 * rng.normal(size=(prod(kind.shape or ()), _COUNT))
+        values[:, ::3] = np.reshape(self._env.variables[name], (-1, 1))  # it may be an index
         return values > 0 if kind.dtype == np.bool_ else values.astype(kind.dtype)
 
     def _run(self) -> None:
         """Run the programs on all states at once."""
-        task, (actions, before) = self._task, self._actions
-        evaluate(task.inputs, self._find_before, (actions, before))
+        task = self._task
+        self._evaluate(task.inputs, self._find_before, ())
         self._inputs = self._wanted.copy()
-        seen = [np.zeros((_COUNT, *array.shape), array.dtype) for array in task.seen]
-        self._seen = tuple(seen)
+        self._seen = tuple(np.zeros((_COUNT, *array.shape), array.dtype) for array in task.seen)
         self._counts = self._counts + 1
+        self._judged = self._evaluate(task.judgement, self._find, self._seen)
+
+    def _evaluate(
+        self, program: Program, find: Callable[[Row], Any], seen: tuple[npt.NDArray[Any], ...]
+    ) -> list[npt.NDArray[Any]]:
+        """Run a program; note the states in which an index is outside of its table."""
         try:
-            self._judged = evaluate(task.judgement, self._find, (actions, before), self._seen)
+            return evaluate(program, find, self._actions, seen)
         except IndexError:
-            raise UntraceableError("an index is outside of its table in a random state") from None
+            results = [self._evaluate_one(index, program, find, seen) for index in range(_COUNT)]
+            return [np.concatenate(parts) for parts in zip(*results, strict=True)]
+
+    def _evaluate_one(
+        self,
+        index: int,
+        program: Program,
+        find: Callable[[Row], Any],
+        seen: tuple[npt.NDArray[Any], ...],
+    ) -> list[npt.NDArray[Any]]:
+        part = slice(index, index + 1)
+        first, second = (actions[part] for actions in self._actions)
+        parts = tuple(array[part] for array in seen)
+        try:
+            return evaluate(program, lambda row: find(row)[part], (first, second), parts)
+        except IndexError:
+            self._outside.add(index)
+            return [np.zeros(1) for _ in program.results]
 
     def _find_before(self, row: Row) -> Any:
         """The values of a row before the step, when the inputs are made."""
@@ -133,6 +157,8 @@ class _Comparison:
     def compare(self, index: int) -> bool:
         """Compare one state; return whether the hooks have given a result there."""
         env = self._env
+        if index in self._outside:
+            return False
         with reading(env, self._readings(index)):
             try:
                 inputs = self._inputs_of(index)
@@ -170,11 +196,17 @@ class _Comparison:
         for index in range(0, _COUNT, _COUNT // 8):
             with reading(self._env, self._readings(index)):
                 before = dict(self._env.variables)
+                contained = {name: np.copy(value) for name, value in before.items()}
                 for name in self._task.left:
                     if name != "_get_inputs":
                         self._place_after(index, tuple(self._inputs[:, index].tolist()))
                     _call(self._env, name)
-                    changed = {n for n, v in self._env.variables.items() if v is not before[n]}
+                    after = self._env.variables.items()
+                    changed = {
+                        n
+                        for n, v in after
+                        if v is not before[n] or differs(contained[n], np.copy(v))
+                    }
                     _require_nothing_changed(name, min(changed, default=contents.changed()))
 
     def _readings(self, index: int) -> Readings:
@@ -221,6 +253,7 @@ class _Comparison:
         env.step_count += 1
 
     def _compare_results(self, index: int, result: tuple[Any, ...]) -> None:
+        self._compare_variables(index)
         observation, reward, done, truncated = result
         expected = {"_is_done": done, "_is_truncated": truncated, "_reward_policy": reward}
         for (hook, value), row in zip(expected.items(), self._judged, strict=True):
@@ -229,11 +262,19 @@ class _Comparison:
             *_, key = description.path
             part = observation[key] if isinstance(observation, Mapping) else observation
             _require("_get_observation", array[index], part)
-        for name in self._task.updated:
+
+    def _compare_variables(self, index: int) -> None:
+        """Compare them when all hooks were called: only ``_update`` may write them."""
+        for name, after in self._after.items():
             value = self._env.variables[name]
+            if name not in self._task.updated:
+                before = self._value(name, self._before[name][:, index])
+                if type(value) is not type(before) or differs(before, value):
+                    raise UntraceableError(writes_variable(name))
+                continue
             if kind_of(value) != self._task.variables[name]:
                 raise UntraceableError(f"_update gives {name!r} different types")
-            _require("_update", self._after[name][:, index], np.asarray(value).reshape(-1))
+            _require("_update", after[:, index], np.asarray(value).reshape(-1))
 
 
 def _leaves_to_python(values: Any, expected: Any) -> bool:

@@ -287,7 +287,7 @@ class _Tracer:
             kind = kind_of(new)
             if kind is None:
                 raise UntraceableError(f"_update makes {name!r} what is no number and no array")
-            if kind.shape != self._variables[name].shape:
+            if (kind.shape or ()) != (self._variables[name].shape or ()):
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             self._variables[name] = kind
             updated.append(name)

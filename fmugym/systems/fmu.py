@@ -55,7 +55,9 @@ def _part_in(folder: Path, component: Component, description: ModelDescription) 
     """Of libraries for Windows, only those that run here in Wine were extracted."""
     part = ExtractedFMU(component.path, description, component.preload, folder)
     part.isolated = component.isolate
-    part.in_wine = can_run_windows() and not (folder / part.library).exists()
+    if can_run_windows() and not (folder / part.library).exists():
+        part.in_wine = True  # names the library for Windows, which is missing, too, after a close
+        part.in_wine = (folder / part.library).exists()
     return part
 
 

@@ -29,11 +29,18 @@ _MANY: Final = 4096
 
 
 def no_action(space: spaces.Space[Any]) -> Any:
-    """Return the action that hooks read before the first one; None for spaces without a zero."""
+    """Return the action that hooks read before the first one; None for spaces without a zero.
+
+    Of a ``Dict`` or a ``Tuple``, each part has its own.
+    """
     if isinstance(space, spaces.Discrete):
         return space.dtype.type(space.start)
     if isinstance(space, spaces.Box | spaces.MultiBinary | spaces.MultiDiscrete):
         return np.zeros(space.shape, space.dtype)
+    if isinstance(space, spaces.Dict):
+        return {name: no_action(part) for name, part in space.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(map(no_action, space))
     return None
 
 

@@ -33,7 +33,7 @@ TASK is a task file, a registered id or ``module:Class``. WHO is ``--action rand
 do. Output is printable text; letters that the console lacks are escaped. The exit code is 0; 1 if
 something cannot be used (one line on the error stream says why), ``validate`` finds an error or
 ``demo`` has not learned; 2 if the arguments are wrong; 130 after Ctrl-C, which keeps what was
-written until then.
+written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143 or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -82,6 +82,7 @@ from typing import Final
 
 from fmugym.errors import FMUGymError, unknown_name
 from fmugym.tools.datasets import add_dataset
+from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import (
@@ -99,8 +100,6 @@ from fmugym.tools.showing import add_demo
 
 __all__ = ["main"]
 
-_INTERRUPTED: Final = 130
-
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
     *(add_evaluate, add_record, add_bench, add_dataset, add_demo),
@@ -115,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: The arguments; by default those of the process.
 
     Returns:
-        The exit code, 0, 1 or 130.
+        The exit code, 0, 1 or, after Ctrl-C, 130.
 
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
@@ -126,8 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         code: int = arguments.run(arguments) or 0
         sys.stdout.flush()
         return code
-    except KeyboardInterrupt:
-        return _INTERRUPTED
+    except KeyboardInterrupt as error:
+        return exit_code(error)
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         _drop_output()
     except (FMUGymError, OSError) as error:

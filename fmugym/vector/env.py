@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-import logging
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,16 +13,11 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
-from fmugym.fmi.status import WARNING_CODE
+from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray, Pool
-from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.saving import require_saving
-from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
-from fmugym.task.starting import checked_column, spread
+from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.arguments import (
-    UnknownAttributeError,
     autoreset_mode_of,
     checked_hooks,
     checked_num_envs,
@@ -33,28 +26,18 @@ from fmugym.vector.arguments import (
     checked_step_limit,
     split_options,
 )
-from fmugym.vector.calls import TOGETHER, checked_name, require_settable
-from fmugym.vector.engines.base import Engine, StepResult
-from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.compiled import CompiledEngine
-from fmugym.vector.engines.per_env import PerEnvEngine
-from fmugym.vector.engines.programs import find_programs
-from fmugym.vector.hooks.check import CURE, find_difference
+from fmugym.vector.attributes import Attributes
+from fmugym.vector.calls import TOGETHER, checked_name
+from fmugym.vector.choosing import make_engine
+from fmugym.vector.engines.base import StepResult
+from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
-from fmugym.vector.rollouts import (
-    Candidates,
-    Rollout,
-    joined_rollouts,
-    roll_out_by_steps,
-    tunable_values,
-)
+from fmugym.vector.rollouts import Candidates, Rollout, tunable_values
 from fmugym.vector.saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv"]
-
-logger = logging.getLogger(__name__)
 
 _SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 
@@ -158,45 +141,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = self._is_ready = False
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self._background = Background()
-        self._engine = self._make_engine(hooks, max_episode_steps)
+        self._engine = make_engine(self._maker, env, self._pool, hooks, max_episode_steps)
+        self._episodes = Episodes(env, self._engine, self._pool)
+        self._attributes = Attributes(env, self._engine)
         self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
         self._at_ends: list[Callable[[Any], None]] = []
         self._pool.forget_health()  # that of the hook check
-
-    def _make_engine(self, hooks: str, max_episode_steps: int | None) -> Engine:
-        env, count = self._prototype, self.num_envs
-        if not self._use_arrays(hooks):
-            envs = self._make_all()
-            return PerEnvEngine(envs, self._pool, max_episode_steps, self.action_space)
-        if hooks != "array":
-            programs = find_programs(env, required=hooks == "compiled")
-            if programs is not None:
-                return CompiledEngine(env, count, max_episode_steps, programs)
-        return BatchEngine(env, count, max_episode_steps)
-
-    def _make_all(self) -> list[FMUEnv]:
-        """Make the other environments; all but the prototype are closed if one cannot be made."""
-        envs = [self._prototype]
-        try:
-            envs.extend(self._maker.make_like(envs[0], i) for i in range(1, self.num_envs))
-        except BaseException:
-            for env in envs[1:]:
-                env.close()
-            raise
-        return envs
-
-    def _use_arrays(self, hooks: str) -> bool:
-        if hooks == "per_env":
-            return False
-        difference = find_difference(self._prototype)
-        if difference is None:
-            return True
-        name = type(self._prototype).__name__
-        text = f"{name}: {difference}, so its hooks cannot be called on arrays. {CURE}"
-        if hooks != "auto":
-            raise ConfigError(text)
-        logger.warning("%s. Until then they are called one environment at a time: slower", text)
-        return False
 
     # Episodes and steps.
 
@@ -415,9 +365,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 the FMUs, or if an FMU fails.
         """
         self._require_ready("save_state", ended=True)
-        indices = chosen(where, self.num_envs)
-        bundle = self._pool.save_instances(indices)
-        return Snapshot(self._scope, self._engine.columns(indices), bundle)
+        return self._episodes.save(chosen(where, self.num_envs))
 
     def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
         """Let environments go on from a snapshot, with their random streams.
@@ -439,13 +387,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._open_pool("restore_state")
         indices = chosen(where, self.num_envs)
         sources = sources_for(checked_snapshot(snapshot), indices)
-        columns = snapshot.columns_for(self._scope)
+        columns = self._episodes.columns_of(snapshot)
         if not self._is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
         self._engine.require_fit(columns)
         require_saving(self._pool)
         self._is_ready = False
-        self._restore(snapshot.bundle, sources, indices)
+        self._episodes.restore(snapshot.bundle, sources, indices)
         self._engine.place(columns, sources, indices)
         self._started = self._is_ready = True
         return self._engine.observe(indices)
@@ -484,10 +432,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
         candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
         present = self.save_state() if self._is_ready else None
-        start = self._start_of_rollout(snapshot, present, candidates.count)
+        start = self._episodes.start_of_rollout(snapshot, present, candidates.count)
         with self._returning_to(present):
-            parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
-            return joined_rollouts(parts, candidates.count)
+            return self._episodes.roll_out(start, candidates)
 
     @contextmanager
     def _returning_to(self, present: Snapshot | None) -> Iterator[None]:
@@ -500,62 +447,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             engine.starts_at_ends = starts_at_ends
             self._is_ready = False
             if present is not None:
-                self._place(present, np.arange(self.num_envs))
+                self._episodes.place(present, np.arange(self.num_envs))
                 self._is_ready = True
-
-    def _start_of_rollout(
-        self, snapshot: Snapshot | None, present: Snapshot | None, count: int
-    ) -> Snapshot:
-        if snapshot is None and present is None:
-            raise SimulationError("rollout without a snapshot was called before the first reset")
-        start = checked_snapshot(present if snapshot is None else snapshot)
-        if len(start) not in ((count,) if snapshot is None else (1, count)):
-            raise ConfigError(
-                f"there are {count} candidates, but {len(start)} episodes where they may begin"
-            )
-        columns = start.columns_for(self._scope)
-        self._engine.require_fit(columns)
-        if np.any(columns["ended"]):
-            raise SimulationError("an episode where candidates begin has ended: reset it first")
-        return start
-
-    def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
-        """Let each environment play the candidate at its place."""
-        engine, actions = self._engine, candidates.actions(places)
-        self._begin(start, places, candidates)
-        if actions is not None:
-            engine.has_moved = False
-            arrays = engine.roll_out(actions)
-            if arrays is not None:
-                return Rollout.of(*arrays)
-            if engine.has_moved:  # a step has failed: the engine knows what follows
-                self._begin(start, places, candidates)
-        first = None if actions is not None else engine.observe(np.arange(self.num_envs))
-        return roll_out_by_steps(engine, candidates.act(actions), candidates.horizon, first)
-
-    def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
-        """Bring all environments to the places where candidates begin."""
-        self._place(start, places if len(start) > 1 else np.zeros_like(places))
-        values = {name: column[places] for name, column in candidates.parameters.items()}
-        if values:
-            variables = tuple(map(self._prototype.fmu.variable, values))
-            self._pool.write(variables, np.stack(list(values.values())))
-            self._engine.show_parameters(values)
-
-    def _place(self, snapshot: Snapshot, sources: IndexArray) -> None:
-        """Let all environments go on from episodes of a snapshot that fits."""
-        everywhere = np.arange(self.num_envs)
-        self._restore(snapshot.bundle, sources, everywhere)
-        self._engine.place(snapshot.columns_for(self._scope), sources, everywhere)
-
-    def _restore(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        statuses = self._pool.restore_instances(bundle, sources, indices)
-        for index in indices[statuses[indices] > WARNING_CODE].tolist():
-            raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
-
-    @cached_property
-    def _scope(self) -> dict[str, str]:
-        return scope_of(self._prototype)
 
     # Single environments.
 
@@ -571,8 +464,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _get_attr(self, name: str, indices: Sequence[int]) -> list[Any]:
         """Read an attribute or a parameter of some environments."""
         self._open_pool("get_attr")
-        name = checked_name(name)
-        return [self._engine.read(name, index) for index in indices]
+        return self._attributes.read(name, indices)
 
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
@@ -589,53 +481,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: After ``close``.
         """
         self._open_pool("set_attr")
-        name = checked_name(name)
-        by_index = self._by_index(name, values)
-        if self._is_parameter(name):
-            self._set_parameter(name, [by_index[index] for index in range(self.num_envs)])
-        else:
-            self._set_attribute(name, by_index)
-
-    def _by_index(self, name: str, values: Any) -> dict[int, Any]:
-        """The values by the number of the environment."""
-        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
-        if not is_row and not issubclass(type(values), list | tuple):
-            return dict.fromkeys(range(self.num_envs), values)
-        try:
-            each = list(values)
-        except Exception:  # a list of the caller's whose methods fail
-            raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
-        if len(each) != self.num_envs:
-            raise ConfigError(
-                f"there are {len(each)} values of {shown(name)}, expected {self.num_envs}"
-            )
-        return dict(enumerate(each))
-
-    def _is_parameter(self, name: str) -> bool:
-        env = self._prototype
-        return not hasattr(env, name) and env.fmu.description.find(name) is not None
-
-    def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
-        """Set a parameter of all environments, from their next episodes on."""
-        self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
-        scalars = self._prototype.fmu.description.scalars(name)
-        rows = [spread(name, scalars, value) for value in values]
-        columns = {
-            variable.name: checked_column(variable, [row[place] for row in rows])
-            for place, variable in enumerate(scalars)
-        }
-        for scalar, numbers in columns.items():
-            self._engine.set_parameter(scalar, numbers)
-
-    def _set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
-        """Set an attribute of some environments."""
-        env = self._prototype
-        if not hasattr(env, name):  # no hook can know of it: the name is misspelt
-            public = [known for known in dir(env) if not known.startswith("_")]
-            names = public + list(env.fmu.description.variables)
-            raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
-        require_settable(name)
-        self._engine.set_attribute(name, values)
+        self._attributes.set(name, values)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each

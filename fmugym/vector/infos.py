@@ -23,7 +23,6 @@ __all__ = [
     "observation_of",
     "observations_of",
     "restricted",
-    "rows_as_objects",
 ]
 
 
@@ -125,16 +124,6 @@ def observation_of(observations: Any, index: int) -> Any:
     if isinstance(observations, tuple):
         return tuple(observation_of(value, index) for value in observations)
     return observations[index].copy()
-
-
-def rows_as_objects(rows: npt.NDArray[Any], mask: MaskArray) -> npt.NDArray[Any]:
-    """``observations_of`` for one array, in an eighth of the time."""
-    objects = np.empty(len(mask), object)
-    indices = mask.nonzero()[0]  # np.flatnonzero takes ten times as long
-    copies = rows.take(indices, 0)  # and rows[indices] as well
-    for place, index in enumerate(indices.tolist()):
-        objects[index] = copies[place]
-    return objects
 
 
 def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

@@ -104,7 +104,7 @@ class _Perturbation:
         self._everywhere = np.arange(envs.num_envs)
         given = {
             name: column[0]
-            for name, column in start.columns_for(envs._scope)["parameters"].items()
+            for name, column in start.columns_for(envs._episodes.scope)["parameters"].items()
             if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
         fixed = [env._interface.parameter(name, value) for name, value in given.items()]
@@ -157,7 +157,7 @@ class _Perturbation:
     def _follow(self, nominal: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Play the trajectory, and keep each moment of it; returns x and y."""
         count = len(self._everywhere)
-        self._envs._place(self._start, np.zeros(count, np.int64))
+        self._envs._episodes.place(self._start, np.zeros(count, np.int64))
         x, y = [self._pool.read(self._x)[:, 0]], []
         bundles, columns = [], []
         for index, action in enumerate(nominal):
@@ -224,7 +224,7 @@ class _Perturbation:
         """Do one step of each; returns the states before, and the states and outputs after."""
         starting, going = np.flatnonzero(trials.starts), np.flatnonzero(~trials.starts)
         if len(going):
-            self._envs._restore(self._bundle, trials.at[going], going)
+            self._envs._episodes.restore(self._bundle, trials.at[going], going)
         columns = taken(self._columns, trials.at)
         if len(starting):
             self._start_at(trials)

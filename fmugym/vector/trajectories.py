@@ -128,7 +128,7 @@ def linearize_along(
     env = envs._prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs._start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
+    start = envs._episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)

@@ -79,8 +79,9 @@ def sources() -> tuple[Path, ...]:
 def _digest() -> str:
     """Stands for the sources and the options."""
     digest = hashlib.sha256(repr(_OPTIONS).encode())
+    folder = os.path.commonpath(sources()) if sources() else ""  # its name differs in a checkout
     for path in sources():
-        digest.update(f"{path.parent.name}/{path.name}\0".encode())
+        digest.update(f"{path.relative_to(folder).as_posix()}\0".encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 

@@ -54,18 +54,16 @@ enum {
     TERMINATED,
     TRUNCATED,
     DRAWN,
-    LAST,
-    STARTED,
     MASK,
     TURN_BUFFERS
 };
 
-enum { STEP_ACTIONS, STEP_DRAWN, STEP_LAST, STEP_STARTED, STEP_ARGUMENTS };
+enum { STEP_ACTIONS, STEP_DRAWN, STEP_ARGUMENTS };
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];
-    Py_buffer seen_buffers[MOST_SEEN], last_buffers[MOST_SEEN];
-    char *seen[MOST_SEEN], *last_seen[MOST_SEEN];
+    Py_buffer seen_buffers[MOST_SEEN];
+    char *seen[MOST_SEEN];
     size_t seen_sizes[MOST_SEEN];
     Turn turn;
     Call call;

@@ -5,25 +5,6 @@
 #include <stdint.h>
 #include <string.h>
 
-/* None stands for episodes that start in the step after the end of the previous one. */
-static bool take_starts_at_ends(PyPool *self, const Playing *playing, PyObject *last,
-                                PyObject *started, PyTurn *t) {
-    const Settings *s = &self->pool.settings;
-    const Py_ssize_t n = (Py_ssize_t)s->count;
-
-    if (last == Py_None) {
-        return true;
-    }
-    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
-        t->seen_sizes[i] = (size_t)(playing->judgement.seen_bytes[i] / n);
-    }
-    return (pool_observes(playing)
-                ? take_matrix(last, &t->buffers[LAST], WRITTEN, "the last observations",
-                              ITEM_FLOAT32, n, (Py_ssize_t)s->num_observed)
-                : take_seen(&playing->judgement, last, t->last_buffers, t->last_seen)) &&
-           take_vector(started, &t->buffers[STARTED], WRITTEN, "started", ITEM_BOOLEAN, n);
-}
-
 /* For arrays that the caller has just made. To tell their types, numpy would describe them in text,
  * which takes as long as all other checks together. */
 bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
@@ -80,11 +61,12 @@ static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn
     return true;
 }
 
+/* None stands for episodes that start where others end. */
 static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
     return take_given_actions(playing, args[STEP_ACTIONS], t) &&
-           take_bytes(args[STEP_DRAWN], &t->buffers[DRAWN], PyBUF_WRITABLE,
-                      playing->play.draws->count * self->pool.settings.count * sizeof(double)) &&
-           take_starts_at_ends(self, playing, args[STEP_LAST], args[STEP_STARTED], t);
+           (args[STEP_DRAWN] == Py_None ||
+            take_bytes(args[STEP_DRAWN], &t->buffers[DRAWN], PyBUF_WRITABLE,
+                       playing->play.draws->count * self->pool.settings.count * sizeof(double)));
 }
 
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
@@ -99,10 +81,7 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .truncated = b[TRUNCATED].buf,
         .seen = t->seen,
         .drawn = b[DRAWN].buf,
-        .last_observations = b[LAST].buf,
-        .last_seen = t->last_seen,
         .seen_sizes = t->seen_sizes,
-        .started = b[STARTED].buf,
     };
     t->call = (Call){
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
@@ -160,20 +139,39 @@ static void settle_results(const Playing *playing, const ResultArrays *arrays, P
     }
 }
 
-/* The result, how many instances had trouble, how many episodes have ended, and how many of these
- * were followed. */
-static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
-    PyObject *tuple = PyTuple_New(4), *result = results_of_step(playing->results, arrays);
+/* Lets episodes start where others end. */
+static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+    const size_t count = playing->play.count;
 
-    if (tuple == NULL || result == NULL) {
-        Py_XDECREF(tuple);
+    t->turn.last_seen = arrays->last_memory;
+    if (pool_observes(playing)) {
+        t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
+    }
+    t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
+    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
+    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
+        t->seen_sizes[i] = (size_t)playing->judgement.seen_bytes[i] / count;
+    }
+}
+
+/* The result, how many instances had trouble, whether any episode is at its end now, and None or
+ * what is known of those that have started where others have ended. */
+static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
+    const bool any_started = t->ends.started > 0;
+    PyObject *result = results_of_step(playing->results, arrays, any_started);
+    PyObject *starts = result == NULL || !any_started ? Py_NewRef(Py_None)
+                                                      : results_starts(playing->results, arrays);
+    PyObject *tuple = result == NULL || starts == NULL ? NULL : PyTuple_New(4);
+
+    if (tuple == NULL) {
+        Py_XDECREF(starts);
         Py_XDECREF(result);
         return NULL;
     }
     PyTuple_SetItem(tuple, 0, result);
     PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
-    PyTuple_SetItem(tuple, 2, PyLong_FromSize_t(t->ends.ended));
-    PyTuple_SetItem(tuple, 3, PyLong_FromSize_t(t->ends.started));
+    PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended > t->ends.started));
+    PyTuple_SetItem(tuple, 3, starts);
     return tuple;
 }
 
@@ -197,7 +195,6 @@ void clear_turn(const Playing *playing, PyTurn *t) {
     t->bad_action = false;
     memset(t->buffers, 0, sizeof t->buffers);
     memset(t->seen_buffers, 0, size);
-    memset(t->last_buffers, 0, size);
 }
 
 void release_turn(const Playing *playing, PyTurn *t) {
@@ -206,7 +203,6 @@ void release_turn(const Playing *playing, PyTurn *t) {
     }
     for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
         release_buffer(&t->seen_buffers[i]);
-        release_buffer(&t->last_buffers[i]);
     }
 }
 
@@ -225,16 +221,25 @@ static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *con
     return done ? Py_NewRef(Py_None) : NULL;
 }
 
+static bool provide(Results *results, bool starts, ResultArrays *arrays) {
+    return results_provide_step(results, arrays) &&
+           (!starts || results_provide_starts(results, arrays));
+}
+
 static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = playing_of(capsule);
+    const bool starts = args[STEP_DRAWN] == Py_None;
     ResultArrays arrays;
     PyTurn t;
     PyObject *result = NULL;
 
     clear_turn(playing, &t);
-    if (results_provide_step(playing->results, &arrays) && take_arrays(self, playing, args, &t)) {
+    if (provide(playing->results, starts, &arrays) && take_arrays(self, playing, args, &t)) {
         settle_turn(self, playing, &t);
         settle_results(playing, &arrays, &t);
+        if (starts) {
+            settle_starts(playing, &arrays, &t);
+        }
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
     results_drop(playing->results, &arrays);
@@ -263,6 +268,10 @@ static PyObject *play_by(PyObject *object, int operation, PyObject *const *args,
     PyPool *self = (PyPool *)object;
 
     if (!has_arguments(nargs, STEP_ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
+        return NULL;
+    }
+    if (operation != PLAY && args[STEP_DRAWN] == Py_None) {
+        PyErr_SetString(PyExc_TypeError, "episodes cannot start where others end in two parts");
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);

@@ -113,11 +113,11 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, nargs == LAST + 1 ? nargs : LAST) || !is_prepared(self)) {
+    if (!has_arguments(nargs, nargs == MASK + 1 ? nargs : MASK) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = roll_out(self, playing, args, nargs > LAST ? args[LAST] : NULL);
+    PyObject *result = roll_out(self, playing, args, nargs > MASK ? args[MASK] : NULL);
     Py_DECREF(playing);
     return result;
 }

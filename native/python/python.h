@@ -71,6 +71,8 @@ bool take_solving(PyObject *tuple, Solving *solving);
  * or not this returns false with an exception. */
 bool take_system(PyObject *tuple, System **system);
 void drop_system(System *system);
+/* Takes the arguments of a new pool, all but the opening of it. Returns false with an exception. */
+bool take_pool_arguments(PyPool *self, PyObject *args, PyObject *kwargs);
 /* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
 bool parse_group(PyObject *group, const char *format, char **names, ...);
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected);

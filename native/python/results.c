@@ -3,42 +3,11 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* The beginning of an array of numpy, as its C interface publishes it. knows_arrays compares it with
- * what numpy says of an array; where it differs, all arrays are new ones. */
-typedef struct {
-    char *data;
-    int dimensions;
-    Py_ssize_t *shape, *strides;
-    PyObject *base, *type;
-    int flags;
-    PyObject *weak_references;
-} Fields;
+#include "ends.h"
 
-typedef struct {
-    PyObject_HEAD Fields fields;
-} Array;
+static const char *const NAMES_AT_ENDS[] = {"final_obs", "_final_obs", "final_info", "_final_info"};
 
-/* An array that was made for a step, and what it was like then. Its holder may have changed its
- * shape, type or flags in place. */
-typedef struct {
-    PyObject *array;
-    char *memory;
-    Fields fields;
-} Made;
-
-enum {
-    MOST_DIMENSIONS = 64, /* more than that numpy has none */
-    ROUNDS = 2 /* callers often hold the arrays of one step while they take the next */
-};
-
-typedef struct {
-    PyObject *arguments; /* of numpy.empty */
-    size_t size;         /* in bytes */
-    int dimensions;
-    Py_ssize_t shape[MOST_DIMENSIONS], strides[MOST_DIMENSIONS];
-    Made made[ROUNDS];
-    unsigned oldest;
-} Maker;
+enum { NAMES = sizeof NAMES_AT_ENDS / sizeof *NAMES_AT_ENDS };
 
 /* What is told of the episodes that a reset starts: dicts that are filled when somebody reads them. */
 typedef struct {
@@ -49,136 +18,44 @@ typedef struct {
 } Telling;
 
 struct Results {
-    PyObject *parts, *empty, *names;
-    PyTypeObject *class, *class_of_arrays;
+    PyObject *parts, *names;
+    PyTypeObject *class;
     allocfunc allocate;
     Telling telling;
-    bool looks_inside;
+    Numpy numpy;
     size_t number_of_seen;
-    Maker makers[RESULT_ARRAYS];
+    Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
+    Observed *observed; /* NULL where the caller replaces the tuple of observations */
+    PyObject *names_at_ends[NAMES];
 };
-
-static const Fields *fields_of(PyObject *array) {
-    return &((Array *)array)->fields;
-}
-
-/* Looking inside of arrays */
-
-static bool has_room_for_fields(PyObject *array) {
-    PyObject *size = PyObject_GetAttrString((PyObject *)Py_TYPE(array), "__basicsize__");
-    const bool has = size != NULL && PyLong_AsSsize_t(size) >= (Py_ssize_t)sizeof(Array);
-
-    Py_XDECREF(size);
-    return has;
-}
-
-static bool equals_buffer(PyObject *array) {
-    const Fields *f = fields_of(array);
-    PyObject *type = PyObject_GetAttrString(array, "dtype");
-    Py_buffer b;
-
-    if (type == NULL || PyObject_GetBuffer(array, &b, PyBUF_STRIDES) < 0) {
-        Py_XDECREF(type);
-        return false;
-    }
-    const size_t lengths = (size_t)b.ndim * sizeof *b.shape;
-    const bool equal = f->data == b.buf && f->dimensions == b.ndim && f->base == NULL &&
-                       f->type == type && f->weak_references == NULL &&
-                       memcmp(f->shape, b.shape, lengths) == 0 &&
-                       memcmp(f->strides, b.strides, lengths) == 0;
-    PyBuffer_Release(&b);
-    Py_DECREF(type);
-    return equal;
-}
-
-/* Whether the fields for flags and weak references show it when these change. */
-static bool shows_changes(PyObject *array) {
-    const int flags = fields_of(array)->flags;
-    PyObject *reference = PyWeakref_NewRef(array, NULL);
-    const bool shows_reference = reference != NULL && fields_of(array)->weak_references != NULL;
-    PyObject *nothing = PyObject_CallMethod(array, "setflags", "i", 0);
-    const bool shows_flags = nothing != NULL && fields_of(array)->flags != flags;
-
-    Py_XDECREF(reference);
-    Py_XDECREF(nothing);
-    return shows_reference && shows_flags;
-}
-
-static bool knows_arrays(PyObject *empty) {
-    PyObject *array = PyObject_CallFunction(empty, "((ii))", 2, 3);
-    const bool knows = array != NULL && has_room_for_fields(array) && equals_buffer(array) &&
-                       shows_changes(array);
-
-    Py_XDECREF(array);
-    PyErr_Clear();
-    return knows;
-}
-
-/* Whether an array is what it was when it was made, and nobody else holds it. */
-static bool is_free(const Maker *maker, const Made *made) {
-    const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
-
-    if (made->array == NULL || Py_REFCNT(made->array) != 1) {
-        return false;
-    }
-    const Fields *now = fields_of(made->array), *then = &made->fields;
-    return now->data == then->data && now->dimensions == then->dimensions &&
-           now->base == NULL && now->type == then->type && now->flags == then->flags &&
-           now->weak_references == NULL && memcmp(now->shape, maker->shape, lengths) == 0 &&
-           memcmp(now->strides, maker->strides, lengths) == 0;
-}
 
 /* Taking over */
 
-static bool take_buffer_of(Maker *maker, const Py_buffer *b) {
-    if (b->ndim > MOST_DIMENSIONS) {
-        return false;
-    }
-    maker->size = (size_t)b->len;
-    maker->dimensions = b->ndim;
-    memcpy(maker->shape, b->shape, (size_t)b->ndim * sizeof *b->shape);
-    memcpy(maker->strides, b->strides, (size_t)b->ndim * sizeof *b->strides);
-    return true;
-}
+/* The masks of what is told of ends are like the other one. */
+static bool take_further_masks(Results *r) {
+    PyObject *arguments = r->makers[MASK_ARRAY].arguments;
 
-static bool measure(Results *r, Maker *maker) {
-    PyObject *array = PyObject_CallObject(r->empty, maker->arguments);
-    Py_buffer buffer;
-
-    if (array == NULL || PyObject_GetBuffer(array, &buffer, PyBUF_STRIDES) < 0) {
-        Py_XDECREF(array);
-        return false;
-    }
-    const bool taken = take_buffer_of(maker, &buffer);
-    PyBuffer_Release(&buffer);
-    Py_DECREF(array);
-    if (!taken) {
-        PyErr_SetString(PyExc_ValueError, "an array of results has too many dimensions");
-    }
-    return taken;
+    return maker_take(&r->makers[FINAL_OBS_MASK], &r->numpy, arguments) &&
+           maker_take(&r->makers[FINAL_INFO_MASK], &r->numpy, arguments);
 }
 
 static bool take_makers(Results *r, PyObject *shapes) {
-    const Py_ssize_t count = PyTuple_Size(shapes), judged = RESULT_ARRAYS - MOST_SEEN;
+    const Py_ssize_t count = PyTuple_Size(shapes), judged = GIVEN_ARRAYS - MOST_SEEN;
 
-    if (count < judged || count > RESULT_ARRAYS) {
+    if (count < judged || count > GIVEN_ARRAYS) {
         PyErr_SetString(PyExc_ValueError, "results have too few or too many arrays");
         return false;
     }
     r->number_of_seen = (size_t)(count - judged);
     for (Py_ssize_t i = 0; i < count; i++) {
         const Py_ssize_t later = i - (count - judged);
-        Maker *maker = &r->makers[later < 0 ? i : MOST_SEEN + later];
-        maker->arguments = PyTuple_GetItem(shapes, i);
-        if (!PyTuple_Check(maker->arguments)) {
-            PyErr_SetString(PyExc_TypeError, "expected a tuple of shape and type");
-            return false;
-        }
-        if (!measure(r, maker)) {
+        PyObject *arguments = PyTuple_GetItem(shapes, i);
+        if (!maker_take(&r->makers[later < 0 ? i : MOST_SEEN + later], &r->numpy, arguments) ||
+            (later < 0 && !maker_take(&r->last[i], &r->numpy, arguments))) {
             return false;
         }
     }
-    return true;
+    return take_further_masks(r);
 }
 
 static bool take_names(Results *r, PyObject *names) {
@@ -216,26 +93,31 @@ static bool take_telling(Telling *t, PyObject *parts) {
     return t->no_arguments != NULL;
 }
 
-/* Returns false with an exception if that is impossible. */
-static bool look_at_arrays(Results *r) {
-    PyObject *array = PyObject_CallFunction(r->empty, "((i))", 1);
+static bool is_replaced(const Results *r) {
+    return r->names != Py_None && PyTuple_Size(r->names) == 0;
+}
 
-    if (array == NULL) {
-        return false;
+static bool take_ends(Results *r) {
+    for (size_t i = 0; i < NAMES; i++) {
+        r->names_at_ends[i] = PyUnicode_InternFromString(NAMES_AT_ENDS[i]);
+        if (r->names_at_ends[i] == NULL) {
+            return false;
+        }
     }
-    r->class_of_arrays = (PyTypeObject *)Py_NewRef((PyObject *)Py_TYPE(array));
-    r->looks_inside = knows_arrays(r->empty);
-    Py_DECREF(array);
-    return true;
+    if (!is_replaced(r)) {
+        r->observed =
+            observed_take(&r->numpy, r->last, r->makers[MASK_ARRAY].size, r->names);
+    }
+    return is_replaced(r) || r->observed != NULL;
 }
 
 static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *names, *shapes, *telling;
+    PyObject *empty, *names, *shapes, *telling;
 
-    return PyArg_ParseTuple(parts, "OO!OO!O!;results", &r->empty, &PyType_Type, &r->class, &names,
+    return PyArg_ParseTuple(parts, "OO!OO!O!;results", &empty, &PyType_Type, &r->class, &names,
                             &PyTuple_Type, &shapes, &PyTuple_Type, &telling) &&
-           take_class(r) && take_makers(r, shapes) && take_names(r, names) &&
-           take_telling(&r->telling, telling) && look_at_arrays(r);
+           take_class(r) && numpy_look(&r->numpy, empty) && take_makers(r, shapes) &&
+           take_names(r, names) && take_telling(&r->telling, telling) && take_ends(r);
 }
 
 Results *results_take(PyObject *parts) {
@@ -259,12 +141,17 @@ void results_free(Results *r) {
     if (r == NULL) {
         return;
     }
+    observed_free(r->observed);
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
-        for (size_t k = 0; k < ROUNDS; k++) {
-            Py_XDECREF(r->makers[i].made[k].array);
-        }
+        maker_drop(&r->makers[i]);
     }
-    Py_XDECREF((PyObject *)r->class_of_arrays);
+    for (size_t i = 0; i < r->number_of_seen; i++) {
+        maker_drop(&r->last[i]);
+    }
+    for (size_t i = 0; i < NAMES; i++) {
+        Py_XDECREF(r->names_at_ends[i]);
+    }
+    numpy_drop(&r->numpy);
     Py_XDECREF(r->telling.no_arguments);
     Py_XDECREF(r->parts);
     free(r);
@@ -280,50 +167,9 @@ size_t results_size(const Results *r, size_t array) {
 
 /* Providing */
 
-static bool make(const Results *r, const Maker *maker, Made *made) {
-    Py_buffer buffer;
-    PyObject *array = PyObject_CallObject(r->empty, maker->arguments);
-
-    if (array == NULL || PyObject_GetBuffer(array, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
-        Py_XDECREF(array);
-        return false;
-    }
-    *made = (Made){.array = array, .memory = buffer.buf};
-    if (r->looks_inside) {
-        made->fields = *fields_of(array);
-    }
-    PyBuffer_Release(&buffer);
-    return true;
-}
-
-/* Returns an array that the caller drops, or NULL with an exception. */
-static PyObject *provide(const Results *r, Maker *maker, char **memory) {
-    Made new;
-
-    for (size_t k = 0; k < ROUNDS && r->looks_inside; k++) {
-        if (is_free(maker, &maker->made[k])) {
-            *memory = maker->made[k].memory;
-            return Py_NewRef(maker->made[k].array);
-        }
-    }
-    if (!make(r, maker, &new)) {
-        return NULL;
-    }
-    *memory = new.memory;
-    if (!r->looks_inside) {
-        return new.array;
-    }
-    Made *place = &maker->made[maker->oldest];
-    PyObject *before = place->array, *array = Py_NewRef(new.array);
-    maker->oldest = (maker->oldest + 1) % ROUNDS;
-    *place = new;
-    Py_XDECREF(before); /* may call back, and another step then replaces the new array */
-    return array;
-}
-
 static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) {
     for (size_t i = begin; i < end; i++) {
-        a->arrays[i] = provide(r, &r->makers[i], &a->memory[i]);
+        a->arrays[i] = maker_provide(&r->makers[i], &r->numpy, &a->memory[i]);
         if (a->arrays[i] == NULL) {
             return false;
         }
@@ -335,12 +181,27 @@ static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) 
 static void clear(const Results *r, ResultArrays *a) {
     memset(a->arrays, 0, r->number_of_seen * sizeof *a->arrays);
     memset(a->arrays + MOST_SEEN, 0, (RESULT_ARRAYS - MOST_SEEN) * sizeof *a->arrays);
+    memset(a->last, 0, r->number_of_seen * sizeof *a->last);
 }
 
 bool results_provide_step(Results *r, ResultArrays *a) {
     clear(r, a);
     return provide_some(r, 0, r->number_of_seen, a) &&
            provide_some(r, REWARDS_ARRAY, TRUNCATED_ARRAY + 1, a);
+}
+
+static bool provide_last(Results *r, ResultArrays *a) {
+    for (size_t i = 0; i < r->number_of_seen; i++) {
+        a->last[i] = maker_provide(&r->last[i], &r->numpy, &a->last_memory[i]);
+        if (a->last[i] == NULL) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool results_provide_starts(Results *r, ResultArrays *a) {
+    return provide_last(r, a) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
 }
 
 bool results_provide_reset(Results *r, ResultArrays *a) {
@@ -352,32 +213,22 @@ bool results_provide_reset(Results *r, ResultArrays *a) {
 void results_drop(const Results *r, ResultArrays *a) {
     for (size_t i = 0; i < r->number_of_seen; i++) {
         Py_XDECREF(a->arrays[i]);
+        Py_XDECREF(a->last[i]);
     }
     for (size_t i = MOST_SEEN; i < RESULT_ARRAYS; i++) {
         Py_XDECREF(a->arrays[i]);
     }
 }
 
-/* Whether an array of the caller is like the array of the mask. */
-static bool is_mask(const Results *r, PyObject *array) {
-    const Maker *own = &r->makers[MASK_ARRAY];
-
-    if (!r->looks_inside || Py_TYPE(array) != r->class_of_arrays) {
-        return false;
-    }
-    const Fields *f = fields_of(array);
-    return f->type == PyTuple_GetItem(own->arguments, 1) && f->dimensions == 1 &&
-           f->shape[0] == own->shape[0] && f->strides[0] == own->strides[0];
-}
-
 bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) {
-    const size_t size = r->makers[MASK_ARRAY].size;
+    const Maker *own = &r->makers[MASK_ARRAY];
+    const char *memory = maker_memory_of(own, &r->numpy, mask);
 
-    if (!is_mask(r, mask)) {
+    if (memory == NULL) {
         return false;
     }
-    memcpy(a->memory[MASK_ARRAY], fields_of(mask)->data, size);
-    return memchr(a->memory[MASK_ARRAY], 1, size) != NULL;
+    memcpy(a->memory[MASK_ARRAY], memory, own->size);
+    return memchr(a->memory[MASK_ARRAY], 1, own->size) != NULL;
 }
 
 /* Returning */
@@ -393,11 +244,11 @@ static PyObject *dict_of(const Results *r, const ResultArrays *a) {
     return dict;
 }
 
-static PyObject *tuple_of(const Results *r, const ResultArrays *a) {
+static PyObject *tuple_of(const Results *r, PyObject *const *arrays) {
     PyObject *tuple = PyTuple_New((Py_ssize_t)r->number_of_seen);
 
     for (size_t i = 0; i < r->number_of_seen && tuple != NULL; i++) {
-        PyTuple_SetItem(tuple, (Py_ssize_t)i, Py_NewRef(a->arrays[i]));
+        PyTuple_SetItem(tuple, (Py_ssize_t)i, Py_NewRef(arrays[i]));
     }
     return tuple;
 }
@@ -406,25 +257,7 @@ static PyObject *observations_of(const Results *r, const ResultArrays *a) {
     if (r->names == Py_None) {
         return Py_NewRef(a->arrays[0]);
     }
-    return PyTuple_Size(r->names) == 0 ? tuple_of(r, a) : dict_of(r, a);
-}
-
-/* Makes the tuple without the constructor of its class, which takes several times as long. */
-PyObject *results_of_step(const Results *r, const ResultArrays *a) {
-    PyObject *observations = observations_of(r, a), *infos = PyDict_New();
-    PyObject *result = observations == NULL || infos == NULL ? NULL : r->allocate(r->class, 5);
-
-    if (result == NULL) {
-        Py_XDECREF(observations);
-        Py_XDECREF(infos);
-        return NULL;
-    }
-    PyTuple_SetItem(result, 0, observations);
-    for (Py_ssize_t i = 0; i < 3; i++) {
-        PyTuple_SetItem(result, 1 + i, Py_NewRef(a->arrays[REWARDS_ARRAY + i]));
-    }
-    PyTuple_SetItem(result, 4, infos);
-    return result;
+    return is_replaced(r) ? tuple_of(r, a->arrays) : dict_of(r, a);
 }
 
 /* A dict that calls a function, with these arguments, when somebody reads or writes it. */
@@ -450,6 +283,67 @@ static PyObject *infos_of_reset(const Telling *t, const ResultArrays *a) {
     }
     Py_XDECREF(drawn);
     return infos;
+}
+
+/* Sets an item to an object, whose reference ends here. */
+static bool add(PyObject *dict, PyObject *name, PyObject *object) {
+    const bool added = object != NULL && PyDict_SetItem(dict, name, object) == 0;
+
+    Py_XDECREF(object);
+    return added;
+}
+
+static PyObject *copy_of_mask(Results *r, size_t which, const ResultArrays *a) {
+    char *memory;
+    PyObject *copy = maker_provide(&r->makers[which], &r->numpy, &memory);
+
+    if (copy != NULL) {
+        memcpy(memory, a->memory[MASK_ARRAY], r->makers[which].size);
+    }
+    return copy;
+}
+
+static PyObject *infos_of_starts(Results *r, const ResultArrays *a) {
+    PyObject *infos = infos_of_reset(&r->telling, a), *const *names = r->names_at_ends;
+
+    if (infos != NULL &&
+        (!add(infos, names[0], observed_of(r->observed, a->memory[MASK_ARRAY], a->last,
+                                           a->last_memory)) ||
+         !add(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) ||
+         !add(infos, names[2], PyDict_New()) ||
+         !add(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a)))) {
+        Py_CLEAR(infos);
+    }
+    return infos;
+}
+
+PyObject *results_starts(const Results *r, const ResultArrays *a) {
+    PyObject *last = tuple_of(r, a->last);
+    PyObject *starts = last == NULL ? NULL
+                                    : PyTuple_Pack(3, a->arrays[MASK_ARRAY],
+                                                   a->arrays[DRAWN_ARRAY], last);
+    Py_XDECREF(last);
+    return starts;
+}
+
+/* Makes the tuple without the constructor of its class, which takes several times as long. */
+PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
+    PyObject *observations = observations_of(r, a);
+    PyObject *infos =
+        any_started && r->observed != NULL ? infos_of_starts(r, a) : PyDict_New();
+    PyObject *result = observations == NULL || infos == NULL ? NULL : r->allocate(r->class, 5);
+
+    if (result == NULL) {
+        Py_XDECREF(observations);
+        Py_XDECREF(infos);
+        return NULL;
+    }
+    PyTuple_SetItem(result, 0, observations);
+    for (Py_ssize_t i = 0; i < 3; i++) {
+        PyTuple_SetItem(result, 1 + i, Py_NewRef(a->arrays[REWARDS_ARRAY + i]));
+    }
+    PyTuple_SetItem(result, 4, infos);
+    return result;
 }
 
 PyObject *results_of_reset(const Results *r, const ResultArrays *a) {

@@ -12,15 +12,19 @@ enum {
     TRUNCATED_ARRAY,
     MASK_ARRAY,
     DRAWN_ARRAY,
+    GIVEN_ARRAYS,
+    FINAL_OBS_MASK = GIVEN_ARRAYS,
+    FINAL_INFO_MASK,
     RESULT_ARRAYS
 };
 
 typedef struct Results Results;
 
-/* The arrays of one step or reset, and their memory. Those of observations and infos come first. */
+/* The arrays of one step or reset, and their memory. Those of observations and infos come first. If
+ * episodes start where others end, there are more of these, for the last observations. */
 typedef struct {
-    PyObject *arrays[RESULT_ARRAYS];
-    char *memory[RESULT_ARRAYS];
+    PyObject *arrays[RESULT_ARRAYS], *last[MOST_SEEN];
+    char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
 } ResultArrays;
 
 /* Takes a tuple: the function numpy.empty; the class of a step's result; what the observations are,
@@ -41,14 +45,21 @@ size_t results_size(const Results *results, size_t array);
  * them in any case. */
 bool results_provide_step(Results *results, ResultArrays *arrays);
 bool results_provide_reset(Results *results, ResultArrays *arrays);
+/* Provides, after results_provide_step, what it takes besides if episodes start where others end. */
+bool results_provide_starts(Results *results, ResultArrays *arrays);
 void results_drop(const Results *results, ResultArrays *arrays);
 
 /* Copies a mask to the array of the mask. Returns false if it is no array that this can be done
  * with, or has no true element. */
 bool results_copy_mask(const Results *results, PyObject *mask, const ResultArrays *arrays);
 
-/* Returns the result of a step, with an empty dict of infos. */
-PyObject *results_of_step(const Results *results, const ResultArrays *arrays);
+/* Returns the result of a step. If episodes have started where others have ended, the infos are those
+ * of Gymnasium's mode SAME_STEP; otherwise they are empty, as they are with a tuple that the caller
+ * replaces. */
+PyObject *results_of_step(Results *results, const ResultArrays *arrays, bool any_started);
+/* Returns where episodes have started in a step, what they have drawn, and the tuple of arrays of the
+ * last observations. */
+PyObject *results_starts(const Results *results, const ResultArrays *arrays);
 /* Returns the observations and infos of a reset. */
 PyObject *results_of_reset(const Results *results, const ResultArrays *arrays);
 

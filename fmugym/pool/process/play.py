@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fmugym import _native
 from fmugym.archive.variable import Variable
-from fmugym.pool.base import FloatArray, MaskArray, SingleCalls, available_processors
+from fmugym.pool.base import FloatArray, MaskArray, Played, SingleCalls, available_processors
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.native import prepare
 from fmugym.pool.pacing import last_initialization
@@ -99,7 +99,7 @@ class PlayAround:
         draws: Any,
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
-    ) -> Callable[..., tuple[Any, int, int, int]]:
+    ) -> Callable[..., Played]:
         """See ``NativePool.prepare_play``; episodes start in the step after the end of others."""
         start, ended = self._access(variables), episodes[1]
         kept = {**surroundings, "reads_kept": True}  # the workers overwrite the outputs
@@ -107,7 +107,7 @@ class PlayAround:
         before, after, advance = self._pool.play_before, self._pool.play_after, self._advance
 
         @passes_refusals
-        def play(*arrays: Any) -> tuple[Any, int, int, int]:
+        def play(*arrays: Any) -> Played:
             before(*arrays)
             advance(variables, start_values, ended)
             return after(*arrays)

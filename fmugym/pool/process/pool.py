@@ -12,7 +12,6 @@ import itertools
 import logging
 import math
 import time
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
@@ -31,17 +30,19 @@ from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
     MaskArray,
+    Played,
     PoolSpec,
     SingleCalls,
     StatusArray,
     available_processors,
 )
-from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
+from fmugym.pool.bundle import Bundle, IndexArray, Record
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
+from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.saving import SavingPool, Serialized
@@ -123,6 +124,7 @@ class ProcessPool(SavingPool):
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
+        self._states = StatesOfWorkers(self._crew)
 
     # The contract of Pool.
 
@@ -256,7 +258,7 @@ class ProcessPool(SavingPool):
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
         return has_native_pool() and self._setup.native and not self._spec.licence_wait
 
-    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., tuple[Any, int, int, int]]:
+    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., Played]:
         """See ``Pool.prepare_play``."""
         self._plays += 1
         self._parts, self._play = (*parts, *named.values()), None
@@ -332,36 +334,24 @@ class ProcessPool(SavingPool):
             self._crew.run("a change", able, lambda s: s.tell("begin_by", str(method)))
         return True
 
-    def save(self) -> _Snapshot:
+    def save(self) -> SnapshotOfWorkers:
         """See ``Pool.save``."""
         with self._lock:
             self._require_present()
-            numbers = self._crew.run(
-                "saving a state", self._crew.supervisors, lambda s: s.tell("save")
-            )
+            snapshot = self._states.save()
             self._require_present()
-            return _Snapshot({s: (s.generation, number) for s, number in numbers.items()})
+            return snapshot
 
     def restore(
-        self, snapshot: _Snapshot, mask: MaskArray | None = None
+        self, snapshot: SnapshotOfWorkers, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.restore``; a state is lost with the process that saved it."""
         mask = self._as_mask(mask)
-        parts = snapshot.parts if isinstance(snapshot, _Snapshot) else {}
-        if parts.keys() != set(self._crew.supervisors):
-            raise SimulationError("the snapshot was taken from another pool")
+        self._states.require_own(snapshot)
         with self._lock:
             self._drop_recording()
             self._require_present(mask)
-            concerned = self._crew.of_any(mask)
-            for supervisor in concerned:
-                _require_generation(supervisor, parts[supervisor][0])
-            self._crew.run(
-                "restoring a state",
-                concerned,
-                lambda s: s.tell("restore", parts[s][1], mask[s.block]),
-            )
-            self._crew.note_lost()
+            self._states.restore(snapshot, mask)
         return self.outputs, self.statuses
 
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
@@ -377,66 +367,22 @@ class ProcessPool(SavingPool):
     def serialize_states(self, indices: IndexArray) -> Serialized:
         """See ``SavingPool.serialize_states``; lost instances get empty states."""
         with self._lock:
-            parts = self._by_worker(indices[~self._crew.lost[indices]])
-            replies = self._crew.run(
-                "saving states", list(parts), lambda s: s.tell("bundle", _within(s, parts[s]))
-            )
-        states: dict[int, tuple[bytes, int, float]] = {}
-        for supervisor, (data, ends, steps, times) in replies.items():
-            one = Bundle(np.zeros((0, len(ends))), steps, times, data, ends)
-            for place, index in enumerate(parts[supervisor].tolist()):
-                states[index] = one.state(place), int(steps[place]), float(times[place])
-        lost = b"", 0, self._spec.start_time
-        found = [states.get(index, lost) for index in indices.tolist()]
-        data, ends = joined(state for state, *_ in found)
-        steps = np.array([steps for _, steps, _ in found], np.int64)
-        return data, ends, steps, np.array([time for *_, time in found], np.float64)
+            return self._states.serialize(indices, self._spec.start_time)
 
     def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
         """See ``SavingPool.deserialize_states``; a lost worker is replaced."""
         with self._lock:
-            parts = self._by_worker(indices)
-            places = {
-                int(index): int(source) for index, source in zip(indices, sources, strict=True)
-            }
-            alive = self._crew.revive(parts)
-
-            def tell(supervisor: Supervisor) -> None:
-                wanted = parts[supervisor]
-                states = bundle.take([places[index] for index in wanted.tolist()])
-                supervisor.tell("unbundle", states, _within(supervisor, wanted))
-
-            for supervisor in self._crew.run("restoring states", alive, tell):
-                supervisor.note_success()
-                self._crew.lost[parts[supervisor]] = False
-            self._crew.note_lost()
-
-    def _by_worker(self, indices: IndexArray) -> dict[Supervisor, IndexArray]:
-        """Divide instances among their workers."""
-        blocks = {
-            s: (indices >= s.block.start) & (indices < s.block.stop) for s in self._crew.supervisors
-        }
-        return {s: indices[own] for s, own in blocks.items() if own.any()}
+            self._states.deserialize(bundle, sources, indices)
 
     def record_of(self, index: int) -> Record | None:
         """See ``SavingPool.record_of``."""
         with self._lock:
-            supervisor = self._crew.of(index)
-            within = index - supervisor.block.start
-            replies = self._crew.run(
-                "a question", [supervisor], lambda s: s.tell("record_of", within)
-            )
-            record: Record | None = replies.get(supervisor)
-            return record
+            return self._states.record_of(index)
 
     def replace_record(self, index: int, record: Record) -> None:
         """See ``SavingPool.replace_record``."""
         with self._lock:
-            supervisor = self._crew.of(index)
-            within = index - supervisor.block.start
-            self._crew.run(
-                "a change", [supervisor], lambda s: s.tell("replace_record", within, record)
-            )
+            self._states.replace_record(index, record)
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -521,33 +467,6 @@ def _take_rolled(replies: Mapping[Supervisor, Any], arrays: Sequence[npt.NDArray
         for array, part in zip(arrays, parts, strict=True):
             array[:, supervisor.block] = part
     return sum(troubled for troubled, _ in replies.values())
-
-
-class _Snapshot:
-    """The numbers of the workers' snapshots, with the generations of their processes."""
-
-    def __init__(self, parts: dict[Supervisor, tuple[int, int]]) -> None:
-        self.parts = parts
-        weakref.finalize(self, _release, parts).atexit = False
-
-
-def _within(supervisor: Supervisor, indices: IndexArray) -> IndexArray:
-    """The numbers of instances within the block of their worker."""
-    within: IndexArray = indices - supervisor.block.start
-    return within
-
-
-def _require_generation(supervisor: Supervisor, generation: int) -> None:
-    if supervisor.generation != generation:
-        raise SimulationError(
-            "the snapshot is of instances whose process has been replaced since: "
-            f"{supervisor.reason}"
-        )
-
-
-def _release(parts: dict[Supervisor, tuple[int, int]]) -> None:
-    for supervisor, part in parts.items():
-        supervisor.released.append(part)
 
 
 def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:

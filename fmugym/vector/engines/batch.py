@@ -528,9 +528,15 @@ class BatchEngine(Engine):
         env._update()
         for name, row in before.items():
             if variables[name] is not row:
-                variables[name] = results.variable(name, variables[name], self._n)
+                variables[name] = self._kept_variable(name, variables[name])
         if self._idle is not None and self._idle.any():
             self._restore_variables(self._idle)
+
+    def _kept_variable(self, name: str, value: Any) -> npt.NDArray[Any]:
+        row = results.variable(name, value, self._n)
+        if row.dtype == np.float64:
+            return row
+        return row.astype(results.type_of_variable(self.env._plan, name, row.dtype), copy=False)
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._variables_before.items():

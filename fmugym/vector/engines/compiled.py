@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray, Followed, MaskArray
 from fmugym.pool.extension import require_refusal
 from fmugym.signals import is_of_signal_handler
 from fmugym.task import spaces as fmu_spaces
@@ -23,7 +23,7 @@ from fmugym.vector.actions import checked_actions
 from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.layout import Layout
+from fmugym.vector.engines.layout import Divided, Layout
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row
@@ -33,7 +33,6 @@ from fmugym.vector.infos import (
     not_finite,
     observations_of,
     restricted,
-    rows_as_objects,
 )
 from fmugym.vector.streams import given_draws
 
@@ -80,17 +79,16 @@ class CompiledEngine(BatchEngine):
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
-        """Give the pool everything it needs for a step, if it can draw the episodes."""
+        """Give the pool everything it needs for a step, if there are programs."""
         plan, streams = self.env._plan, self._streams
         self._task = task
         self._prepared = self._resets_at_once = self._is_whole = False
-        if task is None or not _can_draw(task, plan):
+        if task is None:
             return
         self._left = task.left
         self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
-        self._spare: tuple[FloatArray, Any, MaskArray | None] | None = None
         in_pass = not self._draws_ahead and self.env._warm_ups is None
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
@@ -295,24 +293,6 @@ class CompiledEngine(BatchEngine):
             drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
         return drawn
 
-    def _make_spare(self) -> tuple[FloatArray, Any, MaskArray | None]:
-        """Make arrays for the episodes that start in a step; they serve until one does.
-
-        Returns:
-            For the values drawn and, if episodes start where others end, for the last observations
-            and for which environments these are; otherwise None.
-        """
-        last, started = None, None
-        if self.starts_at_ends and self._starts_in_pass:
-            last, started = self._new_arrays(), np.empty(self._n, _BOOL)
-        self._spare = np.empty(self._drawn_shape), last, started
-        return self._spare
-
-    def leave_starts(self) -> None:
-        """See ``Engine.leave_starts``."""
-        super().leave_starts()
-        self._spare = None
-
     def call(
         self,
         name: str,
@@ -328,16 +308,21 @@ class CompiledEngine(BatchEngine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        if resetting is not None or not self._is_whole or self._any_foreign or self.starts_at_ends:
+        if resetting is not None or not self._is_whole or self._any_foreign:
             return self._step_in_parts(actions, resetting)
         result: StepResult
+        starts = self.starts_at_ends and self._starts_in_pass
+        play = self._play_with_resets if starts else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, ended, _ = self._play(actions, self._not_drawn, None, None)
+            result, troubled, self.any_ended, followed = play(
+                actions, None if starts else self._not_drawn
+            )
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), None)
-        self.any_ended = ended > 0
-        return self._completed(result, troubled, None, None) if troubled else result
+        if troubled:
+            return self._completed(result, troubled, None, followed)
+        return result
 
     def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """Do a step for which one call of the pool may not be all."""
@@ -347,24 +332,20 @@ class CompiledEngine(BatchEngine):
         if self._left or (resetting is not None and self._draws_ahead):
             actions = self._checked_ahead(actions, resetting)
         result: StepResult
-        drawn, last, started = self._spare or self._make_spare()
-        drawn = drawn if resetting is None else self._draw_ahead(resetting)
-        play = self._play if resetting is started is None else self._play_with_resets
+        starts = resetting is None and self.starts_at_ends and self._starts_in_pass
+        drawn = self._not_drawn if resetting is None else self._draw_ahead(resetting)
+        play = self._play_with_resets if starts or resetting is not None else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, ended, begun = play(actions, drawn, last, started)
+            result, troubled, self.any_ended, followed = play(actions, None if starts else drawn)
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
-        self.any_ended = ended > begun
         if self._divided is not None:
-            observations, infos = self._divided(result.observations)
-            result = _make_result((observations, *result[1:4], infos))
+            result = self._in_form(result, self._divided, followed)
         if resetting is not None:
             result.infos.update(_start_infos(self.env._plan, drawn, resetting))
-        elif begun:
-            result = self._with_ends(result, drawn, last, started)
         if troubled or self._left:
-            return self._completed(result, troubled, resetting, started)
+            return self._completed(result, troubled, resetting, followed)
         return result
 
     def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
@@ -384,14 +365,15 @@ class CompiledEngine(BatchEngine):
             raise error
         return converted
 
-    def _with_ends(
-        self, result: StepResult, drawn: FloatArray, last: Any, started: Any
+    def _in_form(
+        self, result: StepResult, divided: Divided, followed: Followed | None
     ) -> StepResult:
-        """Add the infos on the episodes that have ended and on those that have followed them."""
-        self._spare = None
-        late = LateDict.of(self._infos_at_ends, drawn, last, started)
-        infos = result.infos | late if result.infos else late
-        return _make_result((*result[:4], infos))
+        """Give observations and infos the form that the hooks give them."""
+        observations, infos = divided(result.observations)
+        if followed is not None:
+            late = LateDict.of(self._infos_at_ends, divided, *followed)
+            infos = infos | late if infos else late
+        return _make_result((observations, *result[1:4], infos))
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -424,22 +406,23 @@ class CompiledEngine(BatchEngine):
         result: StepResult,
         troubled: int,
         resetting: MaskArray | None,
-        started: MaskArray | None,
+        followed: Followed | None,
     ) -> StepResult:
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
         seen = result.rewards, result.observations
         if troubled or any(not_finite(values) is not None for values in seen):
-            self._mend(result, resetting if started is None else started)
+            self._mend(result, resetting if followed is None else followed[0])
         return result
 
-    def _infos_at_ends(self, drawn: FloatArray, last: Any, started: MaskArray) -> dict[str, Any]:
+    def _infos_at_ends(
+        self, divided: Divided, started: MaskArray, drawn: FloatArray, last: Any
+    ) -> dict[str, Any]:
         """The infos of a step in which episodes have followed others."""
-        observations, infos = (last, {}) if self._divided is None else self._divided(last)
-        is_array = isinstance(observations, np.ndarray)
-        objects = (rows_as_objects if is_array else observations_of)(observations, started)
+        observations, infos = divided(last)
         told = _start_infos(self.env._plan, drawn, started)
+        objects = observations_of(observations, started)
         told.update(final_infos(objects, restricted(infos, started), started))
         return told
 
@@ -551,12 +534,6 @@ class CompiledEngine(BatchEngine):
 
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
-
-
-def _can_draw(task: TracedTask, plan: EpisodePlan) -> bool:
-    """Whether all variables that are drawn have kept the type of a draw."""
-    types = (task.variables.get(name, np.float64) for name in plan.drawn_names)
-    return all(dtype == np.float64 for dtype in types)
 
 
 def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:

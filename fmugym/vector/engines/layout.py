@@ -11,7 +11,10 @@ from fmugym.env import FMUEnv
 from fmugym.vector.codec import with_masks
 from fmugym.vector.hooks.trace import TracedTask
 
-__all__ = ["Layout"]
+__all__ = ["Divided", "Layout"]
+
+Divided = Callable[[Any], tuple[Any, dict[str, Any]]]
+"""Returns the observations and a new dict of infos that some arrays hold."""
 
 
 class Layout:
@@ -25,8 +28,8 @@ class Layout:
         shapes: The shape and type of each array.
         names: None if the observations are the only array; the keys if they are a dict; otherwise
             empty.
-        divided: Returns the observations and a new dict of infos that such arrays hold. None if
-            what ``new_arrays`` makes are the observations.
+        divided: Makes observations and infos of such arrays. None if what ``new_arrays`` makes
+            are the observations.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
@@ -34,7 +37,7 @@ class Layout:
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
         self.names: tuple[str, ...] | None = ()
-        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
+        self.divided: Divided | None = self._tree
         if not task.seen and env._pool_observes:
             self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
             self.names, self.divided = None, None

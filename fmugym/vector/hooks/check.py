@@ -45,6 +45,9 @@ _READ_ONLY = (
     "done",
 )
 
+_WRITING = ("_get_inputs", "_update")
+"""Hooks that are not called for environments that start an episode, and may write variables."""
+
 _EPISODES, _STEPS = 2, 3
 """How many states of the FMU are tried; each is tried at other magnitudes, too."""
 
@@ -213,6 +216,8 @@ class _Comparison(NamedTuple):
         if failures == count or (failures and not is_natural):
             return None  # it fails either way: the first step will tell
         changed = next((name for _, name in calls if name is not None), None)
+        if changed == "variables":
+            return "changes self.variables, which only _update may do"
         if is_natural and changed is not None:
             return f"changes self.{changed}, which belongs in 'episode_variables'"
         together, changed = self._call(copied(self.batch))
@@ -227,19 +232,21 @@ class _Comparison(NamedTuple):
 
     def _call(self, readings: Readings) -> tuple[Any, str | None]:
         """Call the hook; return its result and the name of an attribute that it changes."""
-        before = _read_only(readings)
+        before = _read_only(readings, self.name)
         with reading(self.env, readings):
             result = _result_of(self.env, self.name)
-            after = _read_only(Readings.of(self.env))
+            after = _read_only(Readings.of(self.env), self.name)
         changed = [name for name, row in before.items() if differs(row, after[name])]
         attribute = self.contents.changed()
         self.contents.restore()
         return result, changed[0] if changed else attribute
 
 
-def _read_only(readings: Readings) -> dict[str, Any]:
-    """Copy the readings that hooks must not change, by the names of the attributes."""
-    rows = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
+def _read_only(readings: Readings, hook: str) -> dict[str, Any]:
+    """Copy the readings that a hook must not change, by the names of the attributes."""
+    rows: dict[str, Any] = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
+    if hook not in _WRITING:
+        rows["variables"] = {name: np.copy(row) for name, row in readings.variables.items()}
     return rows | {"out": np.copy(readings.values)}
 
 

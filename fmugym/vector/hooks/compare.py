@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +14,7 @@ from fmugym.task import spaces as fmu_spaces
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.program import Row, UntraceableError, evaluate
+from fmugym.vector.hooks.program import Row, UntraceableError, evaluate, writes_variable
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.views import copied
 
@@ -86,6 +87,7 @@ class _Comparison:
         evaluate(self._task.inputs, self._find, self._actions)
         expected = np.array(env.inputs)
         results.write_inputs(env._get_inputs(), expected)
+        self._require_unwritten(self._before)
         for index in range(self._count):
             expected[:, index] = self._typed(expected[:, index])
         for index, row in enumerate(expected if "_get_inputs" not in self._task.left else ()):
@@ -110,7 +112,9 @@ class _Comparison:
         judged = evaluate(self._task.judgement, self._find, self._actions, seen)
         if env._own.update:
             env._update()
-        self._compare_variables()
+            for name in self._task.updated:
+                kept = results.variable(name, env.variables[name], count)
+                env.variables[name] = kept.astype(self._task.variables[name])
         env.done = results.flags("_is_done", env._is_done(), count)
         self._require_equal("_is_done", judged[0], env.done)
         if "_is_truncated" not in self._task.left:
@@ -120,13 +124,25 @@ class _Comparison:
             rewards = results.rewards(env._reward_policy(), count)
             self._require_equal("_reward_policy", judged[2], rewards)
         self._compare_seen(seen)
+        self._compare_variables()
 
     def _compare_variables(self) -> None:
-        for name in self._task.updated:
-            value = results.variable(name, self._env.variables[name], self._count)
-            expected = np.broadcast_to(value, self._before[name].shape).reshape(-1, self._count)
-            for index, row in enumerate(expected):
+        """Compare them when all hooks were called: only ``_update`` may write them."""
+        updated = self._task.updated
+        self._require_unwritten(name for name in self._before if name not in updated)
+        for name in updated:
+            for index, row in enumerate(self._rows(name)):
                 self._require_equal("_update", self._find(("variable", name, index)), row)
+
+    def _require_unwritten(self, names: Iterable[str]) -> None:
+        for name in names:
+            if not _equal(self._before[name].reshape(-1, self._count), self._rows(name)):
+                raise UntraceableError(writes_variable(name))
+
+    def _rows(self, name: str) -> npt.NDArray[Any]:
+        """The present values of an episode variable, a row for each element."""
+        value = results.variable(name, self._env.variables[name], self._count)
+        return np.broadcast_to(value, self._before[name].shape).reshape(-1, self._count)
 
     def _compare_seen(self, seen: tuple[npt.NDArray[Any], ...]) -> None:
         env, count = self._env, self._count

@@ -317,13 +317,29 @@ def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> 
     return np.sqrt(add.reduce(symbols * symbols, axis=axis, keepdims=keepdims))
 
 
+def _flat(a: Any, axis: Any) -> tuple[Symbols, int]:
+    """Symbols and an axis; without one, numpy takes all elements in a row."""
+    symbols = as_symbols(graph_of(a), a)
+    if axis is not None:
+        return symbols, axis
+    return symbols.like(symbols.cells.ravel()), 0
+
+
+def _accumulating(ufunc: Any) -> Callable[..., Any]:
+    def accumulate(a: Any, axis: Any = None, dtype: Any = None, out: Any = None) -> Any:
+        symbols, axis = _flat(a, axis)
+        return ufunc.accumulate(symbols, axis, dtype, None if out is None else (out,))
+
+    return accumulate
+
+
 def _arg_extreme(is_better: Any) -> Callable[..., Symbols]:
     """The index of the first extreme value, or of the first NaN."""
 
     def find(a: Any, axis: Any = None, out: Any = None, *, keepdims: Any = False) -> Any:
-        symbols = as_symbols(graph_of(a), a)
-        if axis is None or out is not None:
-            raise UntraceableError("it looks for an extreme value without an axis")
+        symbols, axis = _flat(a, axis)
+        if out is not None:
+            raise UntraceableError("it writes the place of an extreme value to an array")
         rows = [symbols.like(row) for row in np.moveaxis(symbols.cells, axis, 0)]
         best: Any = rows[0]
         index: Any = np.zeros_like(best, np.intp)
@@ -400,6 +416,8 @@ _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
     np.ones_like: _filled(1),
     np.full_like: full_like,
     np.broadcast_arrays: _broadcast_arrays,
+    np.cumsum: _accumulating(np.add),
+    np.cumprod: _accumulating(np.multiply),
     np.shape: lambda a: as_symbols(graph_of(a), a).shape,
     np.ndim: lambda a: as_symbols(graph_of(a), a).ndim,
     np.size: lambda a, axis=None: a.size if axis is None else a.shape[axis],
@@ -423,7 +441,7 @@ _REARRANGING: Final = frozenset(
 
 _COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
-    | {np.round, np.around, np.cumsum, np.cumprod, np.ptp, np.diff, np.polyval, np.isclose}
+    | {np.round, np.around, np.ptp, np.diff, np.polyval, np.isclose}
     | {
         np.sinc,
         np.average,

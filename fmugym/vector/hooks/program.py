@@ -16,7 +16,15 @@ import numpy.typing as npt
 
 from fmugym.pool.extension import has_native_pool
 
-__all__ = ["OPERATIONS", "TYPES", "Program", "UntraceableError", "evaluate", "letter_of"]
+__all__ = [
+    "OPERATIONS",
+    "TYPES",
+    "Program",
+    "UntraceableError",
+    "evaluate",
+    "letter_of",
+    "writes_variable",
+]
 
 OPERATIONS: Final = (
     *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
@@ -76,6 +84,11 @@ class UntraceableError(Exception):
 
 _LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
 """On systems where two of numpy's types have the same layout, both are equal to one of these."""
+
+
+def writes_variable(name: str) -> str:
+    """Say why hooks cannot be compiled if another one than ``_update`` writes a variable."""
+    return f"a hook writes the episode variable {name!r}, which only _update may do"
 
 
 def letter_of(dtype: npt.DTypeLike) -> str:

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.episode import EpisodePlan
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
 
@@ -28,6 +29,7 @@ __all__ = [
     "observations",
     "restore_variable",
     "rewards",
+    "type_of_variable",
     "variable",
     "write_inputs",
 ]
@@ -35,7 +37,7 @@ __all__ = [
 _NUMBERS: Final = "biuf"
 """The kinds of numpy's types that are numbers: Booleans, integers with and without sign, floats."""
 
-_BOOL = np.dtype(np.bool_)
+_BOOL, _FLOAT = np.dtype(np.bool_), np.dtype(np.float64)
 
 
 def flags(hook: str, value: Any, count: int) -> MaskArray:
@@ -174,6 +176,25 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
             f"or {count} numbers in the last axis"
         )
     return array if array.ndim else np.full(count, array)
+
+
+def type_of_variable(plan: EpisodePlan, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
+    """The type in which N environments keep an episode variable.
+
+    It is the type that ``_update`` assigns if this can hold the value with which episodes start.
+    Otherwise it is float64, because episodes start while others are under way.
+
+    Args:
+        plan: What episodes start with.
+        name: The variable.
+        assigned: The type of what ``_update`` has assigned.
+    """
+    if name in plan.drawn_names:
+        return _FLOAT
+    start = np.asarray(plan.constant_variables[name], _FLOAT)
+    with np.errstate(all="ignore"):
+        fits = start.astype(assigned).astype(_FLOAT).tobytes() == start.tobytes()
+    return assigned if fits else _FLOAT
 
 
 def restore_variable(

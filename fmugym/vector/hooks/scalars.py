@@ -26,6 +26,9 @@ _BOOL, _INT, _FLOAT = np.dtype(np.bool_), np.dtype(np.int64), np.dtype(np.float6
 _DTYPES: Final = {bool: _BOOL, int: _INT, float: _FLOAT}
 """What holds the numbers of Python; integers are taken to be small."""
 
+_MOST_SHIFTED: Final = 30
+"""Integers of Python that are shifted farther may need more than 64 bits."""
+
 _MOST_TERMS: Final = 7
 """numpy adds more neighbours than these in another order than from the first to the last."""
 
@@ -155,6 +158,12 @@ class Scalar(Unboxed):
     __float__ = __int__ = __index__ = __complex__ = __round__ = _item
     __floor__ = __ceil__ = __trunc__ = _item
     __hash__ = None  # type: ignore[assignment]  # not hashable
+
+    def __divmod__(self, other: Any) -> Any:
+        return self // other, self % other
+
+    def __rdivmod__(self, other: Any) -> Any:
+        return other // self, other % self
 
     def __neg__(self) -> Any:
         return self._unary(np.negative)
@@ -409,6 +418,18 @@ def _bitwise(ufunc: Any, of_flags: Any) -> Callable[..., Any]:
     return combine
 
 
+def _shift(ufunc: Any) -> Callable[..., Any]:
+    def combine(graph: Any, kinds: Any, first: Any, second: Any) -> Any:
+        if float in kinds:
+            raise UntraceableError("it shifts the bits of a float")
+        cells = _cell(graph, first, _INT), _cell(graph, second, _INT)
+        for bad, limit in ((np.less, 0), (np.greater, _MOST_SHIFTED)):
+            graph.guard(graph.apply(bad, (cells[1], _cell(graph, limit, _INT)), _BOOL))
+        return _scalar(graph, graph.apply(ufunc, cells, _INT), _INT, int)
+
+    return combine
+
+
 _OPERATORS: Final[dict[str, tuple[Any, Callable[..., Any]]]] = {
     "add": (np.add, _arithmetic(np.add)),
     "sub": (np.subtract, _arithmetic(np.subtract)),
@@ -417,6 +438,8 @@ _OPERATORS: Final[dict[str, tuple[Any, Callable[..., Any]]]] = {
     "floordiv": (np.floor_divide, _division(np.floor_divide)),
     "mod": (np.remainder, _division(np.remainder)),
     "pow": (np.power, _power_of_python),
+    "lshift": (np.left_shift, _shift(np.left_shift)),
+    "rshift": (np.right_shift, _shift(np.right_shift)),
     "and": (np.bitwise_and, _bitwise(np.bitwise_and, np.logical_and)),
     "or": (np.bitwise_or, _bitwise(np.bitwise_or, np.logical_or)),
     "xor": (np.bitwise_xor, _bitwise(np.bitwise_xor, np.logical_xor)),

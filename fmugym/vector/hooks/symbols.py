@@ -8,7 +8,8 @@ fits nothing, so that code that does not ask these methods fails instead of read
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Final
 
 import numpy as np
@@ -28,9 +29,11 @@ __all__ = [
     "has_symbols",
     "lift",
     "loaded",
+    "same_cells",
     "same_for_all",
     "spread",
     "stand_in",
+    "writeable",
 ]
 
 LANES: Final = 5
@@ -53,8 +56,8 @@ _KEPT: Final = frozenset(
     | {"__radd__", "__rand__", "__rdivmod__", "__rfloordiv__", "__rlshift__", "__rmod__"}
     | {"__rmul__", "__ror__", "__rpow__", "__rrshift__", "__rshift__", "__rsub__", "__rtruediv__"}
     | {"__rxor__", "__sub__", "__truediv__", "__xor__", "__matmul__", "__rmatmul__", "dtype"}
-    | {"sum", "prod", "min", "max", "any", "all", "clip", "var", "std", "astype", "cumsum"}
-    | {"cumprod", "conj", "conjugate", "itemsize"}
+    | {"sum", "prod", "min", "max", "any", "all", "clip", "var", "std", "astype"}
+    | {"conj", "conjugate", "itemsize"}
 )
 """What of ``numpy.ndarray`` works here, because it ends in one of the three methods of numpy."""
 
@@ -209,6 +212,8 @@ class Symbols(np.ndarray[Any, Any]):
         self[...] = np.sort(self, axis, *args, **keywords)
 
     def _round(self, decimals: int = 0, out: Any = None) -> Any:
+        if self.dtype.kind in "iu" and decimals >= 0 and out is None:
+            return self.copy()
         if self.dtype.kind in "iub" or out is not None:
             raise UntraceableError("it rounds integers")
         if decimals == 0:
@@ -260,6 +265,8 @@ _METHODS: Final[Mapping[str, Any]] = {
     "dot": lambda self, b, out=None: np.dot(self, b, out),
     "argmax": lambda self, *args, **keywords: np.argmax(self, *args, **keywords),
     "argsort": lambda self, *args, **keywords: np.argsort(self, *args, **keywords),
+    "cumsum": lambda self, *args, **keywords: np.cumsum(self, *args, **keywords),
+    "cumprod": lambda self, *args, **keywords: np.cumprod(self, *args, **keywords),
     "mean": Symbols._mean,
     "sort": Symbols._sort,
     "argmin": lambda self, *args, **keywords: np.argmin(self, *args, **keywords),
@@ -440,6 +447,25 @@ def spread(graph: Graph, nodes: npt.NDArray[Any], dtype: np.dtype[Any]) -> Symbo
         for lane in range(LANES):
             cells[(*place, lane)] = Cell(int(nodes[place]), lane)
     return Symbols(graph, cells, dtype)
+
+
+@contextmanager
+def writeable(arrays: Iterable[Symbols]) -> Iterator[None]:
+    """Let hooks change some arrays in place inside of a ``with`` block."""
+    own = list(arrays)
+    for symbols in own:
+        symbols._writeable = True
+    try:
+        yield
+    finally:
+        for symbols in own:
+            symbols._writeable = False
+
+
+def same_cells(first: Symbols, second: Symbols) -> bool:
+    """Whether two arrays have the same values in the same places."""
+    pairs = zip(first.cells.flat, second.cells.flat, strict=True)
+    return all((one.node, one.lane) == (other.node, other.lane) for one, other in pairs)
 
 
 def same_for_all(symbols: Symbols) -> npt.NDArray[Any]:

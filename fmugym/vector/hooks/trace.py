@@ -26,14 +26,17 @@ from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.results import type_of_variable
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
     Symbols,
     as_symbols,
     loaded,
+    same_cells,
     same_for_all,
     spread,
+    writeable,
 )
 from fmugym.vector.hooks.tables import Table, is_table, tables_in
 
@@ -248,14 +251,16 @@ class Tracer:
         if not self._env._own.update:
             return [], ()
         before = dict(self._env.variables)
-        self._call("_update", lambda value: None)
+        old = {name: symbols.copy() for name, symbols in before.items()}
+        with writeable(before.values()):
+            self._call("_update", lambda value: None)
         active = self._graph.load("active", None, np.bool_, None)
         stores, updated = [], []
-        for name, old in before.items():
+        for name, symbols in before.items():
             new = self._env.variables[name]
-            if new is old:
+            if new is symbols and same_cells(new, old[name]):
                 continue
-            kept = self._kept_where_idle(name, new, old, active)
+            kept = self._kept_where_idle(name, new, old[name], active)
             self._env.variables[name] = kept
             updated.append(name)
             nodes = same_for_all(kept).reshape(-1)
@@ -268,7 +273,7 @@ class Tracer:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
-        self._variables[name] = symbols.dtype
+        self._variables[name] = type_of_variable(self._env._plan, name, symbols.dtype)
         symbols = symbols.cast(old.dtype)
         choose = self._graph.choose
         cells: Any = np.empty(old.shape, object)

@@ -1,0 +1,83 @@
+"""How a signal ends the command line: as Ctrl-C does, with clean-ups made.
+
+By default SIGTERM (of ``kill``, ``timeout`` and batch systems) and SIGHUP (of a terminal that
+closes) end a process at once, and its temporary folders remain.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+from types import FrameType
+from typing import Final
+
+__all__ = ["SignalledEnd", "end_as_after_ctrl_c", "exit_code"]
+
+_NAMES: Final = ("SIGTERM", "SIGHUP")
+
+_PATIENCE: Final = 5.0
+"""Seconds until the process is ended by force: its FMU may hang, and Python waits for the call."""
+
+_begun: Final = threading.Event()
+"""Set when Python has begun to end the program."""
+
+
+class SignalledEnd(KeyboardInterrupt):
+    """A signal asks the program to end.
+
+    Attributes:
+        number: That of the signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(signal.Signals(number).name)
+        self.number = number
+
+
+def end_as_after_ctrl_c() -> None:
+    """Let the signals raise ``SignalledEnd``, but for those that the process ignores (``nohup``).
+
+    To be called in the main thread.
+    """
+    numbers = {
+        number
+        for number in (getattr(signal, name, None) for name in _NAMES)
+        if number is not None and signal.getsignal(number) == signal.SIG_DFL
+    }
+    for number in numbers:
+        signal.signal(number, _raise)
+    if numbers:
+        _watch(numbers)
+
+
+def exit_code(error: KeyboardInterrupt) -> int:
+    """The exit code that shells give to a process that a signal has ended: 130 after Ctrl-C."""
+    return 128 + getattr(error, "number", signal.SIGINT)
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    _begun.set()
+    raise SignalledEnd(number)
+
+
+def _watch(numbers: set[int]) -> None:
+    """Watch for signals in a thread, which runs also while the main thread is in an FMU."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+    threading.Thread(target=_end_by_force, args=(reader, numbers), daemon=True).start()
+
+
+def _end_by_force(reader: socket.socket, numbers: set[int]) -> None:
+    """Wait for one of the signals; end the process if Python has not begun to end it by then."""
+    number = 0
+    while number not in numbers:
+        (number,) = reader.recv(1)
+    if _begun.wait(_PATIENCE):
+        return
+    if "fmugym.archive.temporary" in sys.modules:
+        sys.modules["fmugym.archive.temporary"].remove_rest()
+    os._exit(128 + number)

@@ -1,0 +1,96 @@
+"""Attributes and parameters of the single environments of a vector environment, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.task.starting import checked_column, spread
+from fmugym.vector.arguments import UnknownAttributeError
+from fmugym.vector.calls import checked_name, require_settable
+from fmugym.vector.engines.base import Engine
+
+__all__ = ["Attributes"]
+
+
+class Attributes:
+    """What ``get_attr`` and ``set_attr`` of a vector environment read and set.
+
+    Args:
+        prototype: The environment whose class and FMU all have.
+        engine: Keeps the values of each environment.
+    """
+
+    def __init__(self, prototype: FMUEnv, engine: Engine) -> None:
+        self._prototype, self._engine = prototype, engine
+
+    def read(self, name: str, indices: Sequence[int]) -> list[Any]:
+        """Read an attribute, or else a parameter, of some environments.
+
+        Raises:
+            ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
+        """
+        name = checked_name(name)
+        return [self._engine.read(name, index) for index in indices]
+
+    def set(self, name: str, values: Any) -> None:
+        """Set an attribute, or a parameter, of all environments; see ``FMUVectorEnv.set_attr``."""
+        name = checked_name(name)
+        each = self._each(name, values)
+        if self.is_parameter(name):
+            self._set_parameter(name, each)
+        else:
+            self.set_attribute(name, dict(enumerate(each)))
+
+    def _each(self, name: str, values: Any) -> list[Any]:
+        """The values of all environments in their order."""
+        count = len(self._engine.ended)
+        is_row = issubclass(type(values), np.ndarray) and values.ndim > 0
+        if not is_row and not issubclass(type(values), list | tuple):
+            return [values] * count
+        try:
+            each = list(values)
+        except Exception:  # a list of the caller's whose methods fail
+            raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
+        if len(each) != count:
+            raise ConfigError(f"there are {len(each)} values of {shown(name)}, expected {count}")
+        return each
+
+    def is_parameter(self, name: str) -> bool:
+        """Whether a name is that of a variable of the FMU and not of an attribute."""
+        env = self._prototype
+        return not hasattr(env, name) and env.fmu.description.find(name) is not None
+
+    def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
+        """Set a parameter of all environments, from their next episodes on."""
+        self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
+        scalars = self._prototype.fmu.description.scalars(name)
+        rows = [spread(name, scalars, value) for value in values]
+        columns = {
+            variable.name: checked_column(variable, [row[place] for row in rows])
+            for place, variable in enumerate(scalars)
+        }
+        for scalar, numbers in columns.items():
+            self._engine.set_parameter(scalar, numbers)
+
+    def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
+        """Set an attribute of some environments.
+
+        Args:
+            name: One that hooks read.
+            values: By the number of the environment.
+
+        Raises:
+            ConfigError: If there is no such attribute, or every environment keeps it itself.
+        """
+        env = self._prototype
+        if not hasattr(env, name):  # no hook can know of it: the name is misspelt
+            public = [known for known in dir(env) if not known.startswith("_")]
+            names = public + list(env.fmu.description.variables)
+            raise UnknownAttributeError(str(unknown_name("attribute or parameter", name, names)))
+        require_settable(name)
+        self._engine.set_attribute(name, values)

@@ -1,0 +1,243 @@
+#include "ends.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "program.h"
+
+enum { MOST_KEPT = 1 << 20, /* bytes of arrays that wait for their next use */
+       SIZE_OF_ARRAY = 128  /* an array of numpy without its memory, about */ };
+
+/* The observations of single environments that one array of all of them holds. */
+typedef struct {
+    Maker maker;
+    PyObject **spare; /* arrays that nobody else holds */
+    size_t number_of_spare, most;
+    size_t size;    /* in bytes */
+    bool is_scalar; /* then it is no array, and no maker is there */
+} RowMaker;
+
+struct Observed {
+    const Numpy *numpy;
+    size_t count;
+    PyObject *names;
+    size_t number_of_rows;
+    Maker objects;
+    RowMaker *rows;
+};
+
+/* Taking over */
+
+/* Returns the arguments that make one element of the first axis, NULL with an exception if memory
+ * runs out. */
+static PyObject *arguments_of_row(const Maker *all) {
+    PyObject *whole = PyTuple_GetItem(all->arguments, 0);
+    PyObject *shape = PySequence_GetSlice(whole, 1, all->dimensions);
+    PyObject *arguments =
+        shape == NULL ? NULL : PyTuple_Pack(2, shape, PyTuple_GetItem(all->arguments, 1));
+
+    Py_XDECREF(shape);
+    return arguments;
+}
+
+static bool take_row(RowMaker *row, const Numpy *numpy, const Maker *all, size_t count) {
+    row->size = count > 0 ? all->size / count : 0;
+    row->is_scalar = all->dimensions == 1;
+    if (row->is_scalar) {
+        return true;
+    }
+    const size_t most = MOST_KEPT / (row->size + SIZE_OF_ARRAY);
+    row->most = most < count ? most : count;
+    row->spare = calloc(row->most + 1, sizeof *row->spare);
+    PyObject *arguments = arguments_of_row(all);
+    if (row->spare == NULL && arguments != NULL) {
+        PyErr_NoMemory();
+    }
+    const bool taken =
+        row->spare != NULL && arguments != NULL && maker_take(&row->maker, numpy, arguments);
+    Py_XDECREF(arguments);
+    return taken;
+}
+
+static bool take_objects(Observed *o) {
+    PyObject *arguments = Py_BuildValue("((n)s)", (Py_ssize_t)o->count, "O");
+    const bool taken = arguments != NULL && maker_take(&o->objects, o->numpy, arguments);
+
+    Py_XDECREF(arguments);
+    return taken;
+}
+
+static bool take_all(Observed *o, const Maker *arrays) {
+    bool good = take_objects(o);
+
+    o->rows = calloc(o->number_of_rows, sizeof *o->rows);
+    if (o->rows == NULL && good) {
+        PyErr_NoMemory();
+        good = false;
+    }
+    for (size_t i = 0; i < o->number_of_rows && good; i++) {
+        good = take_row(&o->rows[i], o->numpy, &arrays[i], o->count);
+    }
+    return good;
+}
+
+Observed *observed_take(const Numpy *numpy, const Maker *arrays, size_t count, PyObject *names) {
+    Observed *o = calloc(1, sizeof *o);
+
+    if (o == NULL) {
+        PyErr_NoMemory();
+        return NULL;
+    }
+    *o = (Observed){.numpy = numpy, .count = count, .names = names};
+    o->number_of_rows = names == Py_None ? 1 : (size_t)PyTuple_Size(names);
+    if (!take_all(o, arrays)) {
+        observed_free(o);
+        return NULL;
+    }
+    return o;
+}
+
+static void drop_row(RowMaker *row) {
+    while (row->number_of_spare > 0) {
+        Py_DECREF(row->spare[--row->number_of_spare]);
+    }
+    free(row->spare);
+    maker_drop(&row->maker);
+}
+
+void observed_free(Observed *o) {
+    if (o == NULL) {
+        return;
+    }
+    maker_drop(&o->objects);
+    for (size_t i = 0; i < o->number_of_rows && o->rows != NULL; i++) {
+        drop_row(&o->rows[i]);
+    }
+    free(o->rows);
+    free(o);
+}
+
+/* Taking back what an array of objects has held. The caller's references end here. */
+
+static void keep(RowMaker *row, const Numpy *numpy, PyObject *object) {
+    char *memory;
+
+    if (Py_REFCNT(object) == 1 && row->number_of_spare < row->most &&
+        maker_knows(&row->maker, numpy, object, &memory)) {
+        row->spare[row->number_of_spare++] = object;
+    } else {
+        Py_DECREF(object);
+    }
+}
+
+static void keep_items(Observed *o, PyObject *dict) {
+    PyObject *items[MOST_SEEN];
+
+    for (size_t i = 0; i < o->number_of_rows; i++) {
+        items[i] = PyDict_GetItemWithError(dict, PyTuple_GetItem(o->names, (Py_ssize_t)i));
+        Py_XINCREF(items[i]);
+        PyErr_Clear(); /* a key of the caller's cannot be compared */
+    }
+    Py_DECREF(dict);
+    for (size_t i = 0; i < o->number_of_rows; i++) {
+        if (items[i] != NULL) {
+            keep(&o->rows[i], o->numpy, items[i]);
+        }
+    }
+}
+
+static void take_back(Observed *o, PyObject *object) {
+    if (o->names == Py_None) {
+        keep(&o->rows[0], o->numpy, object);
+    } else if (PyDict_CheckExact(object) && Py_REFCNT(object) == 1) {
+        keep_items(o, object);
+    } else {
+        Py_DECREF(object);
+    }
+}
+
+static void clear(Observed *o, PyObject **objects) {
+    for (size_t i = 0; i < o->count; i++) {
+        PyObject *object = objects[i];
+        if (object != Py_None) {
+            objects[i] = Py_NewRef(Py_None); /* first, because the end of an object may call back */
+            if (object != NULL) {
+                take_back(o, object);
+            }
+        }
+    }
+}
+
+/* Filling */
+
+static PyObject *array_of(RowMaker *row, const Numpy *numpy, char **memory) {
+    while (row->number_of_spare > 0) {
+        PyObject *spare = row->spare[--row->number_of_spare];
+        if (maker_knows(&row->maker, numpy, spare, memory)) {
+            return spare;
+        }
+        Py_DECREF(spare);
+    }
+    return maker_make(&row->maker, numpy, memory);
+}
+
+static PyObject *row_of(RowMaker *row, const Numpy *numpy, size_t index, PyObject *all,
+                        const char *memory_of_all) {
+    char *memory;
+
+    if (row->is_scalar) {
+        return PySequence_GetItem(all, (Py_ssize_t)index);
+    }
+    PyObject *array = array_of(row, numpy, &memory);
+    if (array != NULL) {
+        memcpy(memory, memory_of_all + index * row->size, row->size);
+    }
+    return array;
+}
+
+static PyObject *dict_of(Observed *o, size_t index, PyObject *const *arrays, char *const *memory) {
+    PyObject *dict = PyDict_New();
+
+    for (size_t i = 0; i < o->number_of_rows && dict != NULL; i++) {
+        PyObject *name = PyTuple_GetItem(o->names, (Py_ssize_t)i);
+        PyObject *row = row_of(&o->rows[i], o->numpy, index, arrays[i], memory[i]);
+        if (row == NULL || PyDict_SetItem(dict, name, row) < 0) {
+            Py_CLEAR(dict);
+        }
+        Py_XDECREF(row);
+    }
+    return dict;
+}
+
+static bool fill(Observed *o, PyObject **objects, const char *mask, PyObject *const *arrays,
+                 char *const *memory) {
+    const char *const end = mask + o->count;
+
+    for (const char *at = mask; (at = memchr(at, 1, (size_t)(end - at))) != NULL; at++) {
+        const size_t index = (size_t)(at - mask);
+        PyObject *seen = o->names == Py_None
+                             ? row_of(&o->rows[0], o->numpy, index, arrays[0], memory[0])
+                             : dict_of(o, index, arrays, memory);
+        if (seen == NULL) {
+            return false;
+        }
+        Py_DECREF(objects[index]); /* None */
+        objects[index] = seen;
+    }
+    return true;
+}
+
+PyObject *observed_of(Observed *o, const char *mask, PyObject *const *arrays,
+                      char *const *memory) {
+    char *objects;
+    PyObject *array = maker_provide(&o->objects, o->numpy, &objects);
+
+    if (array == NULL) {
+        return NULL;
+    }
+    clear(o, (PyObject **)(void *)objects);
+    if (!fill(o, (PyObject **)(void *)objects, mask, arrays, memory)) {
+        Py_CLEAR(array);
+    }
+    return array;
+}

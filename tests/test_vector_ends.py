@@ -1,0 +1,393 @@
+"""What compiled steps tell of ends in the mode ``SAME_STEP``: as Gymnasium's ``SyncVectorEnv``.
+
+Arrays that nobody holds are used again, so these tests hold, change and drop what they are told.
+"""
+
+import contextlib
+import copy
+import functools
+import gc
+import pickle
+import sys
+import tracemalloc
+import weakref
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from vector_tools import CART_POLE, Drawing, require_equal, sampled_actions
+
+from fmugym import FMUVectorEnv, SimulationError
+from fmugym.pool import has_native_pool
+
+pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+
+SAME_STEP = AutoresetMode.SAME_STEP
+NUM_ENVS, STEPS = 6, 60
+BOX = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+
+class Shaped(Drawing):
+    """Observations of a form of their own; the number of steps differs between environments."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=5)
+
+    def _is_done(self):
+        return self.state[0] > 0.5
+
+    def _array(self):
+        return np.array([self.state[0], self.state[1]], np.float32)
+
+
+class Named(Shaped):
+    """A dict of arrays."""
+
+    def _get_observation_space(self):
+        return gym.spaces.Dict({"state": BOX, "steps": gym.spaces.Box(0, 99, (1,), np.int64)})
+
+    def _get_observation(self):
+        return {"state": self._array(), "steps": np.array([self.step_count])}
+
+
+class Square(Shaped):
+    """An array with two axes."""
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (2, 2), np.float64)
+
+    def _get_observation(self):
+        return np.array([[self.state[0], self.state[1]], [self.previous_state[0], self.time]])
+
+
+class Telling(Named):
+    """Infos of its own."""
+
+    def _get_info(self):
+        return {"angle": self.state[0], "nested": {"speed": self.state[1]}}
+
+
+TASKS = [CART_POLE, Named, Square, Telling]
+
+
+def made(task, num_envs=NUM_ENVS):
+    envs = FMUVectorEnv(task, num_envs, autoreset_mode=SAME_STEP, hooks="compiled")
+    envs.reset(seed=0)
+    return envs
+
+
+def infos_of(envs, steps=STEPS):
+    """The infos of the steps in which episodes end."""
+    for actions in sampled_actions(envs, steps):
+        infos = envs.step(actions)[4]
+        if "final_obs" in infos:
+            yield infos
+            infos = None  # so that nobody holds them in the next step
+
+
+def require_same_form(mine, theirs):
+    """The same keys in the same order, types and values, also outside of the masks."""
+    assert list(mine) == list(theirs)
+    for name, value in mine.items():
+        other = theirs[name]
+        if isinstance(other, dict):
+            assert isinstance(value, dict)
+            require_same_form(value, other)
+        elif other.dtype == object:
+            assert (value.dtype, value.shape) == (other.dtype, other.shape)
+            for a, b in zip(value, other, strict=True):
+                assert type(a) is type(b)
+                if b is not None:
+                    require_equal(a, b)
+        else:
+            require_equal(value, other)
+
+
+def final(infos):
+    return {name: value for name, value in infos.items() if "final" in name}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_form_is_that_of_gymnasium(task):
+    ours = made(task)
+    theirs = SyncVectorEnv([task] * NUM_ENVS, autoreset_mode=SAME_STEP)
+    theirs.reset(seed=0)
+    ends = 0
+    for actions in sampled_actions(ours, STEPS):
+        mine, other = ours.step(actions)[4], theirs.step(actions)[4]
+        assert ("final_obs" in mine) == ("final_obs" in other)
+        if "final_obs" in mine:
+            require_same_form(final(mine), final(other))
+            ends += int(mine["_final_obs"].sum())
+    assert ends > NUM_ENVS
+    ours.close()
+    theirs.close()
+
+
+def test_statistics_of_gymnasiums_wrapper():
+    ours = gym.make_vec("fmugym/CartPole-v0", NUM_ENVS, autoreset_mode="same_step")
+    theirs = SyncVectorEnv(
+        [functools.partial(gym.make, "fmugym/CartPole-v0")] * NUM_ENVS, autoreset_mode=SAME_STEP
+    )
+    statistics = gym.wrappers.vector.RecordEpisodeStatistics
+    first, second = statistics(ours), statistics(theirs)
+    first.reset(seed=3)
+    second.reset(seed=3)
+    told = 0
+    for actions in sampled_actions(ours, 80):
+        mine, other = first.step(actions)[4], second.step(actions)[4]
+        assert ("episode" in mine) == ("episode" in other)
+        if "episode" in mine:
+            mine["episode"].pop("t")
+            other["episode"].pop("t")
+            require_equal(mine["episode"], other["episode"])
+            require_equal(mine["_episode"], other["_episode"])
+            require_same_form(final(mine), final(other))
+            told += 1
+    assert told > 5
+    first.close()
+    second.close()
+
+
+def observations_in(objects):
+    """The arrays in an array of objects."""
+    for value in objects:
+        if value is not None:
+            yield from value.values() if isinstance(value, dict) else (value,)
+
+
+@functools.cache
+def told(task):
+    """What a run tells, copied at once."""
+    envs = made(task)
+    copies = [copy.deepcopy(final(infos)) for infos in infos_of(envs)]
+    envs.close()
+    assert len(copies) > 5
+    return copies
+
+
+def held_infos(infos, number):
+    return infos
+
+
+def held_objects(infos, number):
+    return {"final_obs": infos["final_obs"]}
+
+
+def held_objects_in_turn(infos, number):
+    return {"final_obs": infos["final_obs"]} if number % 3 else {}
+
+
+def held_mask(infos, number):
+    return {"_final_obs": infos["_final_obs"], "_final_info": infos["_final_info"]}
+
+
+def held_copy_of_objects(infos, number):
+    return {"final_obs": infos["final_obs"].copy()}
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "hold", [held_infos, held_objects, held_objects_in_turn, held_mask, held_copy_of_objects]
+)
+def test_what_is_held_does_not_change(task, hold):
+    envs, kept = made(task), []
+    kept = [hold(infos, number) for number, infos in enumerate(infos_of(envs))]
+    envs.close()
+    for infos, wanted in zip(kept, told(task), strict=True):
+        require_same_form(
+            {name: infos[name] for name in wanted if name in infos},
+            {name: value for name, value in wanted.items() if name in infos},
+        )
+
+
+@pytest.mark.parametrize("form", [lambda row: row, lambda row: row[...], memoryview])
+@pytest.mark.parametrize("task", TASKS)
+def test_single_observations_that_are_held_do_not_change(task, form):
+    envs, kept = made(task), []
+    for infos in infos_of(envs):
+        kept += [form(row) for row in observations_in(infos["final_obs"])]
+    envs.close()
+    wanted = [row for infos in told(task) for row in observations_in(infos["final_obs"])]
+    for mine, other in zip(kept, wanted, strict=True):
+        require_equal(np.asarray(mine), other)
+
+
+def reshape(row):
+    row.shape = (row.size, 1, 1)
+
+
+def retype(row):
+    row.dtype = np.uint8
+
+
+def protect(row):
+    row.flags.writeable = False
+
+
+def grow(row):
+    row.resize(1000, refcheck=False)
+
+
+def refer(row):
+    row_references.append(weakref.ref(row))
+
+
+row_references = []
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("change", [reshape, retype, protect, grow, refer])
+@pytest.mark.filterwarnings("ignore:Setting the:DeprecationWarning")
+def test_changes_in_place_do_not_come_back(task, change):
+    expected, envs = iter(told(task)), made(task)
+    for infos in infos_of(envs):
+        require_same_form(final(infos), next(expected))
+        for row in observations_in(infos["final_obs"]):
+            assert row.flags.writeable
+            assert row.flags.owndata
+            assert weakref.getweakrefcount(row) == 0
+            change(row)
+        del infos, row
+    envs.close()
+
+
+class Calling:
+    """An object that lets the environments step when nobody refers to it any more."""
+
+    def __init__(self, envs):
+        self.envs = envs
+
+    def __del__(self):
+        if not self.envs.closed:
+            self.envs.step(self.envs.action_space.sample())
+
+
+FOREIGN = {
+    "number": lambda envs: 7,
+    "other type": lambda envs: np.zeros(4),
+    "other size": lambda envs: np.zeros(1, np.float32),
+    "view": lambda envs: np.zeros((9, 4), np.float32)[3],
+    "dict": lambda envs: {"state": 7, 3: np.zeros(2, np.float32)},
+    "object that steps": Calling,
+}
+
+
+@pytest.mark.parametrize("task", [CART_POLE, Named])
+@pytest.mark.parametrize("make", FOREIGN.values(), ids=FOREIGN)
+def test_objects_of_the_caller_do_not_come_back(task, make):
+    envs, own = made(task), set()
+    for infos in infos_of(envs):
+        objects, mask = infos["final_obs"], infos["_final_obs"]
+        own |= {type(value) for value in objects}
+        assert [value is not None for value in objects] == mask.tolist()
+        for row in observations_in(objects):
+            assert row.base is None
+            assert np.isfinite(row).all()
+        objects[:] = [make(envs) for _ in objects]
+        del infos, objects, mask, row
+    assert own == {type(None), dict if task is Named else np.ndarray}
+    envs.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_copies_are_plain_and_equal(task):
+    envs = made(task)
+    for infos in infos_of(envs):
+        for copied in (copy.deepcopy(infos), pickle.loads(pickle.dumps(infos))):
+            assert type(copied) is dict
+            require_same_form(copied, infos)
+    envs.close()
+
+
+@pytest.mark.parametrize("task", [CART_POLE, Named])
+@pytest.mark.parametrize("holds", [False, True])
+def test_nothing_leaks(task, holds):
+    envs = made(task, 12)
+    watched = (None, True, False, "final_obs", "_final_obs", "final_info", "drawn", "state")
+
+    def play():
+        kept = [infos for infos in infos_of(envs, 400) if holds]
+        assert holds == bool(kept)
+        del kept
+        gc.collect()
+        return [sys.getrefcount(value) for value in watched], len(gc.get_objects())
+
+    play()
+    play()
+    tracemalloc.start()
+    first, (before, objects), size = play(), play(), tracemalloc.get_traced_memory()[0]
+    (after, left), later = play(), tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert first
+    assert all(abs(b - a) < 50 for a, b in zip(before, after, strict=True))
+    assert abs(left - objects) < 50
+    assert abs(later - size) < 10_000
+    envs.close()
+
+
+class Empty:
+    """``numpy.empty`` that fails at one of its calls."""
+
+    def __init__(self):
+        self.left, self.error = -1, MemoryError
+
+    def __call__(self, *args):
+        self.left -= 1
+        if self.left == 0:
+            raise self.error("as if memory ran out")
+        return np.empty(*args)
+
+
+def with_empty(task, empty, monkeypatch):
+    """Environments for which the extension makes arrays with a function like ``numpy.empty``."""
+    envs = made(task)
+    prepare = envs._pool.prepare_play
+
+    def with_other(*parts):
+        results = (empty, *parts[-1]["results"][1:])
+        return prepare(*parts[:-1], parts[-1] | {"results": results})
+
+    monkeypatch.setattr(envs._pool, "prepare_play", with_other)
+    envs._engine._prepare(envs._engine._task)
+    envs.reset(seed=0)
+    return envs
+
+
+@pytest.mark.parametrize("task", [CART_POLE, Named])
+@pytest.mark.parametrize("error", [MemoryError, KeyboardInterrupt])
+def test_an_exception_on_the_way_leaves_everything_in_order(task, error, monkeypatch):
+    empty, expected, failures = Empty(), told(task), 0
+    envs = with_empty(task, empty, monkeypatch)
+    empty.error = error
+    for call in range(1, 40, 2):
+        kept, empty.left = [], call
+        with contextlib.suppress(error):
+            kept.extend(infos_of(envs))
+        if empty.left <= 0 and len(kept) < len(expected):
+            failures += 1
+            with pytest.raises(SimulationError, match="call reset"):
+                envs.step(envs.action_space.sample())
+        empty.left = -1
+        for infos, wanted in zip(kept, expected, strict=False):
+            require_same_form(final(infos), wanted)
+        del kept
+        envs.reset(seed=0)
+        for infos, wanted in zip(infos_of(envs), expected, strict=True):
+            require_same_form(final(infos), wanted)
+        envs.reset(seed=0)
+    assert failures > 7
+    envs.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_arrays_that_cannot_be_looked_into(task, monkeypatch):
+    """Then each array is a new one."""
+    expected = told(task)
+    envs = with_empty(
+        task, lambda shape, dtype=float: np.empty((1, *np.atleast_1d(shape)), dtype)[0], monkeypatch
+    )
+    for infos, wanted in zip(infos_of(envs), expected, strict=True):
+        require_same_form(final(infos), wanted)
+    envs.close()

@@ -1,0 +1,182 @@
+"""Episode variables: which hooks write them, and which types they have in each way of calling."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from test_single_compiled import require_same, with_hooks
+from vector_tools import BACKENDS, Drawing, require_pair_equal
+
+import fmugym
+from fmugym import Uniform
+from fmugym.vector import FMUVectorEnv
+
+needs_native = pytest.mark.skipif("native" not in BACKENDS, reason="the extension is not built")
+
+
+class Summing(Drawing):
+    """Adds to variables in place, as one writes sums in Python."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"sum": 0.0, "left": Uniform(0.0, 1.0), "count": 0})
+
+    def _update(self):
+        self.variables["sum"] += self.state[0]
+        self.variables["left"] -= 0.1 * self.state[1]
+        self.variables["count"] += 1
+
+    def _reward_policy(self):
+        return self.variables["sum"] + self.variables["left"] * self.variables["count"]
+
+
+@needs_native
+def test_sums_in_place_are_compiled():
+    """``+=`` changes an array in place, where a number is replaced."""
+    for mode in AutoresetMode:
+        assert require_pair_equal(Summing, steps=20, mode=mode, hooks="compiled") > 5
+
+
+class Aliasing(Summing):
+    """Keeps what a sum was: on arrays, it changes with the sum."""
+
+    def _update(self):
+        before = self.variables["sum"]
+        self.variables["sum"] += self.state[0]
+        self.variables["left"] = self.variables["sum"] - before
+
+
+def test_a_sum_in_place_that_is_still_read_is_not_taken_for_its_old_value():
+    assert require_pair_equal(Aliasing, hooks="auto") > 5
+    with pytest.raises(fmugym.ConfigError, match="_update"):
+        FMUVectorEnv(Aliasing, 2, hooks="array")
+
+
+class Changing(Drawing):
+    """``_update`` assigns types that cannot hold all values that episodes start with."""
+
+    def __init__(self):
+        starts = {"level": 0.5, "drawn": Uniform(-1.0, 1.0), "last": 0.1, "past": [0.1, 2.0]}
+        super().__init__(episode_variables=starts | {"on": 1.0, "mode": 3.0})
+
+    def _update(self):
+        high = self.state[0] > 0.0
+        self.variables["level"] = np.where(high, 1, 2)
+        self.variables["drawn"] = np.where(high, 1, 2)
+        self.variables["last"] = np.float32(0.5) * self.action[0]
+        self.variables["past"] = np.stack([self.action[0], self.action[0]])
+        self.variables["on"] = high
+        self.variables["mode"] = np.where(high, 4, 5)
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (7,), np.float64)
+
+    def _get_observation(self):
+        level, drawn, last, past, on, mode = self.variables.values()
+        parts = [level, drawn, last, past[0], past[1], on, mode]
+        return np.stack([0.0 * self.state[0] + part for part in parts])
+
+
+@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
+@pytest.mark.parametrize("hooks", ["array", *(["compiled"] if "native" in BACKENDS else [])])
+def test_each_episode_starts_with_the_whole_value(mode, hooks):
+    """The first episode and later ones, while others have other types."""
+    assert require_pair_equal(Changing, steps=20, mode=mode, hooks=hooks) > 5
+
+
+def writing(hook):
+    """A class whose hook writes an episode variable that the reward reads."""
+
+    class Writing(Drawing):
+        def __init__(self):
+            super().__init__(episode_variables={"n": 0.5})
+
+        def _reward_policy(self):
+            return 2.0 * self.variables["n"] - self.state[0]
+
+    good = getattr(Writing, hook)
+
+    def write(self):
+        result = good(self)
+        self.variables["n"] = 0.5 * self.variables["n"] + 1.0
+        return result
+
+    setattr(Writing, hook, write)
+    return Writing
+
+
+HOOKS = ("_get_inputs", "_is_done", "_is_truncated", "_reward_policy", "_get_observation")
+
+
+@pytest.mark.parametrize("hook", [*HOOKS, "_get_info"])
+def test_what_another_hook_than_update_writes_is_kept(hook):
+    """Only ``_update`` may do so. Where another hook does, no way of calling it may lose that."""
+    assert require_pair_equal(writing(hook), hooks="auto", steps=20) > 5
+    if hook != "_get_inputs":
+        with pytest.raises(fmugym.ConfigError, match=hook):
+            FMUVectorEnv(writing(hook), 2, hooks="array")
+
+
+@needs_native
+@pytest.mark.parametrize("hook", HOOKS)
+def test_hooks_that_write_variables_are_not_compiled(hook):
+    with pytest.raises(fmugym.ConfigError, match="_update"):
+        FMUVectorEnv(writing(hook), 2, hooks="compiled")
+    with with_hooks(writing(hook), "compiled") as env:
+        env.reset(seed=1)
+        with pytest.raises(fmugym.ConfigError, match="'n'"):
+            env.step(env.action_space.sample())
+
+
+class Queueing(Drawing):
+    """A delay of discrete actions, and a table of pulses that is indexed with what it holds."""
+
+    pulses = np.array([[0, 0, 0, 1], [0, 0, 1, 1], [0, 1, 1, 1], [1, 1, 1, 1]])
+
+    def __init__(self):
+        super().__init__(episode_variables={"queue": [0, 0, 0], "bits": 0, "mode": 1.0})
+
+    def _get_action_space(self):
+        return gym.spaces.MultiDiscrete([4, 2])
+
+    def _get_inputs(self):
+        level = self.pulses[self.variables["queue"][-1].astype(np.int64), self.step_count % 4]
+        return 0.01 * level * (1 - 2 * self.action[1])
+
+    def _update(self):
+        newest = np.stack([self.action[0]])
+        self.variables["queue"] = np.concatenate([newest, self.variables["queue"][:-1]])
+        self.variables["bits"] = (self.action[0] << self.step_count % 3) + (self.step_count << 1)
+        self.variables["mode"] = np.where(self.state[0] > 0.0, 1.5, self.variables["mode"])
+
+    def _reward_policy(self):
+        whole, rest = divmod(self.step_count, 3)
+        return np.cumsum(self.variables["queue"])[-1] - self.variables["bits"] + whole / (1 + rest)
+
+
+@needs_native
+def test_a_variable_that_is_an_index_is_compiled_in_one_environment():
+    """In random states it is outside of its table; hooks in Python would raise there, too."""
+    compiled, ended = require_same(lambda hooks: with_hooks(Queueing, hooks), steps=60)
+    assert compiled > 30
+    assert ended > 5
+
+
+class Mixed(Drawing):
+    """Actions in parts."""
+
+    def _get_action_space(self):
+        torque = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        return gym.spaces.Dict(torque=torque, gear=gym.spaces.Tuple([gym.spaces.Discrete(3)]))
+
+    def _get_inputs(self):
+        return 0.01 * self.action["torque"][0] * self.action["gear"][0]
+
+    def _reward_policy(self):
+        return self.previous_action["gear"][0] - self.previous_action["torque"][1]
+
+
+def test_before_the_first_action_in_parts_are_zeros():
+    assert require_pair_equal(Mixed, hooks="auto", steps=8) > 0
+    with Mixed() as env:
+        env.reset(seed=1)
+        assert env.step(env.action_space.sample())[1] == 0.0
