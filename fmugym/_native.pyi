@@ -315,9 +315,7 @@ class Pool:
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
-    def play(
-        self, actions: Array, drawn: Array | None, /
-    ) -> tuple[Any, int, bool, tuple[Array, Array, tuple[Array, ...]] | None]:
+    def play(self, actions: Array, drawn: Array | None, /) -> tuple[Any, int, bool, Array | None]:
         """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
 
         Raises:

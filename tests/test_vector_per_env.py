@@ -1,5 +1,7 @@
 """Hooks that are called one environment at a time: what comes of their observations and inputs."""
 
+import signal
+
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -83,6 +85,54 @@ class Stepping(Drawing):
     def step(self, action):
         _, *rest = super().step(action)
         return self.observed, *rest
+
+
+class RingError(Exception):
+    """What the handler of a signal raises."""
+
+
+class Ringing(list):
+    """A signal comes while this is converted."""
+
+    def __array__(self, *_, **__):
+        signal.raise_signal(signal.SIGTERM)
+
+    def __getitem__(self, _):
+        signal.raise_signal(signal.SIGTERM)
+
+    __len__ = __iter__ = keys = lambda self: self[0]
+
+
+@pytest.fixture
+def handler():
+    """Let a signal raise ``RingError``."""
+
+    def ring(*_):
+        raise RingError
+
+    before = signal.signal(signal.SIGTERM, ring)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_what_a_signal_handler_raises_in_a_conversion_comes_out(handler, monkeypatch):
+    envs = FMUVectorEnv(Stepping, 2, hooks="per_env")
+    envs.reset(seed=0)
+    monkeypatch.setattr(Stepping, "observed", Ringing())
+    with pytest.raises(RingError):
+        envs.step(np.zeros((2, 1), np.float32))
+    envs.close()
+
+
+@pytest.mark.parametrize("cls", [SharedArray, OfOtherTypes])
+def test_so_it_does_in_a_single_environment(cls, handler, monkeypatch):
+    """``OfOtherTypes`` observes a dict."""
+    env = cls()
+    env.reset(seed=0)
+    monkeypatch.setattr(cls, "_get_observation", lambda self: Ringing())
+    with pytest.raises(RingError):
+        env.step(np.zeros(1, np.float32))
+    env.close()
 
 
 @pytest.mark.parametrize("observed", [np.zeros(3, np.float32), np.zeros(1), "text", 2**70, None])

@@ -1,6 +1,7 @@
 """The arrays that compiled steps return belong to the caller, also where memory is used again."""
 
 import contextlib
+import functools
 import gc
 import weakref
 
@@ -182,27 +183,41 @@ TOLD = "drawn", "_drawn", *LateDict.parts(dict, None)
 
 
 def test_results_that_fit_are_taken(monkeypatch):
-    require_refused((np.empty, tuple, None, ARRAYS, TOLD), monkeypatch, refused=False)
+    require_refused((np.empty, tuple, 0, (), ARRAYS, TOLD), monkeypatch, refused=False)
 
 
 @pytest.mark.parametrize(
     "results",
     [
-        (np.empty, tuple, None, (), TOLD),
-        (np.empty, tuple, None, ARRAYS[:-1], TOLD),
-        (np.empty, tuple, None, ARRAYS[:3], TOLD),
-        (np.empty, tuple, None, (((3, 5), np.float32), *ARRAYS[1:]), TOLD),
-        (np.empty, tuple, None, (SEEN, ((3,), np.float32), *ARRAYS[2:]), TOLD),
-        (np.empty, tuple, None, (*ARRAYS[:-2], ((4,), bool), DRAWN), TOLD),
-        (np.empty, tuple, None, (*ARRAYS[:-1], ((5, 3), float)), TOLD),
-        (np.empty, tuple, ("a", "b"), ARRAYS, TOLD),
-        (np.empty, dict, None, ARRAYS, TOLD),
-        (np.empty, tuple, None, 7, TOLD),
-        ("empty", tuple, None, ARRAYS, TOLD),
-        (np.empty, tuple, None, ARRAYS),
-        (np.empty, tuple, None, ARRAYS, TOLD[:-1]),
-        (np.empty, tuple, None, ARRAYS, ("drawn", "_drawn", list, *TOLD[3:])),
-        (np.empty, tuple, None, ARRAYS, ("drawn", 7, *TOLD[2:])),
+        (np.empty, tuple, 0, (), (), TOLD),
+        (np.empty, tuple, 0, (), ARRAYS[:-1], TOLD),
+        (np.empty, tuple, 0, (), ARRAYS[:3], TOLD),
+        (np.empty, tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), TOLD),
+        (np.empty, tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), TOLD),
+        (np.empty, tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), TOLD),
+        (np.empty, tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), TOLD),
+        (np.empty, tuple, (("a", 0), ("b", 1)), (), ARRAYS, TOLD),
+        (np.empty, dict, 0, (), ARRAYS, TOLD),
+        (np.empty, tuple, 0, (), 7, TOLD),
+        (np.empty, tuple, 9, (), ARRAYS, TOLD),
+        (np.empty, tuple, None, (), ARRAYS, TOLD),
+        (np.empty, tuple, 0, 0, ARRAYS, TOLD),
+        (np.empty, tuple, 0, (("a", 1),), ARRAYS, TOLD),
+        (np.empty, tuple, 0, (("a",),), ARRAYS, TOLD),
+        (np.empty, tuple, 0, ("ab",), ARRAYS, TOLD),
+        (
+            np.empty,
+            tuple,
+            functools.reduce(lambda form, _: (("a", form),), range(999), 0),
+            (),
+            ARRAYS,
+            TOLD,
+        ),
+        ("empty", tuple, 0, (), ARRAYS, TOLD),
+        (np.empty, tuple, 0, (), ARRAYS),
+        (np.empty, tuple, 0, (), ARRAYS, TOLD[:-1]),
+        (np.empty, tuple, 0, (), ARRAYS, ("drawn", "_drawn", list, *TOLD[3:])),
+        (np.empty, tuple, 0, (), ARRAYS, ("drawn", 7, *TOLD[2:])),
     ],
 )
 def test_results_that_do_not_fit_are_refused(results, monkeypatch):

@@ -59,12 +59,12 @@ class Initialization:
         values = self._collected(set_start_values)
         key = KeptStart.key_of(span.start_time, values)
         if self.kept.known and key == self.kept.key:
-            if self._has_begun_again(span, values):
+            if self._begin_again(span, values):
                 return
             self._give_up()
             values = self._collected(set_start_values)
         self._begin_all(span, values)
-        if self.kept.next(key) and not self._has_kept_states():
+        if self.kept.next(key) and not self._keep_states():
             self._give_up()
             self._begin_all(span, self._collected(set_start_values))
 
@@ -85,7 +85,7 @@ class Initialization:
         self._begin_from(0, span, values)
         self._parts.refresh()
 
-    # Some components return to the kept start, the others begin with their inputs of then.
+    # Some components return to the kept start. The others begin with the inputs that are kept.
 
     @property
     def _restoring(self) -> list[int]:
@@ -98,17 +98,18 @@ class Initialization:
         restoring = self._restoring
         return [index for index in range(len(self._parts.all)) if index not in restoring]
 
-    def _has_begun_again(self, span: Span, values: list[Any]) -> bool:
+    def _begin_again(self, span: Span, values: list[Any]) -> bool:
+        """Return to the kept start; False if that failed or led elsewhere."""
         others = self.others
         try:
             self._restore_start()
             self._begin_others(others, span, values)
         except (FailedError, SimulationError):
             return False
-        return not self._blamed()
+        return not self._blame_different()
 
-    def _blamed(self) -> bool:
-        """Restore those no more whose outputs are others than then; returns whether any are."""
+    def _blame_different(self) -> bool:
+        """Restore those no more whose outputs differ from the kept ones; False if none differ."""
         now, then = (np.frombuffer(slots) for slots in (self._parts.slots()[1], self.kept.slots[1]))
         if now.tobytes() == then.tobytes():
             return False
@@ -149,7 +150,8 @@ class Initialization:
                 first = route.target - part.layout.first_input
                 self._write_target(route, part.inputs.values[first : first + route.count].tolist())
 
-    def _has_kept_states(self) -> bool:
+    def _keep_states(self) -> bool:
+        """Save the states of those that restore; False if one cannot."""
         try:
             for index in self._restoring:
                 with self._restoring_part(index):
@@ -160,7 +162,7 @@ class Initialization:
         return True
 
     def _give_up(self) -> None:
-        """Return all that do not restore to where they were made."""
+        """Forget the kept start, and reset the components that do not restore."""
         self.kept.forget()
         for index in self.others:
             self._reset_part(index)

@@ -20,7 +20,6 @@ __all__ = [
     "DEFAULT_CALL_TIMEOUT",
     "ISOLATIONS",
     "FloatArray",
-    "Followed",
     "MaskArray",
     "Played",
     "Pool",
@@ -35,10 +34,7 @@ FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
 
-Followed = tuple[MaskArray, FloatArray, tuple[npt.NDArray[Any], ...]]
-"""Where episodes have started in the step that ended others, what they have drawn, and the last
-observations of the others."""
-Played = tuple[Any, int, bool, Followed | None]
+Played = tuple[Any, int, bool, MaskArray | None]
 """What a step with compiled hooks returns; see ``NativePool.prepare_play``."""
 
 P = ParamSpec("P")

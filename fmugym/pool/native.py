@@ -534,11 +534,12 @@ class NativePool(SavingPool):
                 ``variable_starts``, rows and the bytes of their constants; ``input_starts``, for
                 each input the number of a start value, or -1 and a constant. ``results``, None if
                 only rollouts follow, or a tuple of ``numpy.empty``; the class of a step's result, a
-                tuple; what the observations are, an array (None), a dict (its keys) or a tuple (an
-                empty one); the shape and type of each array: float32 observations, or those that
-                the second program stores, then rewards, terminated and truncated of a step, and
-                mask and drawn values (draws, N) of a reset; and the parts of a reset's infos: the
-                names of the drawn values and of the mask, and what ``LateDict.parts`` returns.
+                tuple; the forms of observations and of infos, each the number of an array, or a
+                tuple of names and forms; the shape and type of each array: float32 observations, or
+                those that the second program stores, then rewards, terminated and truncated of a
+                step, and mask and drawn values (draws, N) of a reset; and the parts of a reset's
+                infos: the names of the drawn values and of the mask, and what ``LateDict.parts``
+                returns.
 
         Returns:
             A function of actions and drawn values (draws, N). It does a step and fills the drawn
@@ -546,11 +547,9 @@ class NativePool(SavingPool):
             an episode that ends without a fault is followed by the next in the same step, otherwise
             in the next step. It returns the result; how many instances had trouble (a status worse
             than a warning, or numbers that are not finite); whether any episode has ended that was
-            not followed; and None or, if some were followed, for which environments (N,), what the
-            next ones have drawn (draws, N), and the arrays with the last observations of those that
-            have ended. The infos of the result are empty unless some were followed; then they are
-            those of Gymnasium's mode ``SAME_STEP``, but empty with a tuple of observations. All
-            arrays are new, or those of an earlier step that nobody holds any more.
+            not followed; and None or, if some were followed, for which environments, shape (N,).
+            The infos of the result are then those of Gymnasium's mode ``SAME_STEP``. All arrays are
+            new, or those of an earlier step that nobody holds any more.
         """
         start = self._access(variables)
         prepare(self._pool, start, programs, actions, start_values, draws, episodes, surroundings)

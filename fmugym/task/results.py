@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import is_of_signal_handler
 
 __all__ = [
     "FLOAT32_LIMIT",
@@ -151,7 +152,9 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
         try:
             fits = observation.keys() == parts.keys()
-        except Exception:  # not a mapping, or its methods fail
+        except Exception as error:  # not a mapping, or its methods fail
+            if is_of_signal_handler(error):
+                raise
             fits = False
         if not fits:
             raise ConfigError(
@@ -206,7 +209,9 @@ def _numbers(observation: Any, kinds: str) -> np.ndarray[Any, Any]:
     given(observation, _OBSERVE)
     try:
         array = np.asarray(observation)
-    except Exception:  # ragged lists, or objects whose methods fail
+    except Exception as error:  # ragged lists, or objects whose methods fail
+        if is_of_signal_handler(error):
+            raise
         array = np.asarray(None)
     if array.dtype.kind not in kinds:
         raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")

@@ -108,7 +108,7 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
             logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
             return Verdict()
         notes.add(outcome)
-        notes.require_licence(name, outcome)
+        _require_licence(name, outcome)
         if "finished" in outcome.answer:
             break
         if "complete" not in outcome.answer:
@@ -153,8 +153,25 @@ def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -
         return Grade.FAILS
     spec = replace(request.spec, blind_start=verdict.blind_start)
     outcome = run(replace(request, spec=spec, sample=pickle.loads(sample)))
-    _Notes().require_licence(request.candidate.path.name, outcome)
+    _require_licence(request.candidate.path.name, outcome)
     return Grade(outcome.answer.get("states", Grade.FAILS))
+
+
+def _require_licence(name: str, outcome: Outcome) -> None:
+    """Give up if an instance got no licence: this tells nothing about the FMU itself.
+
+    Raises:
+        LicenceError: With the FMU's words.
+    """
+    answer, said = outcome.answer, outcome.said
+    words = answer.get("refused", "")
+    if "finished" not in answer and "complete" in answer and speaks_of_licence(said):
+        words = f"it {outcome.end}{said}"
+    if words:
+        raise LicenceError(
+            f"{name} got no licence in its trial, which used {answer['instances']} "
+            f"instance(s) at once: {words}"
+        )
 
 
 class _Notes:
@@ -193,22 +210,6 @@ class _Notes:
             reasons=(FRUGAL,) * bool(answer.get("frugal"))
             + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
         )
-
-    def require_licence(self, name: str, outcome: Outcome) -> None:
-        """Give up if an instance got no licence: this tells nothing about the FMU itself.
-
-        Raises:
-            LicenceError: With the FMU's words.
-        """
-        answer, said = outcome.answer, outcome.said
-        words = answer.get("refused", "")
-        if "finished" not in answer and "complete" in answer and speaks_of_licence(said):
-            words = f"it {outcome.end}{said}"
-        if words:
-            raise LicenceError(
-                f"{name} got no licence in its trial, which used {answer['instances']} "
-                f"instance(s) at once: {words}"
-            )
 
     def died_alone(self, name: str, must_survive: bool) -> Verdict:
         """Report that even a lone instance dies, or that it needs a separate process.

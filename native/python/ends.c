@@ -20,7 +20,7 @@ typedef struct {
 struct Observed {
     const Numpy *numpy;
     size_t count;
-    PyObject *names;
+    const Form *form;
     size_t number_of_rows;
     Maker objects;
     RowMaker *rows;
@@ -70,7 +70,7 @@ static bool take_objects(Observed *o) {
 static bool take_all(Observed *o, const Maker *arrays) {
     bool good = take_objects(o);
 
-    o->rows = calloc(o->number_of_rows, sizeof *o->rows);
+    o->rows = calloc(o->number_of_rows + 1, sizeof *o->rows);
     if (o->rows == NULL && good) {
         PyErr_NoMemory();
         good = false;
@@ -81,15 +81,16 @@ static bool take_all(Observed *o, const Maker *arrays) {
     return good;
 }
 
-Observed *observed_take(const Numpy *numpy, const Maker *arrays, size_t count, PyObject *names) {
+Observed *observed_take(const Numpy *numpy, const Maker *arrays, size_t number_of_arrays,
+                        size_t count, const Form *form) {
     Observed *o = calloc(1, sizeof *o);
 
     if (o == NULL) {
         PyErr_NoMemory();
         return NULL;
     }
-    *o = (Observed){.numpy = numpy, .count = count, .names = names};
-    o->number_of_rows = names == Py_None ? 1 : (size_t)PyTuple_Size(names);
+    *o = (Observed){
+        .numpy = numpy, .count = count, .form = form, .number_of_rows = number_of_arrays};
     if (!take_all(o, arrays)) {
         observed_free(o);
         return NULL;
@@ -130,27 +131,29 @@ static void keep(RowMaker *row, const Numpy *numpy, PyObject *object) {
     }
 }
 
-static void keep_items(Observed *o, PyObject *dict) {
+static void take_back(Observed *o, const Form *form, PyObject *object);
+
+static void take_back_items(Observed *o, const Form *form, PyObject *dict) {
     PyObject *items[MOST_SEEN];
 
-    for (size_t i = 0; i < o->number_of_rows; i++) {
-        items[i] = PyDict_GetItemWithError(dict, PyTuple_GetItem(o->names, (Py_ssize_t)i));
+    for (size_t i = 0; i < form->count; i++) {
+        items[i] = PyDict_GetItemWithError(dict, form->items[i].name);
         Py_XINCREF(items[i]);
         PyErr_Clear(); /* a key of the caller's cannot be compared */
     }
     Py_DECREF(dict);
-    for (size_t i = 0; i < o->number_of_rows; i++) {
+    for (size_t i = 0; i < form->count; i++) {
         if (items[i] != NULL) {
-            keep(&o->rows[i], o->numpy, items[i]);
+            take_back(o, &form->items[i], items[i]);
         }
     }
 }
 
-static void take_back(Observed *o, PyObject *object) {
-    if (o->names == Py_None) {
-        keep(&o->rows[0], o->numpy, object);
-    } else if (PyDict_CheckExact(object) && Py_REFCNT(object) == 1) {
-        keep_items(o, object);
+static void take_back(Observed *o, const Form *form, PyObject *object) {
+    if (form->is_array) {
+        keep(&o->rows[form->array], o->numpy, object);
+    } else if (PyDict_CheckExact(object) && Py_REFCNT(object) == 1 && form->count <= MOST_SEEN) {
+        take_back_items(o, form, object);
     } else {
         Py_DECREF(object);
     }
@@ -162,7 +165,7 @@ static void clear(Observed *o, PyObject **objects) {
         if (object != Py_None) {
             objects[i] = Py_NewRef(Py_None); /* first, because the end of an object may call back */
             if (object != NULL) {
-                take_back(o, object);
+                take_back(o, o->form, object);
             }
         }
     }
@@ -195,16 +198,20 @@ static PyObject *row_of(RowMaker *row, const Numpy *numpy, size_t index, PyObjec
     return array;
 }
 
-static PyObject *dict_of(Observed *o, size_t index, PyObject *const *arrays, char *const *memory) {
-    PyObject *dict = PyDict_New();
+static PyObject *seen_by(Observed *o, const Form *form, size_t index, PyObject *const *arrays,
+                         char *const *memory) {
+    const size_t array = form->array;
 
-    for (size_t i = 0; i < o->number_of_rows && dict != NULL; i++) {
-        PyObject *name = PyTuple_GetItem(o->names, (Py_ssize_t)i);
-        PyObject *row = row_of(&o->rows[i], o->numpy, index, arrays[i], memory[i]);
-        if (row == NULL || PyDict_SetItem(dict, name, row) < 0) {
+    if (form->is_array) {
+        return row_of(&o->rows[array], o->numpy, index, arrays[array], memory[array]);
+    }
+    PyObject *dict = PyDict_New();
+    for (size_t i = 0; i < form->count && dict != NULL; i++) {
+        PyObject *item = seen_by(o, &form->items[i], index, arrays, memory);
+        if (item == NULL || PyDict_SetItem(dict, form->items[i].name, item) < 0) {
             Py_CLEAR(dict);
         }
-        Py_XDECREF(row);
+        Py_XDECREF(item);
     }
     return dict;
 }
@@ -215,9 +222,7 @@ static bool fill(Observed *o, PyObject **objects, const char *mask, PyObject *co
 
     for (const char *at = mask; (at = memchr(at, 1, (size_t)(end - at))) != NULL; at++) {
         const size_t index = (size_t)(at - mask);
-        PyObject *seen = o->names == Py_None
-                             ? row_of(&o->rows[0], o->numpy, index, arrays[0], memory[0])
-                             : dict_of(o, index, arrays, memory);
+        PyObject *seen = seen_by(o, o->form, index, arrays, memory);
         if (seen == NULL) {
             return false;
         }

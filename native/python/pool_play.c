@@ -155,23 +155,20 @@ static void settle_starts(const Playing *playing, const ResultArrays *arrays, Py
 }
 
 /* The result, how many instances had trouble, whether any episode is at its end now, and None or
- * what is known of those that have started where others have ended. */
+ * where episodes have started that follow others. */
 static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
     const bool any_started = t->ends.started > 0;
     PyObject *result = results_of_step(playing->results, arrays, any_started);
-    PyObject *starts = result == NULL || !any_started ? Py_NewRef(Py_None)
-                                                      : results_starts(playing->results, arrays);
-    PyObject *tuple = result == NULL || starts == NULL ? NULL : PyTuple_New(4);
+    PyObject *tuple = result == NULL ? NULL : PyTuple_New(4);
 
     if (tuple == NULL) {
-        Py_XDECREF(starts);
         Py_XDECREF(result);
         return NULL;
     }
     PyTuple_SetItem(tuple, 0, result);
     PyTuple_SetItem(tuple, 1, PyLong_FromSize_t(t->troubled));
     PyTuple_SetItem(tuple, 2, PyBool_FromLong(t->ends.ended > t->ends.started));
-    PyTuple_SetItem(tuple, 3, starts);
+    PyTuple_SetItem(tuple, 3, Py_NewRef(any_started ? arrays->arrays[MASK_ARRAY] : Py_None));
     return tuple;
 }
 

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "ends.h"
+#include "infos.h"
 
 static const char *const NAMES_AT_ENDS[] = {"final_obs", "_final_obs", "final_info", "_final_info"};
 
@@ -18,14 +19,16 @@ typedef struct {
 } Telling;
 
 struct Results {
-    PyObject *parts, *names;
+    PyObject *parts;
     PyTypeObject *class;
     allocfunc allocate;
     Telling telling;
     Numpy numpy;
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
-    Observed *observed; /* NULL where the caller replaces the tuple of observations */
+    Form observations, told; /* the second one of infos */
+    Observed *observed;
+    Infos *infos;
     PyObject *names_at_ends[NAMES];
 };
 
@@ -58,16 +61,15 @@ static bool take_makers(Results *r, PyObject *shapes) {
     return take_further_masks(r);
 }
 
-static bool take_names(Results *r, PyObject *names) {
-    const bool fits = names == Py_None ? r->number_of_seen == 1
-                                       : PyTuple_Check(names) &&
-                                             (PyTuple_Size(names) == 0 ||
-                                              (size_t)PyTuple_Size(names) == r->number_of_seen);
-    r->names = names;
-    if (!fits) {
-        PyErr_SetString(PyExc_ValueError, "the names do not fit the arrays of observations");
+static bool take_forms(Results *r, PyObject *observations, PyObject *told) {
+    if (!form_take(&r->observations, observations, r->number_of_seen) ||
+        !form_take(&r->told, told, r->number_of_seen)) {
+        return false;
     }
-    return fits;
+    if (r->told.is_array) {
+        PyErr_SetString(PyExc_TypeError, "infos are no array");
+    }
+    return !r->told.is_array;
 }
 
 static bool take_class(Results *r) {
@@ -93,31 +95,32 @@ static bool take_telling(Telling *t, PyObject *parts) {
     return t->no_arguments != NULL;
 }
 
-static bool is_replaced(const Results *r) {
-    return r->names != Py_None && PyTuple_Size(r->names) == 0;
-}
-
 static bool take_ends(Results *r) {
+    const Maker *mask = &r->makers[MASK_ARRAY];
+
     for (size_t i = 0; i < NAMES; i++) {
         r->names_at_ends[i] = PyUnicode_InternFromString(NAMES_AT_ENDS[i]);
         if (r->names_at_ends[i] == NULL) {
             return false;
         }
     }
-    if (!is_replaced(r)) {
-        r->observed =
-            observed_take(&r->numpy, r->last, r->makers[MASK_ARRAY].size, r->names);
+    r->observed =
+        observed_take(&r->numpy, r->last, r->number_of_seen, mask->size, &r->observations);
+    if (r->observed == NULL) {
+        return false;
     }
-    return is_replaced(r) || r->observed != NULL;
+    r->infos = infos_take(&r->numpy, r->makers, r->number_of_seen, mask, &r->told);
+    return r->infos != NULL;
 }
 
 static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *empty, *names, *shapes, *telling;
+    PyObject *empty, *observations, *told, *shapes, *telling;
 
-    return PyArg_ParseTuple(parts, "OO!OO!O!;results", &empty, &PyType_Type, &r->class, &names,
-                            &PyTuple_Type, &shapes, &PyTuple_Type, &telling) &&
+    return PyArg_ParseTuple(parts, "OO!OOO!O!;results", &empty, &PyType_Type, &r->class,
+                            &observations, &told, &PyTuple_Type, &shapes, &PyTuple_Type,
+                            &telling) &&
            take_class(r) && numpy_look(&r->numpy, empty) && take_makers(r, shapes) &&
-           take_names(r, names) && take_telling(&r->telling, telling) && take_ends(r);
+           take_forms(r, observations, told) && take_telling(&r->telling, telling) && take_ends(r);
 }
 
 Results *results_take(PyObject *parts) {
@@ -142,6 +145,9 @@ void results_free(Results *r) {
         return;
     }
     observed_free(r->observed);
+    infos_free(r->infos);
+    form_drop(&r->observations);
+    form_drop(&r->told);
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
         maker_drop(&r->makers[i]);
     }
@@ -233,33 +239,6 @@ bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) 
 
 /* Returning */
 
-static PyObject *dict_of(const Results *r, const ResultArrays *a) {
-    PyObject *dict = PyDict_New();
-
-    for (size_t i = 0; i < r->number_of_seen && dict != NULL; i++) {
-        if (PyDict_SetItem(dict, PyTuple_GetItem(r->names, (Py_ssize_t)i), a->arrays[i]) < 0) {
-            Py_CLEAR(dict);
-        }
-    }
-    return dict;
-}
-
-static PyObject *tuple_of(const Results *r, PyObject *const *arrays) {
-    PyObject *tuple = PyTuple_New((Py_ssize_t)r->number_of_seen);
-
-    for (size_t i = 0; i < r->number_of_seen && tuple != NULL; i++) {
-        PyTuple_SetItem(tuple, (Py_ssize_t)i, Py_NewRef(arrays[i]));
-    }
-    return tuple;
-}
-
-static PyObject *observations_of(const Results *r, const ResultArrays *a) {
-    if (r->names == Py_None) {
-        return Py_NewRef(a->arrays[0]);
-    }
-    return is_replaced(r) ? tuple_of(r, a->arrays) : dict_of(r, a);
-}
-
 /* A dict that calls a function, with these arguments, when somebody reads or writes it. */
 static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
     PyObject *filling = PyTuple_Pack(4, t->fill, t->plan, drawn, mask);
@@ -273,24 +252,19 @@ static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
     return dict;
 }
 
-static PyObject *infos_of_reset(const Telling *t, const ResultArrays *a) {
-    PyObject *mask = a->arrays[MASK_ARRAY], *drawn = late_dict(t, a->arrays[DRAWN_ARRAY], mask);
-    PyObject *infos = drawn == NULL ? NULL : PyDict_New();
-
-    if (infos != NULL && (PyDict_SetItem(infos, t->name, drawn) < 0 ||
-                          PyDict_SetItem(infos, t->name_of_mask, mask) < 0)) {
-        Py_CLEAR(infos);
-    }
-    Py_XDECREF(drawn);
-    return infos;
-}
-
 /* Sets an item to an object, whose reference ends here. */
 static bool add(PyObject *dict, PyObject *name, PyObject *object) {
     const bool added = object != NULL && PyDict_SetItem(dict, name, object) == 0;
 
     Py_XDECREF(object);
     return added;
+}
+
+static bool add_starts(const Telling *t, PyObject *infos, const ResultArrays *a) {
+    PyObject *mask = a->arrays[MASK_ARRAY];
+
+    return add(infos, t->name, late_dict(t, a->arrays[DRAWN_ARRAY], mask)) &&
+           PyDict_SetItem(infos, t->name_of_mask, mask) == 0;
 }
 
 static PyObject *copy_of_mask(Results *r, size_t which, const ResultArrays *a) {
@@ -303,35 +277,45 @@ static PyObject *copy_of_mask(Results *r, size_t which, const ResultArrays *a) {
     return copy;
 }
 
-static PyObject *infos_of_starts(Results *r, const ResultArrays *a) {
-    PyObject *infos = infos_of_reset(&r->telling, a), *const *names = r->names_at_ends;
+static PyObject *final_infos(Results *r, const ResultArrays *a) {
+    PyObject *infos = PyDict_New();
 
     if (infos != NULL &&
-        (!add(infos, names[0], observed_of(r->observed, a->memory[MASK_ARRAY], a->last,
-                                           a->last_memory)) ||
-         !add(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) ||
-         !add(infos, names[2], PyDict_New()) ||
-         !add(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a)))) {
+        !infos_add_masked(r->infos, infos, a->last_memory, a->memory[MASK_ARRAY])) {
         Py_CLEAR(infos);
     }
     return infos;
 }
 
-PyObject *results_starts(const Results *r, const ResultArrays *a) {
-    PyObject *last = tuple_of(r, a->last);
-    PyObject *starts = last == NULL ? NULL
-                                    : PyTuple_Pack(3, a->arrays[MASK_ARRAY],
-                                                   a->arrays[DRAWN_ARRAY], last);
-    Py_XDECREF(last);
-    return starts;
+static PyObject *final_observations(Results *r, const ResultArrays *a) {
+    return observed_of(r->observed, a->memory[MASK_ARRAY], a->last, a->last_memory);
+}
+
+static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
+    PyObject *const *names = r->names_at_ends;
+
+    return add(infos, names[0], final_observations(r, a)) &&
+           add(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) &&
+           add(infos, names[2], final_infos(r, a)) &&
+           add(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a));
+}
+
+static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {
+    PyObject *infos = PyDict_New();
+
+    if (infos != NULL &&
+        (!infos_add(r->infos, infos, a->arrays) ||
+         (any_started && (!add_starts(&r->telling, infos, a) || !add_ends(r, infos, a))))) {
+        Py_CLEAR(infos);
+    }
+    return infos;
 }
 
 /* Makes the tuple without the constructor of its class, which takes several times as long. */
 PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
-    PyObject *observations = observations_of(r, a);
-    PyObject *infos =
-        any_started && r->observed != NULL ? infos_of_starts(r, a) : PyDict_New();
-    PyObject *result = observations == NULL || infos == NULL ? NULL : r->allocate(r->class, 5);
+    PyObject *observations = form_of(&r->observations, a->arrays);
+    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started);
+    PyObject *result = infos == NULL ? NULL : r->allocate(r->class, 5);
 
     if (result == NULL) {
         Py_XDECREF(observations);
@@ -346,9 +330,19 @@ PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
     return result;
 }
 
-PyObject *results_of_reset(const Results *r, const ResultArrays *a) {
-    PyObject *infos = infos_of_reset(&r->telling, a);
-    PyObject *observations = infos == NULL ? NULL : observations_of(r, a);
+static PyObject *infos_of_reset(Results *r, const ResultArrays *a) {
+    PyObject *infos = PyDict_New();
+
+    if (infos != NULL && (!infos_add_masked(r->infos, infos, a->memory, a->memory[MASK_ARRAY]) ||
+                          !add_starts(&r->telling, infos, a))) {
+        Py_CLEAR(infos);
+    }
+    return infos;
+}
+
+PyObject *results_of_reset(Results *r, const ResultArrays *a) {
+    PyObject *infos = infos_of_reset(r, a);
+    PyObject *observations = infos == NULL ? NULL : form_of(&r->observations, a->arrays);
     PyObject *result = observations == NULL ? NULL : PyTuple_Pack(2, observations, infos);
 
     Py_XDECREF(observations);

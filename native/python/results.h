@@ -27,12 +27,11 @@ typedef struct {
     char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
 } ResultArrays;
 
-/* Takes a tuple: the function numpy.empty; the class of a step's result; what the observations are,
- * an array (None), a dict (the tuple of its keys) or a tuple of arrays that the caller replaces (an
- * empty tuple); the shape and type of each array: those of observations and infos, then rewards,
- * terminated, truncated, mask and drawn values; and the parts of a reset's infos: the names of the
- * drawn values and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns NULL with
- * an exception if it does not fit. */
+/* Takes a tuple: the function numpy.empty; the class of a step's result; the forms of observations and
+ * of infos (see forms.h); the shape and type of each array: those of observations and infos, then
+ * rewards, terminated, truncated, mask and drawn values; and the parts of a reset's infos: the names
+ * of the drawn values and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns
+ * NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 
@@ -54,13 +53,9 @@ void results_drop(const Results *results, ResultArrays *arrays);
 bool results_copy_mask(const Results *results, PyObject *mask, const ResultArrays *arrays);
 
 /* Returns the result of a step. If episodes have started where others have ended, the infos are those
- * of Gymnasium's mode SAME_STEP; otherwise they are empty, as they are with a tuple that the caller
- * replaces. */
+ * of Gymnasium's mode SAME_STEP. */
 PyObject *results_of_step(Results *results, const ResultArrays *arrays, bool any_started);
-/* Returns where episodes have started in a step, what they have drawn, and the tuple of arrays of the
- * last observations. */
-PyObject *results_starts(const Results *results, const ResultArrays *arrays);
 /* Returns the observations and infos of a reset. */
-PyObject *results_of_reset(const Results *results, const ResultArrays *arrays);
+PyObject *results_of_reset(Results *results, const ResultArrays *arrays);
 
 #endif

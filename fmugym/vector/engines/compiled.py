@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray, Followed, MaskArray
+from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
 from fmugym.signals import is_of_signal_handler
 from fmugym.task import spaces as fmu_spaces
@@ -23,15 +22,13 @@ from fmugym.vector.actions import checked_actions
 from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.layout import Divided, Layout
+from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.infos import (
-    final_infos,
     not_finite,
-    observations_of,
     restricted,
 )
 from fmugym.vector.streams import given_draws
@@ -47,9 +44,6 @@ _FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.f
 
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
-
-_make_result: Callable[[tuple[Any, ...]], StepResult] = partial(tuple.__new__, StepResult)
-"""Takes a third of the time of a NamedTuple's constructor."""
 
 
 class CompiledEngine(BatchEngine):
@@ -97,7 +91,7 @@ class CompiledEngine(BatchEngine):
         self._make_rows(task)
         layout = Layout(task, self.env)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
-        self._is_whole = layout.divided is None and not task.left
+        self._is_whole = not task.left
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
@@ -110,7 +104,7 @@ class CompiledEngine(BatchEngine):
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
             self._surroundings(task)
-            | {"results": (np.empty, StepResult, layout.names, arrays, told)},
+            | {"results": (np.empty, StepResult, *layout.form, arrays, told)},
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:
@@ -252,8 +246,9 @@ class CompiledEngine(BatchEngine):
         self.has_moved = True
         troubled, self.any_ended = self._start(mask, seen, drawn)
         infos = _start_infos(self.env._plan, drawn, mask)
-        if self._divided is None and not troubled and not self._left:
-            return seen, infos
+        if self._divided is not None:
+            seen, told = self._divided(seen)
+            infos = restricted(told, mask) | infos
         return self._started(seen, infos, mask, troubled)
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
@@ -273,11 +268,9 @@ class CompiledEngine(BatchEngine):
         return self._started(*result, result[1]["_drawn"], troubled)
 
     def _started(
-        self, seen: Any, infos: dict[str, Any], mask: MaskArray, troubled: int
+        self, observations: Any, infos: dict[str, Any], mask: MaskArray, troubled: int
     ) -> tuple[Any, dict[str, Any]]:
-        """Complete what a reset returns."""
-        observations, told = (seen, {}) if self._divided is None else self._divided(seen)
-        infos = restricted(told, mask) | infos if told else infos
+        """Call the hooks that are not compiled after a reset, and refuse impossible starts."""
         if troubled:
             self._require_started(np.flatnonzero(mask), self._pool.statuses)
         if self._left:
@@ -315,13 +308,13 @@ class CompiledEngine(BatchEngine):
         play = self._play_with_resets if starts else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, self.any_ended, followed = play(
+            result, troubled, self.any_ended, started = play(
                 actions, None if starts else self._not_drawn
             )
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), None)
         if troubled:
-            return self._completed(result, troubled, None, followed)
+            return self._completed(result, troubled, None, started)
         return result
 
     def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
@@ -337,15 +330,13 @@ class CompiledEngine(BatchEngine):
         play = self._play_with_resets if starts or resetting is not None else self._play
         self.has_moved = True  # unless the call refuses its arguments
         try:
-            result, troubled, self.any_ended, followed = play(actions, None if starts else drawn)
+            result, troubled, self.any_ended, started = play(actions, None if starts else drawn)
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
-        if self._divided is not None:
-            result = self._in_form(result, self._divided, followed)
         if resetting is not None:
             result.infos.update(_start_infos(self.env._plan, drawn, resetting))
         if troubled or self._left:
-            return self._completed(result, troubled, resetting, followed)
+            return self._completed(result, troubled, resetting, started)
         return result
 
     def _checked_ahead(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
@@ -364,16 +355,6 @@ class CompiledEngine(BatchEngine):
         if converted is actions:
             raise error
         return converted
-
-    def _in_form(
-        self, result: StepResult, divided: Divided, followed: Followed | None
-    ) -> StepResult:
-        """Give observations and infos the form that the hooks give them."""
-        observations, infos = divided(result.observations)
-        if followed is not None:
-            late = LateDict.of(self._infos_at_ends, divided, *followed)
-            infos = infos | late if infos else late
-        return _make_result((observations, *result[1:4], infos))
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -406,25 +387,15 @@ class CompiledEngine(BatchEngine):
         result: StepResult,
         troubled: int,
         resetting: MaskArray | None,
-        followed: Followed | None,
+        started: MaskArray | None,
     ) -> StepResult:
         """Call the hooks that are not compiled, and handle faults."""
         if self._left:
             result = self._with_hooks_left(result, resetting)
         seen = result.rewards, result.observations
         if troubled or any(not_finite(values) is not None for values in seen):
-            self._mend(result, resetting if followed is None else followed[0])
+            self._mend(result, resetting if started is None else started)
         return result
-
-    def _infos_at_ends(
-        self, divided: Divided, started: MaskArray, drawn: FloatArray, last: Any
-    ) -> dict[str, Any]:
-        """The infos of a step in which episodes have followed others."""
-        observations, infos = divided(last)
-        told = _start_infos(self.env._plan, drawn, started)
-        objects = observations_of(observations, started)
-        told.update(final_infos(objects, restricted(infos, started), started))
-        return told
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""

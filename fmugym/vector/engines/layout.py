@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,7 @@ from fmugym.env import FMUEnv
 from fmugym.vector.codec import with_masks
 from fmugym.vector.hooks.trace import TracedTask
 
-__all__ = ["Divided", "Layout"]
-
-Divided = Callable[[Any], tuple[Any, dict[str, Any]]]
-"""Returns the observations and a new dict of infos that some arrays hold."""
+__all__ = ["Layout"]
 
 
 class Layout:
@@ -28,8 +25,10 @@ class Layout:
         shapes: The shape and type of each array.
         names: None if the observations are the only array; the keys if they are a dict; otherwise
             empty.
-        divided: Makes observations and infos of such arrays. None if what ``new_arrays`` makes
-            are the observations.
+        form: That of the observations and that of the infos, as the pool takes them: the number of
+            an array, or a tuple of names and forms.
+        divided: Returns the observations and a new dict of infos that such arrays hold. None if
+            what ``new_arrays`` makes are the observations.
     """
 
     def __init__(self, task: TracedTask, env: FMUEnv) -> None:
@@ -37,7 +36,7 @@ class Layout:
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
         self.names: tuple[str, ...] | None = ()
-        self.divided: Divided | None = self._tree
+        self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
         if not task.seen and env._pool_observes:
             self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
             self.names, self.divided = None, None
@@ -45,6 +44,9 @@ class Layout:
             self.names, self.divided = None, None
         elif task.seen and all(path[0] == "observation" and len(path) == 2 for path in self._paths):
             self.names, self.divided = tuple(path[-1] for path in self._paths), None
+
+        observations, infos = self._nested(range(len(self._paths)))
+        self.form = 0 if self.names is None else _pairs(observations), _pairs(infos)
 
     def new_arrays(self) -> Any:
         """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
@@ -55,12 +57,23 @@ class Layout:
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""
+        observations, infos = self._nested(arrays)
+        return observations, with_masks(infos, np.ones(self._n, np.bool_)) if infos else {}
+
+    def _nested(self, leaves: Iterable[Any]) -> tuple[Any, dict[str, Any]]:
+        """Something for each array, in the places of observations and infos."""
         tree: dict[str, Any] = {"observation": {}, "info": {}}
-        for path, array in zip(self._paths, arrays, strict=True):
+        for path, leaf in zip(self._paths, leaves, strict=True):
             *parents, name = path
             place = tree
             for parent in parents:
                 place = place.setdefault(parent, {})
-            place[name] = array
-        infos = with_masks(tree["info"], np.ones(self._n, np.bool_)) if tree["info"] else {}
-        return tree["observation"], infos
+            place[name] = leaf
+        return tree["observation"], tree["info"]
+
+
+def _pairs(tree: Any) -> Any:
+    """Make tuples of dicts."""
+    if not isinstance(tree, dict):
+        return tree
+    return tuple((name, _pairs(value)) for name, value in tree.items())
