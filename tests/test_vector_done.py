@@ -1,5 +1,6 @@
 """``done`` of each environment, as a single environment has it, in every way of calling hooks."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
@@ -167,8 +168,8 @@ TASK = {
 
 @each_kind
 @each_mode
-def test_a_series_has_the_present_done(mode, hooks):
-    """Rows with what ends an episode, which reads ``done``, are those that the infos have."""
+def test_costs_in_a_series_have_the_done_of_their_step(mode, hooks):
+    """They come from the infos; where ``done`` is a cost, it is what the row says of the end."""
     rows = []
     for way in (hooks, "per_env"):
         inner = FMUVectorEnv(
@@ -185,6 +186,10 @@ def test_a_series_has_the_present_done(mode, hooks):
             {name: envs.series[name] for name in [column.name for column in envs.series.columns]}
         )
         assert rows[-1]["costs.last"].any()
+        is_step = rows[-1]["step"] > 0
+        np.testing.assert_array_equal(
+            rows[-1]["costs.last"][is_step], rows[-1]["terminated"][is_step]
+        )
         envs.close()
     require_equal(*rows)
 
@@ -211,6 +216,61 @@ class Cut(Judged):
     """A fault is not the end of the task."""
 
     policy = "truncate"
+
+
+class Broken(Faulty):
+    """The FMU fails at times; observations and infos tell what a hook reads then."""
+
+    def _is_done(self):
+        return (self.step_count > 1) & (self.state[0] > 0.0)
+
+    def _get_observation_space(self):
+        return gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def _get_observation(self):
+        return np.stack([self.state[0], 1.0 * self.done])
+
+    def _get_info(self):
+        return {"done": self.done}
+
+
+class BrokenCut(Broken):
+    """A fault is not the end of the task."""
+
+    policy = "truncate"
+
+
+class Doomed(Broken):
+    """Episodes may start where they end."""
+
+    def _get_inputs(self):
+        return self.action
+
+    def _is_done(self):
+        return self.state[0] > 0.2
+
+
+@each_kind
+@each_mode
+@pytest.mark.parametrize("task", [Broken, BrokenCut, Doomed])
+def test_observations_have_done(task, mode, hooks):
+    """Of a step whose FMU failed it is what the fault makes it; of a start, it is False."""
+    ours, theirs = pair(task, hooks, mode)
+    seen = set()
+    require_equal(ours.reset(seed=1)[0], theirs.reset(seed=1)[0])
+    for actions in sampled_actions(ours, 30):
+        mine, other = ours.step(actions), theirs.step(actions)
+        for one, expected in zip(mine[:4], other[:4], strict=True):
+            require_equal(one, expected)
+        require_same_infos(mine[4], other[4])
+        seen |= set(mine[0][:, 1].tolist())
+        ended = mine[2] | mine[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            for envs in ours, theirs:
+                envs.reset(options={"reset_mask": ended})
+    assert seen == ({0.0} if mode is AutoresetMode.SAME_STEP else {0.0, 1.0})
+    ours.close()
+    theirs.close()
 
 
 @each_kind

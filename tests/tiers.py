@@ -65,6 +65,7 @@ SLOW_MODULES = {
     "test_systems_faces",
     "test_systems_linear_inputs",
     "test_systems_linearization",
+    "test_systems_many",
     "test_systems_parts",
     "test_systems_resets",
     "test_systems_ssp",

@@ -510,8 +510,11 @@ class BatchEngine(Engine):
     reward_type: type | None = None
 
     def flags(self, hook: str, value: Any) -> MaskArray:
-        """See ``Form.flags``."""
-        return results.flags(hook, value, self._n)
+        """See ``Form.flags``; nothing is done where the FMU has not stepped."""
+        found = results.flags(hook, value, self._n)
+        if self._idle is not None and hook == "_is_done":
+            found[self._idle] = False
+        return found
 
     def rewards(self, value: Any) -> FloatArray:
         """See ``Form.rewards``."""
@@ -611,8 +614,11 @@ class BatchEngine(Engine):
         for index, reason in reasons.items():
             env.logger.warning("environment %d: %s", index, reason)
         env.done[faulty] = config.on_fault == "terminate"
-        if (faulty & ~failed).any():
-            self._undo(result, faulty & ~failed, reasons)
+        undone = faulty & ~failed
+        if undone.any():
+            self._undo(undone)
+        if undone.any() or env._has_info or not env._pool_observes:
+            self._see_again(result, faulty, reasons)
         texts = np.full(self._n, None, dtype=object)
         texts[faulty] = list(reasons.values())
         rates = fault_rates(self._pool.health())
@@ -621,15 +627,17 @@ class BatchEngine(Engine):
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
 
-    def _undo(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
+    def _undo(self, mask: MaskArray) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
-        env, pool = self.env, self._pool
-        pool.outputs[:, mask] = self._outputs_before[:, mask]
-        if env._own.update:
+        self._pool.outputs[:, mask] = self._outputs_before[:, mask]
+        if self.env._own.update:
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
-            pool.note_fault(index)
-        env._halt()
+            self._pool.note_fault(index)
+        self.env._halt()
+
+    def _see_again(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
+        """Observe environments in the state before a step, with ``done`` of their fault."""
         again = self._observe()
         for index in _indices(not_finite(again), mask):
             before = shown(observation_of(again, index))
@@ -637,7 +645,7 @@ class BatchEngine(Engine):
                 f"environment {index}: {reasons[index]}; before it the observation is {before}"
             )
         copy_rows(again, result.observations, mask)
-        if env._has_info:
+        if self.env._has_info:
             infos = self._infos(np.ones(self._n, np.bool_))
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 

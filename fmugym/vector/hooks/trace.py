@@ -158,6 +158,7 @@ class Tracer:
         self._env.done = self._whole(results[0], np.dtype(np.bool_))
         results.append(self._or_left("_is_truncated", self._flag_node, np.False_))
         results.append(self._or_left("_reward_policy", self._reward_node, np.float64(0.0)))
+        self._env.done = self._whole(self._only_active(results[0]), np.dtype(np.bool_))
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
@@ -199,6 +200,13 @@ class Tracer:
         flag = np.dtype(np.bool_)
         first = self._whole(node, flag).cells[0]
         return self._graph.apply(np.logical_or, (first, other), flag).node
+
+    def _only_active(self, node: int) -> int:
+        """A flag that is false where the FMU has not stepped: an episode starts there."""
+        flag = np.dtype(np.bool_)
+        active = self._graph.load("active", None, np.bool_, None)
+        flags = self._whole(node, flag).cells[0], active
+        return self._graph.apply(np.logical_and, flags, flag).node
 
     # Inputs.
 
