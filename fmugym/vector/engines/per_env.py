@@ -155,19 +155,22 @@ class PerEnvEngine(Engine):
             running = [*compress(range(len(idle)), map(not_, idle))]
             taken = self._step_pool(items, running, resetting) if self._together else None
             self.has_moved = True
-            return self._results(items, running, taken)
+            return self._results(items, idle, running, taken)
         except BaseException:
             for env in self._envs:
                 env._in_hooks = False
                 env._ended = env._ended or self.has_moved  # its FMU has stepped without a result
             raise
 
-    def _results(self, items: Sequence[Any], running: list[int], taken: Taken | None) -> StepResult:
+    def _results(
+        self, items: Sequence[Any], idle: Sequence[bool], running: list[int], taken: Taken | None
+    ) -> StepResult:
         outcomes = Outcomes(len(self._envs))
         if isinstance(self._stack, PoolStack):
             self._stack.refresh()
-        if len(running) < len(self._envs):
-            self._start_others(outcomes, {*running})
+        for index in compress(range(len(idle)), idle):
+            observation, info = self._reset(index, None, {})
+            self._note(outcomes, index, (observation, 0.0, False, False, info))
         if taken is None:
             self._step_each(outcomes, items, running)
         else:
@@ -176,13 +179,6 @@ class PerEnvEngine(Engine):
         self.note_ends(terminated, truncated)
         infos = gathered(outcomes.sorted_infos(), len(self._envs))
         return StepResult(self._stack.joined(), rewards, terminated, truncated, infos)
-
-    def _start_others(self, outcomes: Outcomes, running: set[int]) -> None:
-        """Start episodes of the environments whose episodes do not go on."""
-        for index in range(len(self._envs)):
-            if index not in running:
-                observation, info = self._reset(index, None, {})
-                self._note(outcomes, index, (observation, 0.0, False, False, info))
 
     def _step_each(self, outcomes: Outcomes, items: Sequence[Any], running: list[int]) -> None:
         """Call the steps of environments that have their own."""
@@ -209,7 +205,7 @@ class PerEnvEngine(Engine):
         """
         status_of, outputs = self._pool.statuses.tolist(), self._pool.outputs
         envs, indices, actions = self._envs, taken.indices, taken.actions
-        told = in_time(outputs if len(indices) == len(envs) else outputs[:, indices])
+        told = in_time(outputs if taken.skipped is None else outputs[:, ~taken.skipped])
         index = 0
         try:
             for index, inputs, values in zip(indices, in_time(taken.rows.T), told, strict=True):
@@ -300,20 +296,20 @@ class PerEnvEngine(Engine):
         self, actions: Sequence[Any], running: list[int], resetting: MaskArray | None
     ) -> Taken:
         """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
-        taken = self._directly_taken(actions, running) if self._are_direct() else None
+        rows = self._direct_inputs(actions, running) if self._are_direct() else None
+        taken = None if rows is None else Taken(running, resetting, rows, actions)
         if taken is None:
-            taken = Taken(running, self._take_actions(actions, running), None)
+            taken = Taken(running, resetting, self._take_actions(actions, running), None)
         self._pool.inputs[:, ... if resetting is None else ~resetting] = taken.rows.T
         self._pool.step(None, resetting, self._pool.observations)
         return taken
 
-    def _directly_taken(self, actions: Sequence[Any], running: list[int]) -> Taken | None:
-        """Take actions that are the inputs; the environments learn of them when they conclude.
+    def _direct_inputs(self, actions: Sequence[Any], running: list[int]) -> FloatArray | None:
+        """Inputs that are the actions, shape (M, k); None if the environments must be asked.
 
-        None if the actions do not make inputs, so that each environment has to be asked.
+        The environments learn of their actions when they conclude.
         """
-        rows = self._envs[0]._input_writer.of_actions(np.asarray(actions)[running])
-        return None if rows is None else Taken(running, rows, actions)
+        return self._envs[0]._input_writer.of_actions(np.asarray(actions)[running])
 
     def _take_actions(self, actions: Sequence[Any], running: list[int]) -> FloatArray:
         """Ask environments for their inputs, shape (M, k)."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any, Final, NamedTuple
 
-from fmugym.pool.base import FloatArray
+from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = ["Taken", "in_time"]
 
@@ -19,11 +19,13 @@ class Taken(NamedTuple):
 
     Attributes:
         indices: The M environments.
+        skipped: Which of all N the others are, or None for none.
         rows: Their inputs, shape (M, k).
         actions: The actions of all N environments if these M do not know theirs yet, or None.
     """
 
     indices: list[int]
+    skipped: MaskArray | None
     rows: FloatArray
     actions: Sequence[Any] | None
 
