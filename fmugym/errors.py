@@ -20,7 +20,7 @@ shown with ``printable``: it may quote an FMU.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "SimulationError",
     "TaskError",
     "UnknownParameterError",
+    "nearest_name",
     "printable",
     "reason",
     "shown",
@@ -152,7 +153,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
     names = _in_order(known)
-    near = _nearest(name, names)
+    near = nearest_name(name, names)
     if near is not None:
         return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near!r}?")
     return ConfigError(f"unknown {kind} {shown(name)}; known are: {_listing(names)}")
@@ -167,7 +168,7 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentErr
         known: All arguments that the class has.
     """
     names = _in_order(known)
-    near = _nearest(name, names)
+    near = nearest_name(name, names)
     hint = f"known are: {_listing(names)}" if near is None else f"did you mean {near!r}?"
     return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
 
@@ -177,10 +178,15 @@ def _in_order(names: Iterable[str]) -> list[str]:
     return sorted(names) if isinstance(names, set | frozenset) else list(names)
 
 
-def _nearest(name: object, known: list[str]) -> str | None:
+def nearest_name(name: object, known: Sequence[str]) -> str | None:
+    """The known name that is nearest to another one, upper or lower case; None if none is near."""
     text = name if isinstance(name, str) else shown(name)
     near = difflib.get_close_matches(text[:_LONGEST], known, n=1)
-    return near[0] if near else None
+    if near:
+        return near[0]
+    lower = {one.lower(): one for one in reversed(known)}
+    near = difflib.get_close_matches(text[:_LONGEST].lower(), lower, n=1)
+    return lower[near[0]] if near else None
 
 
 def _listing(names: list[str]) -> str:

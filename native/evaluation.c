@@ -54,6 +54,44 @@ static size_t run_other(const Evaluation *e, const Instruction *next) {
     return 1;
 }
 
+/* Whether these values of a run are all the same, bit by bit. Most that differ do so at once. */
+static bool are_same(const void *values, size_t count, size_t size) {
+    return memcmp(values, (const char *)values + size, (count - 1) * size) == 0;
+}
+
+/* Whether an operation takes much time, and all of a run would compute the same. Nearly all such
+ * operands are 8 bytes wide. */
+static bool is_shared(const Evaluation *e, Instruction i) {
+    const void *const *places = e->registers->places;
+    const size_t size = sizeof(double);
+
+    switch (i.operation) {
+    case INTERPOLATE:
+    case CALL_SINE:
+    case CALL_COSINE:
+        return are_same(places[i.a], e->count, size);
+    case CALL_REMAINDER:
+    case POWER_D:
+        return are_same(places[i.a], e->count, size) && are_same(places[i.b], e->count, size);
+    default:
+        return false;
+    }
+}
+
+/* Computes what is the same for all of a run once: what depends on nothing but the time often is. */
+static size_t run_once(const Evaluation *e, const Instruction *next) {
+    Evaluation once = *e;
+    double *to = e->registers->own[next->to].doubles;
+
+    once.count = 1;
+    once.lanes = PROGRAM_BLOCK;
+    const size_t done = run_other(&once, next);
+    for (size_t j = 1; j < e->lanes; j++) {
+        to[j] = to[0];
+    }
+    return done;
+}
+
 static inline size_t run_one(const Evaluation *e, const Instruction *next) {
     const Instruction i = *next;
     const void **places = e->registers->places;
@@ -65,7 +103,7 @@ static inline size_t run_one(const Evaluation *e, const Instruction *next) {
     }
     places[i.to] = to;
     if (i.operation < ADD_D || i.operation >= POWER_D) {
-        return run_other(e, next);
+        return e->count > 1 && is_shared(e, i) ? run_once(e, next) : run_other(e, next);
     }
     operation_compute(i.operation, places[i.a], places[i.b], places[i.c], e->lanes / PROGRAM_BLOCK,
                       to);

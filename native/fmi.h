@@ -84,8 +84,16 @@ typedef struct {
     Stage stage; /* the call that returned the status */
 } Outcome;
 
+/* Blocks of memory that each hold an instance, its inputs and its outputs; all at the same offsets in
+ * bytes. */
+typedef struct {
+    void *const *blocks;
+    size_t component, inputs, outputs;
+} Blocks;
+
 /* One step for each of several instances. The step sets the inputs before and gets the outputs
- * after. places gives the row of each instance in the inputs and outputs. */
+ * after. places gives the row of each instance in the inputs and outputs. In blocks, which may be
+ * NULL, the instances and their values are somewhere else. */
 typedef struct {
     const uint32_t *input_references, *output_references;
     size_t number_of_inputs, number_of_outputs;
@@ -99,6 +107,7 @@ typedef struct {
     const double *inputs;
     double *outputs;
     Outcome *outcomes;
+    const Blocks *blocks;
 } Exchange;
 
 /* A directional derivative: that of all unknowns along a direction of the knowns. An adjoint one of
@@ -196,27 +205,56 @@ static inline bool has_outputs(Outcome outcome) {
            (outcome.status <= STATUS_WARNING || outcome.status == STATUS_TERMINATED);
 }
 
+/* An instance and its values. */
+typedef struct {
+    void *component;
+    const double *inputs;
+    double *outputs;
+} Stepper;
+
+static inline Stepper stepper_of_run(const Exchange *e, size_t index) {
+    return (Stepper){e->components[index], e->inputs + e->places[index] * e->number_of_inputs,
+                 e->outputs + e->places[index] * e->number_of_outputs};
+}
+
+static inline Stepper stepper_of_block(const Blocks *blocks, size_t index) {
+    char *block = blocks->blocks[index];
+    return (Stepper){*(void **)(void *)(block + blocks->component),
+                 (const double *)(void *)(block + blocks->inputs),
+                 (double *)(void *)(block + blocks->outputs)};
+}
+
 static inline Outcome exchange_once(const Fmi *fmi, const Library *library, const Exchange *e,
-                                    size_t index) {
-    void *component = e->components[index];
-    const double *inputs = e->inputs + e->places[index] * e->number_of_inputs;
-    double *outputs = e->outputs + e->places[index] * e->number_of_outputs;
+                                    Stepper me, double time) {
     Outcome outcome = {.stage = SETTING_INPUTS};
 
     if (e->number_of_inputs > 0) {
-        outcome.status = fmi->set(library, component, TYPE_FLOAT64, e->input_references,
-                                  e->number_of_inputs, inputs, e->number_of_inputs);
+        outcome.status = fmi->set(library, me.component, TYPE_FLOAT64, e->input_references,
+                                  e->number_of_inputs, me.inputs, e->number_of_inputs);
     }
     if (outcome.status <= STATUS_WARNING) {
         outcome.stage = DOING_STEP;
-        outcome.status = fmi->do_step(library, component, e->times[index], e->step, e->no_return);
+        outcome.status = fmi->do_step(library, me.component, time, e->step, e->no_return);
     }
     if (has_outputs(outcome)) {
-        const Status got = fmi->get(library, component, TYPE_FLOAT64, e->output_references,
-                                    e->number_of_outputs, outputs, e->number_of_outputs);
+        const Status got = fmi->get(library, me.component, TYPE_FLOAT64, e->output_references,
+                                    e->number_of_outputs, me.outputs, e->number_of_outputs);
         outcome = got > STATUS_WARNING ? (Outcome){got, READING_OUTPUTS} : outcome;
     }
     return outcome;
+}
+
+static inline bool exchange_blocks(const Fmi *fmi, const Library *library, const Exchange *exchange) {
+    const Exchange e = *exchange;
+    const Blocks blocks = *exchange->blocks;
+    bool good = true;
+
+    for (size_t i = 0; i < e.count; i++) {
+        e.outcomes[i] = exchange_once(fmi, library, &e, stepper_of_block(&blocks, i), e.times[i]);
+        floats_restore_if_seen(e.floats);
+        good &= e.outcomes[i].status == STATUS_OK;
+    }
+    return good;
 }
 
 /* For the source files of the FMI versions. The compiler sees their tables there and turns the
@@ -225,8 +263,11 @@ static inline bool exchange_by(const Fmi *fmi, const Library *library, const Exc
     const Exchange e = *exchange; /* a local copy, so the compiler knows that no FMU changes it */
     bool good = true;
 
+    if (exchange->blocks != NULL) {
+        return exchange_blocks(fmi, library, exchange);
+    }
     for (size_t i = 0; i < e.count; i++) {
-        e.outcomes[i] = exchange_once(fmi, library, &e, i);
+        e.outcomes[i] = exchange_once(fmi, library, &e, stepper_of_run(&e, i), e.times[i]);
         floats_restore_if_seen(e.floats);
         good &= e.outcomes[i].status == STATUS_OK;
     }

@@ -1,6 +1,7 @@
 /* FMI 2.0 for co-simulation. */
 
 #include "fmi2.h"
+#include "platform.h"
 
 enum { CO_SIMULATION = 1 };
 enum { LAST_SUCCESSFUL_TIME = 2, TERMINATED = 3 }; /* of fmi2StatusKind */
@@ -50,7 +51,7 @@ static double last_successful_time(const Functions *f, void *component, double t
 
 /* Does the rest of a discarded step, from where the FMU returned. An FMU that has done nothing of
  * it, or refuses to go on, has discarded it. */
-static Status go_on(const Functions *f, void *component, double time, double end, bool no_return) {
+NEVER_INLINE static Status go_on(const Functions *f, void *component, double time, double end, bool no_return) {
     Status status = judge_discard(f, component);
 
     while (status == STATUS_DISCARD) {

@@ -41,6 +41,13 @@ enum { CACHE_LINE = 64 };
 #define ALWAYS_INLINE inline __attribute__((always_inline))
 #endif
 
+/* For what happens so rarely that it must not lengthen the function which calls it. */
+#if defined _MSC_VER
+#define NEVER_INLINE __declspec(noinline)
+#else
+#define NEVER_INLINE __attribute__((noinline))
+#endif
+
 /* Atomics. All are sequentially consistent. That costs little, because each is used at most once
  * per chunk of work. */
 

@@ -139,31 +139,60 @@ static void forget_actions(const Actions *a, size_t index) {
     }
 }
 
-void play_start_episode(const Turn *turn, size_t index) {
-    const Play *play = turn->play;
-
-    forget_actions(&play->actions, index);
-    if (play->done != NULL) {
-        play->done[index] = 0;
-    }
+static void start_inputs(const Play *play, const uint32_t *starting, size_t count) {
     for (size_t i = 0; i < play->number_of_inputs; i++) {
         const InputStart *start = &play->input_starts[i];
-        play->input_rows[i * play->count + index] =
-            start->row == NULL ? start->value : start->row[index];
+        double *row = play->input_rows + i * play->count;
+        for (size_t j = 0; j < count; j++) {
+            row[starting[j]] = start->row == NULL ? start->value : start->row[starting[j]];
+        }
     }
+}
+
+static void start_variables(const Turn *turn, const uint32_t *starting, size_t count) {
+    const Play *play = turn->play;
+
     for (size_t i = 0; i < play->number_of_variable_starts; i++) {
         const VariableStart *start = &play->variable_starts[i];
-        memcpy(start->row.data + index * start->row.size, &start->bits, start->row.size);
+        for (size_t j = 0; j < count; j++) {
+            memcpy(start->row.data + starting[j] * start->row.size, &start->bits, start->row.size);
+        }
     }
     for (size_t i = 0; i < play->number_of_drawn_variables; i++) {
         const DrawnVariable *variable = &play->drawn_variables[i];
-        const double *value = turn->drawn + variable->draw * play->count + index;
-        memcpy(variable->row.data + index * sizeof *value, value, sizeof *value);
+        const double *values = turn->drawn + variable->draw * play->count;
+        for (size_t j = 0; j < count; j++) {
+            memcpy(variable->row.data + starting[j] * sizeof *values, &values[starting[j]],
+                   sizeof *values);
+        }
     }
+}
+
+/* Fills one row after the other, because each is far from the next one in memory. */
+static void start_listed(const Turn *turn, const uint32_t *starting, size_t count) {
+    const Play *play = turn->play;
+
+    for (size_t j = 0; j < count; j++) {
+        forget_actions(&play->actions, starting[j]);
+        if (play->done != NULL) {
+            play->done[starting[j]] = 0;
+        }
+    }
+    start_inputs(play, starting, count);
+    start_variables(turn, starting, count);
     for (size_t i = 0; i < play->number_of_outputs; i++) {
-        const size_t place = i * play->count + index;
-        play->kept_rows[place] = play->output_rows[place];
+        const double *from = play->output_rows + i * play->count;
+        double *to = play->kept_rows + i * play->count;
+        for (size_t j = 0; j < count; j++) {
+            to[starting[j]] = from[starting[j]];
+        }
     }
+}
+
+void play_start_episode(const Turn *turn, size_t index) {
+    const uint32_t starting = (uint32_t)index;
+
+    start_listed(turn, &starting, 1);
 }
 
 WIDE static bool is_any_set(const uint8_t *flags, size_t count) {
@@ -176,14 +205,18 @@ WIDE static bool is_any_set(const uint8_t *flags, size_t count) {
 }
 
 static void start_episodes(const Turn *turn, size_t begin, size_t count) {
+    uint32_t starting[PROGRAM_WIDTH];
+    size_t number = 0;
+
     if (!is_any_set(turn->play->ended + begin, count)) {
         return;
     }
     for (size_t index = begin; index < begin + count; index++) {
         if (turn->play->ended[index]) {
-            play_start_episode(turn, index);
+            starting[number++] = (uint32_t)index;
         }
     }
+    start_listed(turn, starting, number);
 }
 
 static void copy_rows(const Play *play, size_t begin, size_t count) {

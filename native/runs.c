@@ -211,17 +211,53 @@ typedef struct {
     Outcome outcomes[RUN];
 } LineUp;
 
+/* Whether none of a run is in the mask. */
+static bool is_none_in(Mask mask, size_t begin, size_t count) {
+    unsigned char any = 0;
+
+    for (size_t j = 0; mask.data != NULL && j < count; j++) {
+        any |= (unsigned char)mask.data[(ptrdiff_t)(begin + j) * mask.stride];
+    }
+    return any == 0;
+}
+
+/* Lines up a run of which nearly always all instances step. Returns whether they do; otherwise
+ * nothing has happened. */
+static bool line_up_all(const Pool *pool, size_t begin, size_t count, LineUp *line) {
+    Instance *first = &pool->instances[begin];
+    const Library *library = first->library;
+    bool all = true;
+
+    for (size_t j = 0; j < count; j++) {
+        const Instance *me = first + j;
+        line->components[j] = me->component;
+        line->times[j] = instance_time(pool, me);
+        line->places[j] = (uint32_t)j;
+        all &= (me->phase == PHASE_STEPPING) & (me->library == library);
+    }
+    for (size_t j = 0; all && j < count; j++) {
+        first[j].steps++;
+    }
+    line->count = all ? count : 0;
+    line->others = 0;
+    return all;
+}
+
 /* Counts the steps as done before they happen. Avoids branches, because the processor cannot
  * predict which episodes have ended. */
 static void line_up(const Task *task, size_t begin, size_t count, bool together, LineUp *line) {
     const Pool *pool = task->pool;
     const Library *library = pool->instances[begin].library;
+    const Mask mask = task->call->mask;
     size_t steppers = 0, others = 0;
 
+    if (together && is_none_in(mask, begin, count) && line_up_all(pool, begin, count, line)) {
+        return;
+    }
     for (size_t j = 0; j < count; j++) {
         Instance *me = &pool->instances[begin + j];
-        const bool steps = together & !is_in(task->call->mask, begin + j) &
-                           (me->phase == PHASE_STEPPING) & (me->library == library);
+        const bool steps = together & !is_in(mask, begin + j) & (me->phase == PHASE_STEPPING) &
+                           (me->library == library);
 
         line->places[steppers] = line->other_places[others] = (uint32_t)j;
         line->components[steppers] = me->component;

@@ -24,11 +24,6 @@ static Status carry_to(Composite *me, size_t index) {
     return carry(me, part->first_route, part->end_route);
 }
 
-typedef struct {
-    double time, step;
-    bool no_return;
-} Span;
-
 static Status advance(Composite *me, size_t index, Span span) {
     const Component *part = &me->system->parts[index];
     const double size = span.step / (double)part->steps;
@@ -43,7 +38,7 @@ static Status advance(Composite *me, size_t index, Span span) {
 
 /* If the FMU asks to stop, the others do their step all the same. The floating-point environment is
  * restored before another FMU runs. */
-static Status step_part(Composite *me, size_t index, Span span) {
+Status system_step_part(Composite *me, size_t index, Span span) {
     Status status = part_set_inputs(me, index);
 
     if (goes_on(status)) {
@@ -110,7 +105,7 @@ static Status evaluate(void *context, const double *x, double *y) {
         x += route->count;
     }
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
-        status = step_part(me, group->parts[i], r->span);
+        status = system_step_part(me, group->parts[i], r->span);
     }
     for (size_t i = 0; i < group->number_of_routes && goes_on(status); i++) {
         const Route *route = &me->system->routes[group->routes[i]];
@@ -120,7 +115,7 @@ static Status evaluate(void *context, const double *x, double *y) {
     return status;
 }
 
-static Status solve(Composite *me, const PartGroup *group, Span span) {
+Status system_solve(Composite *me, const PartGroup *group, Span span) {
     Repetition repetition = {me, group, span, false};
     Status status = STATUS_OK;
 
@@ -153,15 +148,23 @@ static Status step_group(Composite *me, const PartGroup *group, Span span) {
     Status status = STATUS_OK;
 
     if (group->has_loop && !jacobi) {
-        return solve(me, group, span);
+        return system_solve(me, group, span);
     }
     for (size_t i = 0; i < group->count && goes_on(status); i++) {
         status = jacobi ? STATUS_OK : carry_to(me, group->parts[i]);
         if (goes_on(status)) {
-            status = step_part(me, group->parts[i], span);
+            status = system_step_part(me, group->parts[i], span);
         }
     }
     return status;
+}
+
+void system_end_ticks(Composite *me) {
+    const System *s = me->system;
+
+    for (size_t i = 0; i < s->number_of_clocks; i++) {
+        me->inputs[s->clocks[i]] = 0.0;
+    }
 }
 
 Status system_step_once(Composite *me, double time, double step, bool no_return) {
@@ -178,9 +181,8 @@ Status system_step_once(Composite *me, double time, double step, bool no_return)
     for (size_t i = 0; i < s->number_of_groups && goes_on(status); i++) {
         status = step_group(me, &s->groups[i], span);
     }
-    /* each tick is for one step only */
-    for (size_t i = 0; i < s->number_of_clocks && goes_on(status); i++) {
-        me->inputs[s->clocks[i]] = 0.0;
+    if (goes_on(status)) {
+        system_end_ticks(me);
     }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
@@ -194,10 +196,6 @@ Status system_do_step(const Library *library, void *component, double time, doub
     me->kept.stepped = true;
     return me->system->control.tolerance > 0.0 ? system_step_controlled(me, time, step)
                                                : system_step_once(me, time, step, no_return);
-}
-
-static bool exchange(const Library *library, const Exchange *e) {
-    return exchange_by(&composite, library, e);
 }
 
 /* Systems are loaded by system_load. */
@@ -220,7 +218,7 @@ const Fmi composite = {
     .choose_messages = system_choose_messages,
     .initialize = system_initialize,
     .do_step = system_do_step,
-    .exchange = exchange,
+    .exchange = system_exchange,
     .get = system_get,
     .set = system_set,
     .set_string = system_set_string,

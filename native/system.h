@@ -219,6 +219,20 @@ Status system_choose_messages(const Library *library, void *component,
                               const char *const *categories, size_t count);
 Status system_initialize(const Library *library, void *component, const Experiment *experiment,
                          StartValues start_values, const char **doing);
+/* A communication step of a system. */
+typedef struct {
+    double time, step;
+    bool no_return;
+} Span;
+
+/* Sets the inputs of a part, lets it step, and reads its outputs. */
+Status system_step_part(Composite *me, size_t index, Span span);
+/* The step of the parts of an algebraic loop. */
+Status system_solve(Composite *me, const PartGroup *group, Span span);
+/* Each tick of a clock is for one step only. */
+void system_end_ticks(Composite *me);
+/* Steps of many systems, see system_exchange.c. */
+bool system_exchange(const Library *library, const Exchange *e);
 /* One step without an estimate of its error. */
 Status system_step_once(Composite *me, double time, double step, bool no_return);
 /* As many steps as the tolerance needs. */

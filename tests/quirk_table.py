@@ -145,6 +145,7 @@ QUIRKS = (
           neighbours="libraries", log=DISTURB),
     Quirk("strtok", "initializes with `strtok`", neighbours="one initialization at a time"),
     # Memory, files and calls
+    Quirk("warns", "returns Warning in each step until its first reset"),
     Quirk("overruns", "writes a byte beyond its memory (it runs in worker processes)",
           log="harms its process", may_die_early=True),
     Quirk("changes directory", "makes its resources the working directory (you get yours back "

@@ -148,7 +148,11 @@ class TestBadArchives:
         refused(tmp_path / "absent.fmu", "there is no FMU at")
 
     def test_a_folder(self, tmp_path):
-        refused(tmp_path, "there is no FMU at")
+        refused(tmp_path, "there is no FMU at.*folder.*zip")
+
+    def test_a_misspelt_name(self, tmp_path):
+        (tmp_path / "Boiler.fmu").touch()
+        refused(tmp_path / "boilr.FMU", "boilr.*'Boiler.fmu'")
 
     def test_a_name_that_no_file_can_have(self, tmp_path):
         refused(tmp_path / ("long" * 100), "there is no FMU at|is not an FMU.*too long")

@@ -1,6 +1,9 @@
 """The settings that ``fmugym validate`` recommends, for models whose needs are known."""
 
+import json
 import math
+import subprocess
+import sys
 import tomllib
 from functools import partial
 
@@ -8,6 +11,7 @@ import exchange_tools
 import foreign_lag
 import numpy as np
 import pytest
+import zoo_tools
 from gymnasium import spaces
 from pythonfmu.builder import FmuBuilder
 
@@ -174,3 +178,18 @@ class TestTimeStep:
         upright = {"q_0": math.pi}
         advice, _ = advised(pendulum(time_step=0.2, parameters=upright))
         assert advice["time_step"] == 0.02
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
+@pytest.mark.parametrize("options", [[], ["--json"]])
+def test_what_an_fmu_prints_is_not_in_the_output(tmp_path, options):
+    """It prints whenever an instance is made, also while the process ends."""
+    calls = zoo_tools.FAULTS.index("print"), zoo_tools.CALLS.index("instantiate")
+    path = zoo_tools.zoo_fmu(tmp_path, 2, "{{zoo {} {} 0}}".format(*calls))
+    command = [sys.executable, "-m", "fmugym", "validate", str(path), *options]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0
+    printed = "a line of the zoo"
+    assert printed in done.stderr
+    assert printed not in done.stdout
+    assert not options or json.loads(done.stdout)["schema"] == 1

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 import sys
 import tomllib
@@ -15,6 +16,7 @@ from fmugym import __main__ as program
 from fmugym.series import TimeSeries
 from fmugym.tools import speed
 from fmugym.tools.cli import _parsed, _parser, main
+from fmugym.tools.evaluation import Score, plot_scores
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 PID = "pid of=T setpoint=21 kp=0.3 ti=7200"
@@ -134,6 +136,26 @@ class TestEvaluate:
         assert (code, out) == (1, "")
         assert fact in err
         assert err.count("\n") == 1
+
+    @pytest.mark.parametrize(("random", "is_drawn"), [(-9.0, False), (-1.5, True)])
+    def test_only_random_actions_that_are_the_worst_are_left_out(self, tmp_path, random, is_drawn):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path, rewards = tmp_path / "a.svg", {"random": random, "one": -1.00001, "two": -2.0}
+        scores = [Score(name, (reward,), (), (1,), {}, 1.0) for name, reward in rewards.items()]
+        plot_scores(scores, path, "three")
+        drawn = re.findall("<!-- (.*) -->", path.read_text())
+        assert ("random" in drawn) == is_drawn
+        assert {"one", "two"} <= set(drawn)
+
+    def test_nearly_equal_rewards_look_so(self, tmp_path):
+        """Their ticks are whole numbers, not differences to one that stands elsewhere."""
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.svg"
+        scores = [Score(str(x), (x,), (), (1,), {}, 1.0) for x in (-33.28887, -33.28889)]
+        plot_scores(scores, path, "two")
+        ticks = re.findall("<!-- .(33.*) -->", path.read_text())
+        assert len(ticks) > 2
+        assert float(ticks[0]) - float(ticks[-1]) > 0.1
 
     def test_several_scenarios_and_a_picture(self, tmp_path, capsys):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")

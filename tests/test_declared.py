@@ -9,8 +9,10 @@ from functools import partial
 from pathlib import Path
 
 import gymnasium
+import model_tools
 import numpy as np
 import pytest
+import zoo_tools
 from gymnasium.envs.registration import EnvSpec
 
 import fmugym
@@ -392,6 +394,7 @@ MISTAKES = {
     "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "math:Pie"),
     "previous of memory": ('"-abs(q)"', '"previous(time)"', "line 3", "'time'"),
     "arguments": ('"-abs(q)"', '"hypot(q)"', "line 3", "2 arguments, got 1"),
+    "upper case": ('["tau"]', '["TAU"]', "line 7", "'tau'"),
 }
 
 
@@ -402,6 +405,27 @@ def test_mistakes_are_placed_and_explained(old, new, place, fact, tmp_path):
     path = write(tmp_path, "task.toml", text.replace(old, new, 1))
     with pytest.raises(TaskError, match=rf"{place}.*({fact})"):
         fmugym.load(path).close()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line"), [('"-abs(q)"', "-abs(q)", 3), ('"20ms"', "20 ms", 2)]
+)
+def test_a_text_that_lacks_its_quotes(old, new, line, tmp_path):
+    path = write(tmp_path, "task.toml", textwrap.dedent(SMALL).replace(old, new))
+    with pytest.raises(ConfigError, match=rf"task\.toml.*line {line}.*quotes"):
+        fmugym.load(path)
+
+
+def test_a_name_with_dots_that_lacks_its_quotes(tmp_path):
+    """TOML takes it for tables in tables."""
+    variables = (*zoo_tools.VARIABLES, ("mass.rotor.m", "parameter", 'start="0"'))
+    fmu = model_tools.model_fmu(tmp_path / "Zoo.fmu", "zoo", 2, "{zoo}", variables)
+    text = f'fmu = "{fmu.name}"\ntime_step = 1\nreward = "y"\n'
+    text += "[parameters]\nmass.rotor.m = 3\n"
+    text += '[variables]\nu = { min = 0, max = 1 }\n[agent]\nactions = "u"\nobservations = "y"\n'
+    path = write(tmp_path, "task.toml", text)
+    with pytest.raises(TaskError, match=r'line 5.*quotes.*"mass\.rotor\.m"'):
+        fmugym.load(path)
 
 
 def test_an_action_without_limits(tmp_path):

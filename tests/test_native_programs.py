@@ -282,6 +282,46 @@ def test_both_at_once_are_those_of_numpy(n):
         np.testing.assert_array_equal(stored, np.stack([np.sin(x), np.cos(x)]))
 
 
+def computed_by_all_operations_that_share(x):
+    """What the operations that compute equal values once make of an array."""
+    remainder = loop_of(np.remainder, (DOUBLE,) * 3), 2, (8, 8, 8), 2
+    sines = [(loop_of(f, (DOUBLE,) * 2), 1, (8, 8), 1) for f in (np.sin, np.cos)]
+    table = np.array([-1.0, 0.0, 2.0, 5.0, 3.0, 4.0, -7.0, 7.0])
+    lines = (
+        ("call_sine", 0, 2, 1),
+        ("call_cosine", 1, 3, 1),
+        ("call_remainder", 2, 4, 1, 0),
+        ("interpolate", 0, 5, 1),
+        ("scalar_power d", 0, 6, 1, 0),
+    )
+    stores = [("store_row", 1 + k, 0, 2 + k) for k in range(len(lines))]
+    stored = np.zeros((len(lines), len(x)))
+    code = ("load_row", 0, 1), *lines, *stores
+    calls = *sines, remainder
+    evaluate(code, (x, *stored), x, constants=(3.0,), calls=calls, tables=(table,))
+    return stored
+
+
+@pytest.mark.skipif(not has_known_sines(), reason="the error of this system's sine is not known")
+@pytest.mark.parametrize("n", LENGTHS)
+@pytest.mark.parametrize("value", [0.75, 0.0, -0.0, np.pi, 1e300, -0.5, np.nan, np.inf], ids=str)
+def test_values_that_all_share_are_those_of_numpy(n, value):
+    """With one that differs in no place, the last one, and the first one."""
+    for place in (None, n - 1, 0):
+        x = np.full(n, value)
+        if place is not None:
+            x[place] = -x[place] if value == 0.0 else 0.25
+        with np.errstate(all="ignore"):
+            expected = [np.sin(x), np.cos(x), np.remainder(x, 3.0)]
+            expected.append(np.interp(x, [-1.0, 0.0, 2.0], [5.0, 3.0, 4.0], left=-7.0, right=7.0))
+            expected.append([number**3.0 for number in x])
+        found = computed_by_all_operations_that_share(x)
+        np.testing.assert_array_equal(found, expected)
+        numbers = ~np.isnan(expected)
+        signs = np.signbit(found), np.signbit(expected)
+        np.testing.assert_array_equal(signs[0][numbers], signs[1][numbers])
+
+
 def hard_numbers(count):
     """Numbers of all magnitudes, and those whose squares lie between two floats or on one."""
     rng = np.random.default_rng(1)

@@ -6,6 +6,7 @@ import pickle
 import fmpy
 import numpy as np
 import pytest
+import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, edited_fmu
 from wine_tools import for_windows
 
@@ -55,7 +56,7 @@ def make_pool(request, tmp_path):
         monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
     made = []
 
-    def make(path, inputs, outputs, num_instances=1, time_step=0.1, **spec):
+    def make(path, inputs, outputs, num_instances=1, time_step=0.1, reset_method=None, **spec):
         fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
         if "system" in request.param:
             fmu = system_of(path)
@@ -65,7 +66,7 @@ def make_pool(request, tmp_path):
             time_step=time_step,
             **spec,
         )
-        options = OPTIONS[request.param]
+        options = OPTIONS[request.param] | {"reset_method": reset_method}
         pool = opening.make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **options)
         pool.variable, pool.is_system = fmu.variable, "system" in request.param
         made.append(pool)
@@ -527,13 +528,28 @@ class TestFaults:
 
     @with_state
     def test_a_state_that_cannot_be_restored(self, pool, version):
-        pool = pool(version)
+        pool = pool(version, reset_method="restore")
         for _ in range(4):
             outputs, status = set_up(pool, restore_status=3)
             assert status.tolist() == [Status.OK]
             assert outputs[1].tolist() == [0.0]
             step(pool)
         self.assert_sound(pool)
+
+    @with_state
+    @pytest.mark.parametrize("make_pool", [n for n in OPTIONS if n != "wine"], indirect=True)
+    @pytest.mark.parametrize("status", [Status.DISCARD, Status.ERROR, Status.FATAL])
+    def test_a_state_that_cannot_be_saved(self, make_pool, tmp_path, version, status):
+        path = zoo_tools.zoo_fmu(tmp_path, version)
+        values = zoo_tools.parameters("status", "get_state", at=0, status=status)
+        pool = make_pool(path, ["u"], ["y"], 1, 0.5, reset_method="restore")
+        for _ in range(4):
+            outputs, statuses = set_up(pool, **values)
+            assert statuses.tolist() == [Status.OK]
+            assert outputs.tolist() == [[0.0]]
+            outputs, statuses = step(pool, 1.0)
+            assert statuses.tolist() == [Status.OK]
+            assert outputs.tolist() == [[0.5]]
 
     @with_state
     def test_a_snapshot_that_cannot_be_restored(self, pool, version):

@@ -123,6 +123,16 @@ def test_a_step_that_fails(make_fmu, way, caplog):
     env.close()
 
 
+@all_ways
+def test_a_step_that_warns_is_no_reason(make_fmu, way, caplog):
+    env = TiringEnv(make_fmu("reset warns"), **WAYS[way])
+    assert set(play(env, 200)) == {1.5}
+    assert env.health["rehearsals"] > 0
+    assert warnings(caplog) == []
+    assert env.reset_method == "reset"
+    env.close()
+
+
 @pytest.mark.parametrize("options", [{"threads": 1}, {"threads": 2}, {"isolation": "process"}])
 def test_a_vector_environment(make_fmu, caplog, options):
     """With compiled hooks, too: the recording is made where the steps are done."""

@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
 from fmugym.checks import KnownArguments, check_count
-from fmugym.errors import FMULoadError, reason
+from fmugym.errors import FMULoadError, nearest_name, reason
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
 
@@ -112,7 +112,7 @@ class SafeZip:
         self.notes: list[str] = []
         try:
             if not path.is_file():
-                raise FMULoadError(f"there is no FMU at {path}")
+                raise FMULoadError(f"there is no FMU at {path}{_what_is_there(path)}")
             self._version = _version_of(path)
             entries = _read_directory(path, limits)
         except _ZIP_ERRORS as error:
@@ -339,6 +339,13 @@ def _read_at_most(file: BinaryIO, count: int) -> bytes:
         pieces.append(piece)
         count -= len(piece)
     return b"".join(pieces)
+
+
+def _what_is_there(path: Path) -> str:
+    if path.is_dir():
+        return ", which is a folder: put its contents into a zip archive"
+    near = nearest_name(path.name, sorted(file.name for file in path.parent.glob("*.fmu")))
+    return "" if near is None else f"; did you mean {near!r}?"
 
 
 def _check_sizes(path: Path, entries: Sequence[zipfile.ZipInfo], limits: ArchiveLimits) -> None:

@@ -59,8 +59,9 @@ class Source(NamedTuple):
         """The first line that leads furthest along the keys."""
         found: tuple[int, int | None] = (0, None)
         for number, path in _paths(self.text):
-            if len(path) > found[0] and list(path) == list(keys[: len(path)]):
-                found = len(path), number
+            shared = min(len(path), len(keys))
+            if shared > found[0] and list(path[:shared]) == list(keys[:shared]):
+                found = shared, number
         return found[1]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -128,7 +128,7 @@ class Records:
 
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
-        return [*self._records, *self._description.variables]
+        return list(dict.fromkeys([*self._records, *self._description.variables]))
 
     def get(self, alias: str) -> Record | None:
         """The record of an alias or of a variable of the FMU; None if there is none."""
@@ -158,8 +158,18 @@ class Records:
         """
         record = self.get(name)
         if record is None:
-            raise entry.error(unknown_name(role, name, [*others, *self.names()]))
+            error = unknown_name(role, name, [*others, *self.names()])
+            raise entry.error(f"{error}{self._dotted(name, entry.value)}")
         return record
+
+    def _dotted(self, name: str, value: object) -> str:
+        """Say what TOML makes of a name with dots, if that explains an unknown name."""
+        while isinstance(value, Mapping) and value:
+            key = next(iter(value))
+            name, value = f"{name}.{key}", value[key]
+            if self.get(name) is not None:
+                return f' (a name with dots stands in quotes: "{name}")'
+        return ""
 
     def input_of(self, entry: Entry, unit: str | None) -> Record:
         """The record of an input that data are written to, in the unit of the data.

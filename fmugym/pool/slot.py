@@ -142,7 +142,8 @@ class Slot:
             self._instance.begin_episode()
             if not self._restored(key):
                 self._initialize(variables, values)
-                self._keep_state(key, stepped)
+                if not self._kept_state(key, stepped):
+                    self._initialize(variables, values)
         except FMUGymError as error:
             return self._failed(str(error))
         self._begin_counting_at(self._spec.warm_up_steps * self._spec.substeps)
@@ -223,12 +224,16 @@ class Slot:
         self._first_outputs = state.outputs
         return True
 
-    def _keep_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> None:
-        """Keep the state if a later reset can use it."""
+    def _kept_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
+        """Keep the state if a later reset can use it; returns whether the instance can step."""
         again = stepped and key == self._start_key
         self._start_key, self._saved = key, None
         if again and self._restores:
-            self._saved = self._instance.save_state()
+            try:
+                self._saved = self._instance.save_state()
+            except SimulationError:  # episodes can begin without it, whatever the trial showed
+                self._restores = False
+        return self._instance.phase is _STEPPING
 
     def _initialize(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """Initialize; if that fails without a word, repeat it and let the FMU log everything."""

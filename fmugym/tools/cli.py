@@ -73,8 +73,6 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 from __future__ import annotations
 
 import argparse
-import io
-import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -97,6 +95,7 @@ from fmugym.tools.learning import add_train
 from fmugym.tools.options import note
 from fmugym.tools.playing import add_bench, add_evaluate, add_record, add_simulate
 from fmugym.tools.showing import add_demo
+from fmugym.tools.streams import drop_output, escape_what_consoles_lack, keep_output_from_fmus
 
 __all__ = ["main"]
 
@@ -119,7 +118,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
     """
-    _escape_what_consoles_lack()
+    if argv is None:
+        keep_output_from_fmus()
+    escape_what_consoles_lack()
     arguments = _parsed(argv)
     try:
         code: int = arguments.run(arguments) or 0
@@ -128,18 +129,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         return exit_code(error)
     except BrokenPipeError:  # the reader, for example ``head``, has ended
-        _drop_output()
+        drop_output()
     except (FMUGymError, OSError) as error:
         note(_told(error), "error")
         return 1
     return 0
-
-
-def _escape_what_consoles_lack() -> None:
-    """Names and descriptions of an FMU may have letters that an old console cannot show."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _told(error: Exception) -> str:
@@ -176,8 +170,3 @@ def _parser() -> tuple[argparse.ArgumentParser, Sequence[str]]:
     for add in _COMMANDS:
         add(commands)
     return parser, tuple(commands.choices)
-
-
-def _drop_output() -> None:
-    """Discard what is still buffered, which the interpreter would complain about at its end."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -23,6 +23,9 @@ __all__ = ["Score", "confidence", "each_score", "evaluate", "plot_scores", "tabl
 _Z: Final = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
 
+_LEAST_WIDTH: Final = 0.01
+"""The least width of an axis, as a fraction of its largest value."""
+
 _LONGEST_LABEL: Final = 48
 
 Wrap = Callable[[FMUEnv], Any]
@@ -214,8 +217,8 @@ def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
 def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     """Draw rewards and costs: each episode, the mean, and its 95 % confidence interval.
 
-    Random actions are left out beside two others or more: they are so much worse that the others
-    could not be told apart.
+    Random actions are left out beside two others or more if they are worse than all of these: often
+    by so much that the others could not be told apart.
 
     Args:
         scores: The scores.
@@ -226,8 +229,7 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
         ConfigError: If Matplotlib is missing.
     """
     figures: Any = imported("matplotlib.figure", "plot")
-    others = [score for score in scores if score.name != "random"]
-    scores = others if len({score.name for score in others}) > 1 else scores
+    scores = _worth_drawing(scores)
     groups = {"reward of an episode": [score.rewards for score in scores]}
     if all(score.costs for score in scores):
         groups["cost of an episode"] = [score.costs for score in scores]
@@ -244,6 +246,14 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     figure.savefig(path, dpi=150)
 
 
+def _worth_drawing(scores: Sequence[Score]) -> Sequence[Score]:
+    others = [score for score in scores if score.name != "random"]
+    randoms = [np.mean(score.rewards) for score in scores if score.name == "random"]
+    if not randoms or len({score.name for score in others}) < 2:
+        return scores
+    return others if max(randoms) < min(np.mean(score.rewards) for score in others) else scores
+
+
 def _shortened(text: str) -> str:
     shown = text.replace("$", r"\$")
     return shown if len(shown) <= _LONGEST_LABEL else f"{shown[: _LONGEST_LABEL - 3]}..."
@@ -255,7 +265,16 @@ def _draw_scores(axis: Any, groups: Sequence[Sequence[float]]) -> None:
         half = confidence(values) or 0.0
         style = {"capsize": 4, "markersize": 6, "linewidth": 1.6}
         axis.errorbar(np.mean(values), row, xerr=half, fmt="o", color="#0072b2", **style)
+    _widen(axis)
     axis.set_ylim(-0.6, len(groups) - 0.4)
     axis.grid(axis="x", color="#e4e4e4")
     axis.set_axisbelow(True)
     axis.spines[["top", "right"]].set_visible(False)
+
+
+def _widen(axis: Any) -> None:
+    """Let nearly equal values look nearly equal, and give each tick its whole number."""
+    low, high = axis.get_xlim()
+    center, width = (low + high) / 2.0, max(high - low, _LEAST_WIDTH * max(abs(low), abs(high)))
+    axis.set_xlim(center - width / 2.0, center + width / 2.0)
+    axis.ticklabel_format(axis="x", useOffset=False)

@@ -34,7 +34,10 @@ _silent: Final = logging.Logger("fmugym.trial.spare", logging.CRITICAL + 1)
 
 @dataclass(frozen=True)
 class _Run:
-    """The outputs before the first step and after each, and the statuses of the steps."""
+    """The outputs before the first step and after each, and the statuses of the steps.
+
+    A step with a warning counts as one without.
+    """
 
     rows: FloatArray
     statuses: tuple[int, ...]
@@ -42,7 +45,8 @@ class _Run:
     @classmethod
     def of(cls, tape: Tape) -> _Run:
         """What the training has seen."""
-        return cls(np.vstack([tape.first_outputs, tape.outputs]), tuple(tape.statuses.tolist()))
+        rows = np.vstack([tape.first_outputs, tape.outputs])
+        return cls(rows, tuple(map(_without_warning, tape.statuses.tolist())))
 
     def until(self, step: int) -> tuple[bytes, tuple[int, ...]]:
         """The run up to a step; equal runs are the same to the last bit."""
@@ -187,6 +191,10 @@ def _rank(method: ResetMethod) -> int:
     return list(ResetMethod).index(method)
 
 
+def _without_warning(status: int) -> int:
+    return Status.OK if status == Status.WARNING else status
+
+
 def _played(pool: Pool, tape: Tape) -> _Run:
     outputs, statuses = pool.reset(tape.variables, tape.starts[:, None])
     rows, codes = [outputs[:, 0].copy()], []
@@ -195,5 +203,5 @@ def _played(pool: Pool, tape: Tape) -> _Run:
             break
         outputs, statuses = pool.step(row[:, None])
         rows.append(outputs[:, 0].copy())
-        codes.append(int(statuses[0]))
+        codes.append(_without_warning(int(statuses[0])))
     return _Run(np.array(rows), tuple(codes))

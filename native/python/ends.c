@@ -207,11 +207,10 @@ static PyObject *seen_by(Observed *o, const Form *form, size_t index, PyObject *
     }
     PyObject *dict = PyDict_New();
     for (size_t i = 0; i < form->count && dict != NULL; i++) {
-        PyObject *item = seen_by(o, &form->items[i], index, arrays, memory);
-        if (item == NULL || PyDict_SetItem(dict, form->items[i].name, item) < 0) {
+        const Form *item = &form->items[i];
+        if (!set_item(dict, item->name, seen_by(o, item, index, arrays, memory))) {
             Py_CLEAR(dict);
         }
-        Py_XDECREF(item);
     }
     return dict;
 }

@@ -69,17 +69,22 @@ void form_drop(Form *form) {
     *form = (Form){.is_array = false};
 }
 
+bool set_item(PyObject *dict, PyObject *name, PyObject *object) {
+    const bool is_set = object != NULL && PyDict_SetItem(dict, name, object) == 0;
+
+    Py_XDECREF(object);
+    return is_set;
+}
+
 PyObject *form_of(const Form *form, PyObject *const *arrays) {
     if (form->is_array) {
         return Py_NewRef(arrays[form->array]);
     }
     PyObject *dict = PyDict_New();
     for (size_t i = 0; i < form->count && dict != NULL; i++) {
-        PyObject *value = form_of(&form->items[i], arrays);
-        if (value == NULL || PyDict_SetItem(dict, form->items[i].name, value) < 0) {
+        if (!set_item(dict, form->items[i].name, form_of(&form->items[i], arrays))) {
             Py_CLEAR(dict);
         }
-        Py_XDECREF(value);
     }
     return dict;
 }

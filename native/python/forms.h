@@ -20,6 +20,10 @@ struct Form {
 bool form_take(Form *form, PyObject *parts, size_t number_of_arrays);
 void form_drop(Form *form);
 
+/* Sets an item of a dict to an object, whose reference ends here. Returns false with an exception if
+ * there is no object, or if memory runs out. */
+bool set_item(PyObject *dict, PyObject *name, PyObject *object);
+
 /* Returns the array, or a new dict of arrays; NULL with an exception if memory runs out. */
 PyObject *form_of(const Form *form, PyObject *const *arrays);
 

@@ -134,14 +134,6 @@ static PyObject *value_of(Infos *in, size_t number, const Origin *origin) {
     return value;
 }
 
-/* Sets an item to an object, whose reference ends here. */
-static bool set(PyObject *dict, PyObject *name, PyObject *object) {
-    const bool is_set = object != NULL && PyDict_SetItem(dict, name, object) == 0;
-
-    Py_XDECREF(object);
-    return is_set;
-}
-
 static bool add_items(Infos *in, const Form *form, Origin *origin, PyObject *dict);
 
 static PyObject *dict_of(Infos *in, const Form *form, Origin *origin) {
@@ -162,11 +154,11 @@ static bool add_items(Infos *in, const Form *form, Origin *origin, PyObject *dic
         const Form *item = &form->items[i];
         PyObject *mask = mask_of(in, origin);
         origin->item++;
-        if (mask == NULL || !set(dict, item->name, item_of(in, item, origin))) {
+        if (mask == NULL || !set_item(dict, item->name, item_of(in, item, origin))) {
             Py_XDECREF(mask);
             return false;
         }
-        if (!set(dict, item->name_of_mask, mask)) {
+        if (!set_item(dict, item->name_of_mask, mask)) {
             return false;
         }
     }

@@ -252,18 +252,10 @@ static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
     return dict;
 }
 
-/* Sets an item to an object, whose reference ends here. */
-static bool add(PyObject *dict, PyObject *name, PyObject *object) {
-    const bool added = object != NULL && PyDict_SetItem(dict, name, object) == 0;
-
-    Py_XDECREF(object);
-    return added;
-}
-
 static bool add_starts(const Telling *t, PyObject *infos, const ResultArrays *a) {
     PyObject *mask = a->arrays[MASK_ARRAY];
 
-    return add(infos, t->name, late_dict(t, a->arrays[DRAWN_ARRAY], mask)) &&
+    return set_item(infos, t->name, late_dict(t, a->arrays[DRAWN_ARRAY], mask)) &&
            PyDict_SetItem(infos, t->name_of_mask, mask) == 0;
 }
 
@@ -294,10 +286,10 @@ static PyObject *final_observations(Results *r, const ResultArrays *a) {
 static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
     PyObject *const *names = r->names_at_ends;
 
-    return add(infos, names[0], final_observations(r, a)) &&
-           add(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) &&
-           add(infos, names[2], final_infos(r, a)) &&
-           add(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a));
+    return set_item(infos, names[0], final_observations(r, a)) &&
+           set_item(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) &&
+           set_item(infos, names[2], final_infos(r, a)) &&
+           set_item(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a));
 }
 
 static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {

@@ -212,6 +212,9 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
         me->values[CALLS] += 1.0;
         me->stopped = strncmp(me->token, "stops", 5) == 0 && me->values[CLOCK] >= 0.35;
     }
+    if (is(me, "warns") && me->resets == 0) {
+        return WARNING;
+    }
     return me->stopped && FMI_VERSION == 2 ? DISCARD : OK;
 }
 

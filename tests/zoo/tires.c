@@ -6,7 +6,7 @@
    "stubborn": a reset does nothing from the start.
    "noise": every step adds a random number if the environment variable TIRES_NOISE is set.
    "crash": the process ends if the first step of all instances has an input of 1.
-   "fails": instead of another value, the step returns Error.
+   "fails", "warns": instead of another value, the step returns Error or Warning.
    y' = gain u. Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter). */
 
 #include "zoo.h"
@@ -64,9 +64,10 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
     } else if (me->keep > 0.0 && is(me, "fails")) {
         return ERROR;
     }
-    v[Y] += step_size * v[GAIN] * v[U] + me->keep;
+    const bool warns = me->keep > 0.0 && is(me, "warns");
+    v[Y] += step_size * v[GAIN] * v[U] + (warns ? 0.0 : me->keep);
     me->keep = 0.0;
-    return OK;
+    return warns ? WARNING : OK;
 }
 
 int zoo_get(Animal *me, const unsigned *references, size_t count, double *values) {

@@ -1,0 +1,117 @@
+"""Many systems that step together: each does what it does alone, whatever happens to the others."""
+
+import re
+
+import numpy as np
+import pytest
+from system_tools import (
+    by_each_master,
+    closing_pools,  # noqa: F401  # the fixture "make"
+    linear,
+    linear_fmu,
+    system,
+)
+
+from fmugym.fmi.status import Status
+from fmugym.pool import has_native_pool
+from fmugym.systems.plan import Evaluation, Group, Link, Loop, SystemPlan
+
+pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+
+NAMES = ("a", "b", "c")
+COUNT = 150
+"""More than step together."""
+
+FAULTS = (0, 0, 0, 1, 2, 3, 4)
+STARTS = tuple(f"{name}.{what}" for name in NAMES for what in ("x1_0", "fails", "status"))
+OUTPUTS = tuple(f"{name}.{what}" for name in NAMES for what in ("y1", "t", "u1"))
+OSCILLATOR = {"a": [[0, 1], [-4, -0.1]], "b": [[0, 0], [1, 0]], "c": [[1, 0], [0, 1]]}
+
+
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    """The FMU of linear equations by FMI version."""
+    folder = tmp_path_factory.mktemp("linear")
+    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
+
+
+def oscillators(fmus, versions, steps, master, feedthrough=0.0):
+    parts = [
+        linear(name, fmus[version], steps=number, d=[[feedthrough, 0], [0, 0]], **OSCILLATOR)
+        for name, version, number in zip(NAMES, versions, steps, strict=True)
+    ]
+    links = (
+        Link("a", "y1", "b", "u1", 0.5, 0.1),
+        Link("b", "y1", "c", "u1"),
+        Link("c", "y2", "a", "u2"),
+    )
+    return system(parts, links, name="chain", master=master)
+
+
+def loop(fmus, master):
+    """The first two are an algebraic loop."""
+    plan = oscillators(fmus, (2, 3, 1), (1, 1, 1), master, 0.3)
+    links = (*plan.links, Link("b", "y1", "a", "u1", -0.5))
+    circle = Loop("newton")
+    evaluations = (Evaluation((0, 3), circle), Evaluation((1,)), Evaluation((2,)))
+    groups = (Group(("a", "b"), circle), Group(("c",)))
+    return SystemPlan("chain", plan.components, links, groups, evaluations, master)
+
+
+PLANS = {
+    "plain": lambda fmus, master: oscillators(fmus, (2, 3, 1), (1, 1, 1), master),
+    "multirate": lambda fmus, master: oscillators(fmus, (3, 2, 2), (1, 3, 1), master),
+    "loop": loop,
+}
+
+
+def starts_of(rng):
+    """Some components are to fail, some to grow beyond all numbers."""
+    values = np.zeros((len(STARTS), COUNT))
+    for column in values.T:
+        of_parts = column.reshape(len(NAMES), 3)
+        of_parts[:, 0] = rng.uniform(-1, 1, len(NAMES))
+        of_parts[rng.integers(3), 1:] = rng.uniform(0.1, 0.8), rng.choice(FAULTS)
+        if rng.random() < 0.1:
+            of_parts[rng.integers(3), 0] = 1.5e308
+    return values
+
+
+def told(pool, statuses):
+    """What the pool says of its failures, without the numbers of the systems."""
+    failures = [pool.failure(i) for i in np.flatnonzero(statuses > Status.WARNING)]
+    return [re.sub(r"chain_\d+", "chain", text) for text in failures]
+
+
+def run(pool, seed):
+    """Two episodes, of which half of the second begin while the first go on."""
+    rng, rows = np.random.default_rng(seed), []
+    start = tuple(map(pool.variable, STARTS))
+    for mask in (None, np.arange(COUNT) % 2 == 0):
+        _, statuses = pool.reset(start, starts_of(rng), mask)
+        rows.append((pool.outputs.tobytes(), statuses.tolist(), told(pool, statuses)))
+        for _ in range(8):
+            _, statuses = pool.step(rng.uniform(-1, 1, (1, COUNT)))
+            rows.append((pool.outputs.tobytes(), statuses.tolist(), told(pool, statuses)))
+    return rows
+
+
+@by_each_master
+@pytest.mark.parametrize("name", PLANS)
+def test_each_does_what_it_does_in_python(make, fmus, name, master):
+    rows = []
+    for native in (False, True):
+        plan = PLANS[name](fmus, master)
+        pool = make(plan, ["c.u2"], OUTPUTS, native, COUNT)
+        rows.append(run(pool, 1))
+    seen = {status for _, statuses, _ in rows[0] for status in statuses}
+    assert seen >= {
+        0,
+        Status.DISCARD,
+        Status.ERROR,
+        Status.FATAL,
+        Status.TERMINATED,
+        Status.NOT_FINITE,
+    }
+    for python, native in zip(*rows, strict=True):
+        assert python == native
