@@ -381,29 +381,26 @@ class FMUEnv(Constructed):
         self._take_usable(action)
         self._input_writer.write(self.inputs, self._input_row)
 
-    def _take_usable(self, action: Any) -> tuple[Any, Any, Any]:
-        """Make the inputs for an action that was checked already.
-
-        Returns:
-            What ``_give_up`` needs.
-        """
-        before = self.previous_action, self.previous_state, self.inputs
+    def _take_usable(self, action: Any) -> None:
+        """Make the inputs for an action that was checked already."""
+        before = self.action, self.previous_action, self.previous_state, self.inputs
         self.previous_action, self.previous_state, self.action = self.action, self.state, action
         try:
             self.inputs = self._input_writer.checked(self._get_inputs(), action)
         except BaseException as error:  # the FMU was not touched: a better action may follow
             self._give_up(before)
-            if self._blames_action(action, error):
-                raise ConfigError(
-                    f"action {shown(action)} is not in {self.action_space}: {shown(error)}"
-                ) from error
+            blaming = self._blame(action, error)
+            if blaming is not None:
+                raise blaming from error
             raise
-        return before
 
-    def _give_up(self, before: tuple[Any, Any, Any]) -> None:
-        """Return to before an action was taken, if the FMU has not stepped."""
-        self.action = self.previous_action
-        self.previous_action, self.previous_state, self.inputs = before
+    def _give_up(self, before: tuple[Any, Any, Any, Any]) -> None:
+        """Return to before an action was taken, if the FMU has not stepped.
+
+        Args:
+            before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
+        """
+        self.action, self.previous_action, self.previous_state, self.inputs = before
 
     def _require_usable(self, action: Any) -> None:
         elements = self._elements
@@ -413,13 +410,13 @@ class FMUEnv(Constructed):
         elif has_nan(action):
             raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
 
-    def _blames_action(self, action: Any, error: BaseException) -> bool:
-        """Whether ``_get_inputs`` failed because of an action outside of the action space."""
+    def _blame(self, action: Any, error: BaseException) -> ConfigError | None:
+        """The error if ``_get_inputs`` failed because of an action outside of the action space."""
         if isinstance(error, FMUGymError) or not isinstance(error, Exception):
-            return False
-        if self._own.step:  # then its actions may be others
-            return False
-        return is_misfit(action, self.action_space, error)
+            return None
+        if self._own.step or not is_misfit(action, self.action_space, error):
+            return None  # with a step of its own, its actions may be others
+        return ConfigError(f"action {shown(action)} is not in {self.action_space}: {shown(error)}")
 
     def _conclude(
         self, pool: Pool, status: int, values: tuple[float, ...] | None = None, observed: Any = None

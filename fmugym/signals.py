@@ -6,7 +6,7 @@ import signal
 from types import CodeType
 from typing import Any
 
-__all__ = ["is_of_signal_handler"]
+__all__ = ["is_of_signal_handler", "let_through"]
 
 
 def is_of_signal_handler(error: BaseException | None) -> bool:
@@ -20,6 +20,12 @@ def is_of_signal_handler(error: BaseException | None) -> bool:
             place = place.tb_next
         error = error.__cause__ or error.__context__
     return False
+
+
+def let_through(error: BaseException) -> None:
+    """Raise an exception again if a signal handler has raised it."""
+    if is_of_signal_handler(error):
+        raise error
 
 
 def _code_of(handler: Any) -> CodeType | None:

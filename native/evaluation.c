@@ -59,11 +59,10 @@ static bool are_same(const void *values, size_t count, size_t size) {
     return memcmp(values, (const char *)values + size, (count - 1) * size) == 0;
 }
 
-/* Whether an operation takes much time, and all of a run would compute the same. Nearly all such
- * operands are 8 bytes wide. */
+/* Whether an operation takes much time, and would compute the same for all of a run. */
 static bool is_shared(const Evaluation *e, Instruction i) {
     const void *const *places = e->registers->places;
-    const size_t size = sizeof(double);
+    const size_t size = sizeof(double); /* these operations take nothing else */
 
     switch (i.operation) {
     case INTERPOLATE:

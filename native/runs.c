@@ -340,6 +340,10 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
     if (!pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
         return conclude_steps(task, begin, line, scratch);
     }
+    if (line->others == 0) {
+        memset(pool->settings.status + begin, STATUS_OK, line->count);
+        return 0;
+    }
     for (size_t i = 0; i < line->count; i++) {
         pool->settings.status[begin + line->places[i]] = STATUS_OK;
     }

@@ -35,12 +35,24 @@ def library(*sources, flags=(), stubs=None):
         flags: More arguments of the compiler.
         stubs: The text of the file that the sources include as ``STUBS``.
     """
-    digest = hashlib.sha256(repr((sources, flags, stubs)).encode()).hexdigest()[:16]
+    key = sources, flags, stubs
+    return once(key, fmpy.sharedLibraryExtension, lambda path: _compile(path, *key))
+
+
+def once(key, suffix, build):
+    """The bytes of a file that one process of a test run builds, and the others find.
+
+    Args:
+        key: What the file depends on.
+        suffix: That of its name.
+        build: Writes it to a path.
+    """
+    digest = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
     with contextlib.ExitStack() as stack:
         folder = os.environ.get(FOLDER) or stack.enter_context(tempfile.TemporaryDirectory())
-        path = Path(folder) / f"{digest}{fmpy.sharedLibraryExtension}"
+        path = Path(folder) / f"{digest}{suffix}"
         if not path.exists():
-            _compile(path, sources, flags, stubs)
+            build(path)
         return path.read_bytes()
 
 

@@ -258,7 +258,7 @@ class TestRetries:
 
     def test_of_an_fmu_that_cannot(self, lawful):
         with pytest.raises(
-            ConfigError, match="'fault_retries': Lawful must be able to get and set"
+            ConfigError, match=r"'fault_retries' needs an FMU that can get and set .* Lawful"
         ):
             LawfulEnv(lawful[1], fault_retries=1)
 

@@ -446,6 +446,14 @@ class TestMistakes:
             with pytest.raises(FMULoadError, match=fact):
                 FMUSystem.read(path)
 
+    @pytest.mark.parametrize("kind", ["input", "output"])
+    def test_units_with_a_factor_of_0(self, pack, kind):
+        ends = ("q", "h.Q_int") if kind == "input" else ("h.Q_em", "q")
+        root = system("r", {"q": f"{kind} odd"}, [component("h", HOUSE_PORTS)], [connection(*ends)])
+        unit = '<ssc:Unit name="odd"><ssc:BaseUnit kg="1" m="2" s="-3" factor="0"/></ssc:Unit>'
+        with pytest.raises(FMULoadError, match=r"line 3.*'odd' is 0"):
+            FMUSystem.read(pack(root, f"<ssd:Units>{unit}</ssd:Units>"))
+
 
 class TestDamaged:
     """Whatever is in a file, an error of this package says so, or the system can be written."""

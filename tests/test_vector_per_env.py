@@ -1,11 +1,9 @@
 """Hooks that are called one environment at a time: what comes of their observations and inputs."""
 
-import signal
-
 import numpy as np
 import pytest
 from gymnasium import spaces
-from vector_tools import Drawing
+from vector_tools import Drawing, RingError, Ringing, handler  # noqa: F401
 
 import fmugym
 from fmugym import ConfigError
@@ -87,35 +85,8 @@ class Stepping(Drawing):
         return self.observed, *rest
 
 
-class RingError(Exception):
-    """What the handler of a signal raises."""
-
-
-class Ringing(list):
-    """A signal comes while this is converted."""
-
-    def __array__(self, *_, **__):
-        signal.raise_signal(signal.SIGTERM)
-
-    def __getitem__(self, _):
-        signal.raise_signal(signal.SIGTERM)
-
-    __len__ = __iter__ = keys = lambda self: self[0]
-
-
-@pytest.fixture
-def handler():
-    """Let a signal raise ``RingError``."""
-
-    def ring(*_):
-        raise RingError
-
-    before = signal.signal(signal.SIGTERM, ring)
-    yield
-    signal.signal(signal.SIGTERM, before)
-
-
-def test_what_a_signal_handler_raises_in_a_conversion_comes_out(handler, monkeypatch):
+@pytest.mark.usefixtures("handler")
+def test_what_a_signal_handler_raises_in_a_conversion_comes_out(monkeypatch):
     envs = FMUVectorEnv(Stepping, 2, hooks="per_env")
     envs.reset(seed=0)
     monkeypatch.setattr(Stepping, "observed", Ringing())
@@ -124,8 +95,9 @@ def test_what_a_signal_handler_raises_in_a_conversion_comes_out(handler, monkeyp
     envs.close()
 
 
+@pytest.mark.usefixtures("handler")
 @pytest.mark.parametrize("cls", [SharedArray, OfOtherTypes])
-def test_so_it_does_in_a_single_environment(cls, handler, monkeypatch):
+def test_so_it_does_in_a_single_environment(cls, monkeypatch):
     """``OfOtherTypes`` observes a dict."""
     env = cls()
     env.reset(seed=0)

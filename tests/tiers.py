@@ -53,6 +53,8 @@ SLOW_MODULES = {
     "test_value_types",
     "test_vector_ends",
     "test_vector_masks",
+    "test_vector_per_env_inputs",
+    "test_vector_signals",
     "test_vector_variables",
     "test_systems",
     "test_systems_apart",

@@ -49,15 +49,23 @@ def _library(model, version):
 @functools.cache
 def windows_library(*sources, flags=(), stubs=""):
     """The bytes of a library for Windows; the arguments are those of ``building.library``."""
+    key = sources, flags, stubs or ""
+    return building.once(key, ".dll", lambda path: _compile(path, *key))
+
+
+def _compile(path, sources, flags, stubs):
+    """Compile elsewhere and move the result, for another process may do the same.
+
+    The name that the library is compiled under becomes a part of it.
+    """
     command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
     command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
-    stubs = stubs or ""
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         (Path(folder) / "stubs.h").write_text(stubs)
         target = Path(folder) / "made.dll"
         files = [building.HERE / source for source in sources]
         subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
-        return target.read_bytes()
+        target.replace(path)
 
 
 @contextlib.contextmanager

@@ -40,7 +40,7 @@ _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 
 
 
 MOST_ELEMENTS: Final = 100_000
-"""How many elements an array may have of which elements are named."""
+"""The most elements of an array whose elements have names."""
 
 CLOCK_KINDS = (
     "constant",

@@ -232,8 +232,9 @@ def _statistics(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Iterator
 
 
 def _statistic(name: str, reference: int, text: str, unit: str | None) -> Variable:
-    kind = "Real", reference, "local", "discrete", "calculated"
-    return Variable(name, *kind, unit=unit, description=text)
+    return Variable(
+        name, "Real", reference, "local", "discrete", "calculated", unit=unit, description=text
+    )
 
 
 def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:

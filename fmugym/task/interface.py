@@ -49,6 +49,7 @@ class Interface:
             that is drawn last.
         config: The config.
         description: That of the FMU.
+        limits: Minimum and maximum by name, where the config has bounds.
         texts: By name, those that Strings may get besides what ``parameters`` has.
     """
 
@@ -183,20 +184,24 @@ class Interface:
         linear = _by_scalar(self.description, names, self.inputs, kind)
         ramped = tuple(variable for variable in self.inputs if variable.name in linear)
         for variable in ramped:
-            unable = self.description.unable_to_interpolate(variable)
-            if unable is not None:
-                raise ConfigError(
-                    f"config key 'input_interpolation': {unable}; {variable.name!r} can only hold"
-                )
-            found = variable.variability, variable.causality, variable.is_scalar
-            if found != ("continuous", "input", True) or variable.type not in {"Real", "Float64"}:
-                element = "" if variable.is_scalar else ", an element of an array"
-                raise ConfigError(
-                    f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
-                    f"a {variable.variability} {variable.causality} of type {variable.type}"
-                    f"{element}; expected a continuous scalar input of type Real or Float64"
-                )
+            self._require_linear(variable)
         return ramped
+
+    def _require_linear(self, variable: Variable) -> None:
+        """Refuse an input that cannot change linearly; see ``_ramped``."""
+        unable = self.description.unable_to_interpolate(variable)
+        if unable is not None:
+            raise ConfigError(
+                f"config key 'input_interpolation': {unable}; {variable.name!r} can only hold"
+            )
+        found = variable.variability, variable.causality, variable.is_scalar
+        if found != ("continuous", "input", True) or variable.type not in {"Real", "Float64"}:
+            element = "" if variable.is_scalar else ", an element of an array"
+            raise ConfigError(
+                f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
+                f"a {variable.variability} {variable.causality} of type {variable.type}"
+                f"{element}; expected a continuous scalar input of type Real or Float64"
+            )
 
     def _max_step(self) -> float | None:
         """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
@@ -238,8 +243,8 @@ class Interface:
         ):
             return
         raise ConfigError(
-            f"config key 'fault_retries': {self.description.model_name} must be able to get and "
-            "set its FMU state and to handle variable communication step sizes, and is not"
+            "config key 'fault_retries' needs an FMU that can get and set its state and handle "
+            f"variable communication step sizes; {self.description.model_name} cannot do both"
         )
 
 

@@ -41,6 +41,9 @@ _FEWEST_ENVS: Final = 8
 _WIDE: Final = 100.0
 """An observation that is larger by this factor than another one hides it from most networks."""
 
+_UNEVEN: Final = "of very different sizes"
+"""How the finding about such observations begins, for which ``normalize`` is recommended."""
+
 
 @dataclass(frozen=True)
 class _Episode:
@@ -112,7 +115,7 @@ def _isolates(env: FMUEnv) -> bool:
 def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advice]:
     """Lines for what other checks have found."""
     if recommended.get("normalize") and _has_limits(env.observation_space):
-        yield Advice("agent", "normalize", True, "observations are of very different sizes")
+        yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
     if "isolation" in recommended:
         yield Advice("config", "isolation", "process", "instances disturb each other, or crash")
 
@@ -143,7 +146,7 @@ def _recommended(
     settings: dict[str, Any] = {}
     if hooks != "none":
         settings["envs"] = next((n for most, n in _ENVS if step_time < most), _FEWEST_ENVS)
-    if any("very different sizes" in finding.text for finding in findings):
+    if any(finding.text.startswith(_UNEVEN) for finding in findings):
         settings["normalize"] = True
     if _isolates(env):
         settings["isolation"] = "process"
@@ -407,7 +410,7 @@ def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "observations",
-            f"of very different sizes: {largest} reaches {sizes.max():.4g}",
+            f"{_UNEVEN}: {largest} reaches {sizes.max():.4g}",
             "give min and max and normalize = true under [agent], or another unit",
         )
 

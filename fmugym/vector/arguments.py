@@ -19,6 +19,7 @@ from fmugym.checks import (
 )
 from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
+from fmugym.signals import let_through
 
 __all__ = [
     "ARGUMENTS",
@@ -184,7 +185,8 @@ def _elements(values: Any) -> list[Any] | None:
         return None
     try:
         return list(values)
-    except Exception:  # an array without a dimension, or the user's own __iter__
+    except Exception as error:  # an array without a dimension, or the user's own __iter__
+        let_through(error)
         return None
 
 
@@ -218,7 +220,8 @@ def checked_mask(mask: Any, num_envs: int) -> MaskArray:
     try:
         array = np.array(mask)
         fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())
-    except Exception:  # lists that make no array, and the user's own __array__
+    except Exception as error:  # lists that make no array, and the user's own __array__
+        let_through(error)
         fits = False
     if not fits:
         raise ConfigError(

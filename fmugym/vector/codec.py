@@ -9,6 +9,8 @@ a dict of such arrays, with a mask of its own.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
+from fmugym.signals import let_through
 
 __all__ = ["coded", "gathered", "handed_out", "with_masks", "within"]
 
@@ -62,26 +65,34 @@ def gathered(infos: Mapping[int, Mapping[str, Any]], count: int) -> dict[str, An
         ConfigError: If a value does not fit the first one of its name.
     """
     result: dict[str, Any] = {}
-    for name in dict.fromkeys(name for info in infos.values() for name in info):
-        own = {index: info[name] for index, info in infos.items() if name in info}
+    indices, rows = list(infos), list(infos.values())
+    for name in dict.fromkeys(chain.from_iterable(rows)):
+        own, places = [row[name] for row in rows if name in row], indices
+        if len(own) < len(rows):
+            places = [index for index, row in infos.items() if name in row]
         mask = np.zeros(count, np.bool_)
-        mask[list(own)] = True
-        result[name], result[f"_{name}"] = _gathered_values(name, own, count), mask
+        mask[places] = True
+        result[name], result[f"_{name}"] = _gathered_values(name, places, own, count), mask
     return result
 
 
-def _gathered_values(name: str, own: Mapping[int, Any], count: int) -> Any:
-    first = next(iter(own.values()))
+def _gathered_values(name: str, indices: list[int], own: list[Any], count: int) -> Any:
+    first = own[0]
     if isinstance(first, dict):
-        for index, value in own.items():
+        for index, value in zip(indices, own, strict=True):
             if not isinstance(value, dict):
                 raise _misfit(name, index, value)
-        return gathered(own, count)
+        return gathered(dict(zip(indices, own, strict=True)), count)
     values = _empty_for(first, count)
-    for index, value in own.items():
+    if values.dtype != object and values.ndim == 1 and set(map(type, own)) == {type(first)}:
+        with suppress(OverflowError):  # an integer is too large, and the loop finds out which
+            values[indices] = np.array(own, values.dtype)
+            return values
+    for index, value in zip(indices, own, strict=True):
         try:
             values[index] = value
-        except Exception:  # users' infos may raise anything
+        except Exception as error:  # users' infos may raise anything
+            let_through(error)
             raise _misfit(name, index, value) from None
     return values
 

@@ -306,12 +306,17 @@ def read_units(xml: Any) -> dict[str, Unit]:
     """Read the definitions of units of a file.
 
     Raises:
-        FMULoadError: If a number is none.
+        FMULoadError: If a number is none, or a factor is 0.
     """
     units = {}
     for one in children(xml, "Units/Unit"):
         for base in children(one, "BaseUnit"):
             dimension = tuple(round(number_in(base, name)) for name in BASE_UNITS)
             factor, offset = number_in(base, "factor", 1.0), number_in(base, "offset")
+            if factor == 0.0:
+                raise FMULoadError(
+                    f"line {base.sourceline}: factor of the unit {shown(one.get('name'))} is 0, "
+                    "expected another number"
+                )
             units[one.get("name") or ""] = Unit(dimension, factor, offset)
     return units

@@ -34,7 +34,7 @@ class Outcomes:
 
     Attributes:
         rewards, terminated, truncated: Those of each environment.
-        infos: The infos that are not empty, by the number of the environment.
+        infos: The infos, by the number of the environment; one that is missing is empty.
         values: The outputs before the step, of environments whose numbers are not checked yet.
         variables: Copies of their episode variables, where hooks write them.
         misfits: Their observations that are not finite, as hooks returned them.
@@ -68,6 +68,10 @@ class Outcomes:
             return []
         found = {*np.flatnonzero(~fine).tolist(), *self.misfits}
         return sorted(index for index in found if self.values[index] is not None)
+
+    def sorted_infos(self) -> dict[int, Mapping[str, Any]]:
+        """The infos in the order of the environments."""
+        return {index: self.infos[index] for index in sorted(self.infos)}
 
     def arrays(self) -> tuple[FloatArray, MaskArray, MaskArray]:
         """The rewards, terminated and truncated, each of shape (N,)."""

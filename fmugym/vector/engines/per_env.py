@@ -6,7 +6,8 @@ import copy
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain, compress
+from itertools import compress
+from math import isfinite
 from operator import not_
 from types import MappingProxyType
 from typing import Any, cast
@@ -19,6 +20,7 @@ from fmugym.env import IN_POOL, FMUEnv, Result
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
+from fmugym.signals import let_through
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.task.step import conclude
@@ -28,6 +30,7 @@ from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.outcomes import Outcomes, Unconverted
+from fmugym.vector.engines.taken import Taken, in_time
 from fmugym.vector.stacking import PoolStack, Stack, make_stack
 
 __all__ = ["PerEnvEngine"]
@@ -149,35 +152,41 @@ class PerEnvEngine(Engine):
         items = self._actions(actions)
         idle = [False] * len(items) if resetting is None else resetting.tolist()
         try:
-            if self._together:
-                self._step_pool(items, idle, resetting)
+            running = [*compress(range(len(idle)), map(not_, idle))]
+            taken = self._step_pool(items, running, resetting) if self._together else None
             self.has_moved = True
-            return self._results(items, idle)
+            return self._results(items, running, taken)
         except BaseException:
             for env in self._envs:
                 env._in_hooks = False
                 env._ended = env._ended or self.has_moved  # its FMU has stepped without a result
             raise
 
-    def _results(self, items: Sequence[Any], idle: Sequence[bool]) -> StepResult:
+    def _results(self, items: Sequence[Any], running: list[int], taken: Taken | None) -> StepResult:
         outcomes = Outcomes(len(self._envs))
         if isinstance(self._stack, PoolStack):
             self._stack.refresh()
-        for index in compress(range(len(idle)), idle):
-            observation, info = self._reset(index, None, {})
-            self._note(outcomes, index, (observation, 0.0, False, False, info))
-        if self._together:
-            self._conclude(outcomes, idle)
+        if len(running) < len(self._envs):
+            self._start_others(outcomes, {*running})
+        if taken is None:
+            self._step_each(outcomes, items, running)
         else:
-            self._step_each(outcomes, items, idle)
+            self._conclude(outcomes, taken)
         rewards, terminated, truncated = outcomes.arrays()
         self.note_ends(terminated, truncated)
-        infos = gathered(dict(sorted(outcomes.infos.items())), len(self._envs))
+        infos = gathered(outcomes.sorted_infos(), len(self._envs))
         return StepResult(self._stack.joined(), rewards, terminated, truncated, infos)
 
-    def _step_each(self, outcomes: Outcomes, items: Sequence[Any], idle: Sequence[bool]) -> None:
+    def _start_others(self, outcomes: Outcomes, running: set[int]) -> None:
+        """Start episodes of the environments whose episodes do not go on."""
+        for index in range(len(self._envs)):
+            if index not in running:
+                observation, info = self._reset(index, None, {})
+                self._note(outcomes, index, (observation, 0.0, False, False, info))
+
+    def _step_each(self, outcomes: Outcomes, items: Sequence[Any], running: list[int]) -> None:
         """Call the steps of environments that have their own."""
-        for index in _running(idle):
+        for index in running:
             try:
                 result = self._envs[index].step(items[index])
             except FMUGymError as error:
@@ -193,20 +202,25 @@ class PerEnvEngine(Engine):
         if self._envs[index].step_count >= self._limit:
             outcomes.truncated[index] = True
 
-    def _conclude(self, outcomes: Outcomes, idle: Sequence[bool]) -> None:
+    def _conclude(self, outcomes: Outcomes, taken: Taken) -> None:
         """Ask the hooks of the environments whose FMUs have stepped for the results.
 
         Most numbers are checked when all are there, which takes much less time.
         """
-        status_of = self._pool.statuses.tolist()
-        told = map(tuple, self._pool.outputs.T.tolist())  # Python's floats are faster
+        status_of, outputs = self._pool.statuses.tolist(), self._pool.outputs
+        envs, indices, actions = self._envs, taken.indices, taken.actions
+        told = in_time(outputs if len(indices) == len(envs) else outputs[:, indices])
         index = 0
         try:
-            for index, (env, values) in enumerate(zip(self._envs, told, strict=True)):
-                if idle[index]:
-                    continue
+            for index, inputs, values in zip(indices, in_time(taken.rows.T), told, strict=True):
+                env = envs[index]
+                if actions is not None:
+                    env._in_hooks = True
+                    env.previous_action, env.previous_state = env.action, env.state
+                    env.action = actions[index]
+                env.inputs = inputs
                 env.step_count += 1
-                if status_of[index] or env._has_info or env.render_mode is not None:
+                if status_of[index] or env.render_mode is not None:
                     self._conclude_fully(outcomes, index, status_of[index], values)
                 else:
                     self._judge(outcomes, index, env, values)
@@ -219,7 +233,7 @@ class PerEnvEngine(Engine):
     def _judge(
         self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
     ) -> None:
-        """Do what ``FMUEnv._conclude`` does, for one that has no info, without checking numbers."""
+        """Do what ``FMUEnv._conclude`` does, but leave numbers unchecked where no info follows."""
         outcomes.values[index] = env._values
         if env._own.update:
             outcomes.variables[index] = env.variables.copy()
@@ -232,6 +246,8 @@ class PerEnvEngine(Engine):
         observation, reward, ended, cut_off = conclude(
             env, self._form, False, steps >= env._step_limit, observed
         )
+        if env._has_info and _are_finite(env, reward, observation):
+            outcomes.infos[index] = env._info()
         if observation is not IN_POOL and not self._take(index, observation):
             if env._is_finite(observation):
                 self._stack.put(index, observation)
@@ -247,7 +263,7 @@ class PerEnvEngine(Engine):
     def _conclude_fully(
         self, outcomes: Outcomes, index: int, status: int, values: tuple[float, ...]
     ) -> None:
-        """Let an environment conclude alone: it has infos or pictures, or its FMU a status."""
+        """Let an environment conclude alone: it has pictures, or its FMU a status."""
         env = self._envs[index]
         result = env._conclude(self._columns[index], status, values, self._observed)
         self._note(outcomes, index, result)
@@ -281,47 +297,49 @@ class PerEnvEngine(Engine):
             raise _located(error, index) from error
 
     def _step_pool(
-        self, actions: Sequence[Any], idle: Sequence[bool], resetting: MaskArray | None
-    ) -> None:
+        self, actions: Sequence[Any], running: list[int], resetting: MaskArray | None
+    ) -> Taken:
         """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
-        running = [*_running(idle)]
-        rows = self._directly_taken(actions, running) if self._are_direct() else None
-        if rows is None:
-            self._take_actions(actions, running)
-            inputs = chain.from_iterable([self._envs[index].inputs for index in running])
-            rows = np.fromiter(inputs, np.float64).reshape(len(running), len(self._pool.inputs))
-        self._pool.inputs[:, ... if resetting is None else ~resetting] = rows.T
+        taken = self._directly_taken(actions, running) if self._are_direct() else None
+        if taken is None:
+            taken = Taken(running, self._take_actions(actions, running), None)
+        self._pool.inputs[:, ... if resetting is None else ~resetting] = taken.rows.T
         self._pool.step(None, resetting, self._pool.observations)
+        return taken
 
-    def _directly_taken(self, actions: Sequence[Any], running: list[int]) -> FloatArray | None:
-        """Let environments take actions that are their inputs, too; return these, shape (M, k).
+    def _directly_taken(self, actions: Sequence[Any], running: list[int]) -> Taken | None:
+        """Take actions that are the inputs; the environments learn of them when they conclude.
 
         None if the actions do not make inputs, so that each environment has to be asked.
         """
         rows = self._envs[0]._input_writer.of_actions(np.asarray(actions)[running])
-        if rows is None:
-            return None
-        for index, inputs in zip(running, map(tuple, rows.tolist()), strict=True):
-            env = self._envs[index]
-            env._in_hooks = True
-            env.previous_action, env.previous_state = env.action, env.state
-            env.action, env.inputs = actions[index], inputs
-        return rows
+        return None if rows is None else Taken(running, rows, actions)
 
-    def _take_actions(self, actions: Sequence[Any], running: list[int]) -> None:
-        taken: list[Any] = []
+    def _take_actions(self, actions: Sequence[Any], running: list[int]) -> FloatArray:
+        """Ask environments for their inputs, shape (M, k)."""
+        writer, parts, index = self._envs[0]._input_writer, [], 0
+        befores: list[tuple[Any, Any, Any, Any]] = []
         try:
             for index in running:
-                env = self._envs[index]
+                env, action = self._envs[index], actions[index]
                 env._in_hooks = True
                 if not self._checks_all:
-                    env._require_usable(actions[index])
-                taken.append(env._take_usable(actions[index]))
+                    env._require_usable(action)
+                state, before = env.state, env.action
+                befores.append((before, env.previous_action, env.previous_state, env.inputs))
+                env.previous_action, env.previous_state, env.action = before, state, action
+                parts.append(writer.packed(env._get_inputs(), action))
+            rows = writer.unpacked(parts)
+            for place in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
+                index = running[place]
+                writer.checked(rows[place], actions[index])
+            return rows
         except BaseException as error:
-            for place, before in zip(running, taken, strict=False):
-                self._envs[place]._give_up(before)
-            if isinstance(error, FMUGymError):
-                raise _located(error, index) from error
+            for place, taken in zip(running, befores, strict=False):
+                self._envs[place]._give_up(taken)
+            blaming = self._envs[index]._blame(actions[index], error) or error
+            if isinstance(blaming, FMUGymError):
+                raise _located(blaming, index) from error
             raise
 
     def _actions(self, actions: Any) -> Sequence[Any]:
@@ -331,7 +349,8 @@ class PerEnvEngine(Engine):
             return cast(Sequence[Any], checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
-        except Exception:  # users' actions may raise anything
+        except Exception as error:  # users' actions may raise anything
+            let_through(error)
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"
             ) from None
@@ -364,8 +383,11 @@ class PerEnvEngine(Engine):
         return self._stack.joined()
 
 
-def _running(idle: Sequence[bool]) -> Iterator[int]:
-    return compress(range(len(idle)), map(not_, idle))
+def _are_finite(env: FMUEnv, reward: Any, observation: Any) -> bool:
+    """Whether the numbers of a step are finite, so that no fault follows."""
+    if observation is IN_POOL:
+        observation = env._observation_row
+    return isfinite(reward) and env._is_finite(observation)
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:

@@ -17,9 +17,10 @@ from fmugym.vector.hooks.symbols import LANES, as_symbols, has_symbols, lift
 
 __all__ = ["exclusive", "numpy_of"]
 
+_array_function, _full_function, _empty_function = np.array, np.full, np.empty
 
 _tracing = threading.local()
-
+"""Has the ``graph`` that this thread records, if any."""
 
 _lock = threading.RLock()
 
@@ -32,6 +33,9 @@ def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
         return graph.patched(own, function, args, keywords)
 
     return functools.update_wrapper(call, function)
+
+
+# What takes the place of numpy's functions: each gets the graph, the function and its arguments.
 
 
 def _array(
@@ -70,9 +74,6 @@ def _looked_up(graph: Graph, function: Any, *args: Any, **keywords: Any) -> Any:
     return function(*args, **keywords)
 
 
-_array_function, _full_function, _empty_function = np.array, np.full, np.empty
-
-
 def _of_list(graph: Graph, function: Any, a: Any, *args: Any, **keywords: Any) -> Any:
     is_list = isinstance(a, list | tuple) and has_symbols(a)
     return function(as_symbols(graph, a) if is_list else a, *args, **keywords)
@@ -89,13 +90,12 @@ _OVERRIDING: Final[Mapping[str, Any]] = {
     **dict.fromkeys((one.__name__ for one in (*sorting.FUNCTIONS, *nans.FUNCTIONS)), _of_list),
     **dict.fromkeys(("argmax", "argmin", "average", "dot", "cross", "inner"), _of_list),
 }
-
+"""What each function does with symbols, by its name."""
 
 _PATCHES: Final = [
     *((np, name, _patched(getattr(np, name), own)) for name, own in _OVERRIDING.items()),
     (np.linalg, "norm", _patched(np.linalg.norm, _of_list)),
 ]
-
 
 _ORIGINALS: Final = [(module, name, getattr(module, name)) for module, name, _ in _PATCHES]
 

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.signals import let_through
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
@@ -101,7 +102,8 @@ def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]
             return np.broadcast_to(array, (count,))
     except FMUGymError:
         raise
-    except Exception:  # it makes no array, or its own methods fail
+    except Exception as error:  # it makes no array, or its own methods fail
+        let_through(error)
         raise _mismatch(hook, value, wanted) from None
     raise _mismatch(hook, value, wanted)
 
@@ -113,7 +115,8 @@ def _expected(hook: str, value: Any, wanted: str) -> Iterator[None]:
         yield
     except FMUGymError:
         raise
-    except Exception:
+    except Exception as error:
+        let_through(error)
         raise _mismatch(hook, value, wanted) from None
 
 
@@ -168,7 +171,8 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     try:
         array = np.array(value)
         fits = array.dtype.kind in _NUMBERS and array.shape[-1:] in {(), (count,)}
-    except Exception:  # lists that make no array, or objects whose own methods fail
+    except Exception as error:  # lists that make no array, or objects whose own methods fail
+        let_through(error)
         fits = False
     if not fits:
         raise ConfigError(
