@@ -183,12 +183,19 @@ def test_before_the_first_action_in_parts_are_zeros():
         assert env.step(env.action_space.sample())[1] == 0.0
 
 
+class Adding(Summing):
+    """Assigns new arrays."""
+
+    def _update(self):
+        self.variables["sum"] = self.variables["sum"] + self.state[0]
+
+
 @needs_native
 def test_sums_go_on_when_steps_are_compiled_again():
     """While one episode has parameters of its own, all steps are done on arrays."""
     ours, theirs = (
         FMUVectorEnv(
-            lambda: Summing(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks
+            lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks
         )
         for hooks in ("compiled", "per_env")
     )
