@@ -338,3 +338,20 @@ def test_what_all_environments_share_is_found(task):
         expected += 0.1 * (state[0] - expected)
     assert task is Stepping or FILTER.value == rewards[-1] == expected
     envs.close()
+
+
+DATA = {"large": np.zeros(100_000), "small": np.zeros(3), "many": [[0.0] for _ in range(5000)]}
+
+
+class Reading(Drawing):
+    """Reads data outside of it."""
+
+    def _reward_policy(self):
+        return self.state[0] + DATA["small"][0]
+
+
+def test_large_data_outside_is_not_copied():
+    with Reading() as env:
+        kept = [one.value for one in Contents(env, outside=True)._kept]
+    assert any(value is DATA["small"] for value in kept)
+    assert not any(value is DATA["large"] or value is DATA["many"] for value in kept)

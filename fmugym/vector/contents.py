@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,6 +26,9 @@ _NOT_COMPARED: Final = frozenset(
     {*READINGS, "_in_hooks", "_input_row", "_output_row", "_observation_row"}
 )
 """Attributes that the caller of hooks and the pool change."""
+
+_LARGEST_OUTSIDE: Final = 2000
+"""Global variables with more elements are taken for data, which no hook changes."""
 
 _OURS: Final = ("fmugym", "gymnasium", "logging")
 """Packages whose objects hooks only read."""
@@ -74,9 +78,10 @@ class Contents:
         self._outside = [(place, name, place[name]) for place, name in places]
         self._first_outside = len(self._kept)
         for _, name, value in self._outside:
-            self._keep(name or type(value).__name__, value, seen)
+            largest = self._first_outside + _LARGEST_OUTSIDE
+            self._keep(name or type(value).__name__, value, seen, largest)
 
-    def _keep(self, attribute: str, value: Any, seen: set[int]) -> None:
+    def _keep(self, attribute: str, value: Any, seen: set[int], largest: float = math.inf) -> None:
         waiting = [value]
         while waiting:
             value = waiting.pop()
@@ -85,7 +90,7 @@ class Contents:
             seen.add(id(value))
             with suppress(Exception):  # users' objects may fail in any way
                 kind = _kind_of(value)
-                if kind is None:
+                if kind is None or _size_of(value) + len(self._kept) > largest:
                     continue
                 contents = kind.copy(value)
                 self._kept.append(_Kept(attribute, value, kind, contents))
@@ -148,6 +153,12 @@ def _is_followed(value: Any, own: str) -> bool:
         return False
     is_known = isinstance(value, (*_KINDS, bool, int, float, np.generic))
     return is_known or type(value).__module__.partition(".")[0] == own
+
+
+def _size_of(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return value.size
+    return len(value) if isinstance(value, (list, dict, set, tuple, deque)) else 1
 
 
 def _was_added_to(kept: _Kept) -> bool:
