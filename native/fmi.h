@@ -84,7 +84,7 @@ typedef struct {
     Stage stage; /* the call that returned the status */
 } Outcome;
 
-/* Blocks of memory that each hold an instance, its inputs and its outputs; all at the same offsets in
+/* Blocks of memory that each hold an instance, its inputs and its outputs, at the same offsets in
  * bytes. */
 typedef struct {
     void *const *blocks;
@@ -214,14 +214,14 @@ typedef struct {
 
 static inline Stepper stepper_of_run(const Exchange *e, size_t index) {
     return (Stepper){e->components[index], e->inputs + e->places[index] * e->number_of_inputs,
-                 e->outputs + e->places[index] * e->number_of_outputs};
+                     e->outputs + e->places[index] * e->number_of_outputs};
 }
 
 static inline Stepper stepper_of_block(const Blocks *blocks, size_t index) {
     char *block = blocks->blocks[index];
     return (Stepper){*(void **)(void *)(block + blocks->component),
-                 (const double *)(void *)(block + blocks->inputs),
-                 (double *)(void *)(block + blocks->outputs)};
+                     (const double *)(void *)(block + blocks->inputs),
+                     (double *)(void *)(block + blocks->outputs)};
 }
 
 static inline Outcome exchange_once(const Fmi *fmi, const Library *library, const Exchange *e,
@@ -244,7 +244,8 @@ static inline Outcome exchange_once(const Fmi *fmi, const Library *library, cons
     return outcome;
 }
 
-static inline bool exchange_blocks(const Fmi *fmi, const Library *library, const Exchange *exchange) {
+static inline bool exchange_blocks(const Fmi *fmi, const Library *library,
+                                   const Exchange *exchange) {
     const Exchange e = *exchange;
     const Blocks blocks = *exchange->blocks;
     bool good = true;

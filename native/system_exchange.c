@@ -1,8 +1,8 @@
 /* Steps of many systems: part by part, each in all systems before the next.
  *
- * A part of one system after that of another runs the same code of the same FMU, and one call of its
- * FMI version does all of these steps. Each FMU gets the same calls in the same order as in
- * system_step_once. */
+ * A part of one system after that of another runs the same code of the same FMU, and one call of
+ * exchange does all of these steps. Each instance of an FMU gets the same calls in the same order as
+ * in system_step_once. */
 
 #include "system.h"
 
@@ -15,11 +15,15 @@ typedef struct {
     const Exchange *exchange;
     const System *system;
     size_t count;
-    Composite *systems[MOST];
+    void *systems[MOST]; /* of type Composite */
     double times[MOST];
     uint32_t numbers[MOST]; /* in the exchange */
     Outcome outcomes[MOST];
 } Line;
+
+static Composite *system_at(const Line *line, size_t index) {
+    return line->systems[index];
+}
 
 static bool goes_on(Status status) {
     return status <= STATUS_WARNING;
@@ -31,7 +35,8 @@ static void close_ranks(Line *line) {
 
     for (size_t i = 0; i < line->count; i++) {
         if (!goes_on(line->outcomes[i].status)) {
-            line->exchange->outcomes[line->numbers[i]] = (Outcome){line->outcomes[i].status, DOING_STEP};
+            line->exchange->outcomes[line->numbers[i]] =
+                (Outcome){line->outcomes[i].status, DOING_STEP};
             continue;
         }
         line->systems[left] = line->systems[i];
@@ -67,7 +72,7 @@ static void take_inputs(Line *line, size_t input) {
         const End end = s->ends[j];
         for (size_t i = 0; i < line->count; i++) {
             const size_t row = e->places[line->numbers[i]] * e->number_of_inputs;
-            line->systems[i]->inputs[end.input] = scaled(end.scale, e->inputs[row + input]);
+            system_at(line, i)->inputs[end.input] = scaled(end.scale, e->inputs[row + input]);
         }
     }
 }
@@ -120,7 +125,7 @@ static Status judge(Composite *me, size_t index, Status status) {
 static void step_plain(Line *line, size_t index) {
     const Component *part = &line->system->parts[index];
     Composite *first = line->systems[0];
-    const Blocks blocks = {(void *const *)line->systems, offset_in(first, &first->components[index]),
+    const Blocks blocks = {line->systems, offset_in(first, &first->components[index]),
                            offset_in(first, first->inputs + part->first_input),
                            offset_in(first, first->outputs + part->first_output)};
     Exchange e = *line->exchange;

@@ -284,6 +284,12 @@ class TestSkeleton:
         config = config_of(skeleton(path).out)
         assert (config["time_step"], config["max_episode_steps"]) == (time_step, steps)
 
+    @pytest.mark.parametrize("limits", ['min="1" max="-1"', 'min="-1e308" max="1e308"'])
+    def test_limits_that_mean_nothing_are_guessed(self, skeleton, make_fmu, limits):
+        made = skeleton(make_fmu(variable("u", f'<Real start="0" {limits}/>'), OUTPUT))
+        assert config_of(made.out)["bounds"] == {"u": (0.0, 1.0)}
+        assert "limits of input 'u'" in made.err
+
     def test_time_step_is_a_multiple_of_the_internal_one(self, skeleton, tmp_path):
         """FMI 3.0 has it; a shorter step does nothing."""
         edits = {'modelIdentifier="Probe"': 'modelIdentifier="Probe" fixedInternalStepSize="0.3"'}

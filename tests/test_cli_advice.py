@@ -17,6 +17,7 @@ from pythonfmu.builder import FmuBuilder
 
 import fmugym
 from fmugym.declared import Task, load
+from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import lines_of
 from fmugym.tools.cli import main
 from fmugym.tools.validation import validate
@@ -178,6 +179,19 @@ class TestTimeStep:
         upright = {"q_0": math.pi}
         advice, _ = advised(pendulum(time_step=0.2, parameters=upright))
         assert advice["time_step"] == 0.02
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
+def test_failures_with_other_settings_are_not_told(tmp_path, caplog):
+    """They are part of the search."""
+    path = zoo_tools.zoo_fmu(tmp_path, 2)
+    env = zoo_tools.ZooEnv(
+        path, model_parameters=zoo_tools.parameters("status", "step", at=60, status=3)
+    )
+    replay = Replay.of(env)
+    assert np.isnan(replay.run(substeps=4).outputs).any()
+    assert caplog.text == ""
+    env.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")

@@ -1,6 +1,7 @@
 """Training and evaluation from the command line."""
 
 import csv
+import errno
 import json
 import sys
 from pathlib import Path
@@ -36,6 +37,16 @@ def run(capsys, *arguments):
     code = main([str(argument) for argument in arguments])
     printed = capsys.readouterr()
     return code, printed.out, printed.err
+
+
+def test_a_full_disk_is_told_with_the_folder(tmp_path, capsys, monkeypatch):
+    def fill(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("fmugym.tools.learning.train", fill)
+    code, out, err = run(capsys, "train", CART_POLE, "--output", tmp_path / "agent")
+    assert (code, out) == (1, "")
+    assert err == f"fmugym: error: {tmp_path / 'agent'}: No space left on device\n"
 
 
 class TestEvaluate:

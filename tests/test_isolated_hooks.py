@@ -233,7 +233,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
     envs = make(Short, 3)
     envs.reset(seed=0)
     around = PlayAround(envs._pool._setup, envs._pool._arrays, lambda *_: None)
-    arrays = np.zeros((3, 1), np.float32), np.zeros((2, 3)), None, None
+    arrays = np.zeros((3, 1), np.float32), np.zeros((2, 3))
     for name in ("play", "play_before", "play_after"):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around._pool, name)(*arrays)

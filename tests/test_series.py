@@ -3,6 +3,7 @@
 import csv
 import html.parser
 import re
+import sys
 from itertools import pairwise
 
 import gymnasium
@@ -287,6 +288,13 @@ def test_steps_in_the_background_and_masked_resets():
     many.close()
 
 
+def play_until_an_error(env):
+    while True:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+
+
 class TestFiles:
     def test_a_csv_file_has_units_and_exact_numbers(self, tmp_path):
         env = RecordSeries(make(), ["angle", "T_set"], path=tmp_path / "a.csv")
@@ -324,6 +332,24 @@ class TestFiles:
             del env  # as the end of the interpreter does
             assert TimeSeries.read(path)["angle"].tolist() == expected
             inner.close()
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no size of files")
+    def test_a_full_disk_names_the_file(self, tmp_path):
+        import resource
+
+        path, limits = tmp_path / "a.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
+        env = RecordSeries(make(), "angle", path=path)
+        env.reset(seed=0)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+        try:
+            with pytest.raises(OSError, match="too large") as caught:
+                play_until_an_error(env)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert caught.value.filename == str(path)
+        env.close()
+        env.close()
+        assert path.stat().st_size == 4096
 
     def test_a_parquet_file_has_units_and_can_be_read_again(self, tmp_path):
         parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra parquet")

@@ -276,3 +276,82 @@ def test_observations_of_one_environment_after_another_are_new_arrays():
     assert (again[1] != before[1]).all()
     assert (np.abs(again) < 2.0).all()
     envs.close()
+
+
+class LowPass:
+    """A filter that is shared by all who refer to it."""
+
+    def __init__(self):
+        self.value = 0.0
+
+    def __call__(self, new):
+        self.value = self.value + 0.1 * (new - self.value)
+        return self.value
+
+
+FILTER, RECORD, STEPS = LowPass(), [], 0
+
+
+class SharedFilter(Drawing):
+    """Its reward is that of a filter outside of it."""
+
+    def _reward_policy(self):
+        return FILTER(self.state[0])
+
+
+class Recording(Drawing):
+    """Adds to a list outside of it."""
+
+    def _reward_policy(self):
+        RECORD.append(self.state[0])
+        return self.state[0]
+
+
+class Stepping(Drawing):
+    """Counts in a global variable."""
+
+    def _reward_policy(self):
+        global STEPS
+        STEPS += 1
+        return 1.0 * STEPS
+
+
+@pytest.mark.parametrize("task", [SharedFilter, Recording, Stepping])
+def test_making_a_vector_environment_leaves_nothing_outside_of_it(task):
+    FILTER.value, globals()["STEPS"] = 0.25, 0
+    envs = FMUVectorEnv(task, 3)
+    assert (FILTER.value, RECORD, STEPS) == (0.25, [], 0)
+    envs.close()
+
+
+@pytest.mark.parametrize("task", [SharedFilter, Stepping])
+def test_what_all_environments_share_is_found(task):
+    with pytest.raises(ConfigError, match="_reward_policy changes"):
+        FMUVectorEnv(task, 3, hooks="array")
+    envs = FMUVectorEnv(task, 3)
+    envs.reset(seed=0)
+    before = FILTER.value
+    rewards = envs.step(np.zeros((3, 1), np.float32))[1]
+    assert len(set(rewards.tolist())) == 3
+    expected = before
+    for state in envs.get_attr("state"):
+        expected += 0.1 * (state[0] - expected)
+    assert task is Stepping or FILTER.value == rewards[-1] == expected
+    envs.close()
+
+
+DATA = {"large": np.zeros(100_000), "small": np.zeros(3), "many": [[0.0] for _ in range(5000)]}
+
+
+class Reading(Drawing):
+    """Reads data outside of it."""
+
+    def _reward_policy(self):
+        return self.state[0] + DATA["small"][0]
+
+
+def test_large_data_outside_is_not_copied():
+    with Reading() as env:
+        kept = [one.value for one in Contents(env, outside=True)._kept]
+    assert any(value is DATA["small"] for value in kept)
+    assert not any(value is DATA["large"] or value is DATA["many"] for value in kept)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from test_single_compiled import require_same, with_hooks
-from vector_tools import BACKENDS, Drawing, require_pair_equal
+from vector_tools import BACKENDS, Drawing, require_equal, require_pair_equal, sampled_actions
 
 import fmugym
 from fmugym import Uniform
@@ -17,8 +17,9 @@ needs_native = pytest.mark.skipif("native" not in BACKENDS, reason="the extensio
 class Summing(Drawing):
     """Adds to variables in place, as one writes sums in Python."""
 
-    def __init__(self):
-        super().__init__(episode_variables={"sum": 0.0, "left": Uniform(0.0, 1.0), "count": 0})
+    def __init__(self, **changes):
+        variables = {"sum": 0.0, "left": Uniform(0.0, 1.0), "count": 0}
+        super().__init__(episode_variables=variables, **changes)
 
     def _update(self):
         self.variables["sum"] += self.state[0]
@@ -180,3 +181,52 @@ def test_before_the_first_action_in_parts_are_zeros():
     with Mixed() as env:
         env.reset(seed=1)
         assert env.step(env.action_space.sample())[1] == 0.0
+
+
+class Adding(Summing):
+    """Assigns new arrays."""
+
+    def _update(self):
+        self.variables["sum"] = self.variables["sum"] + self.state[0]
+
+
+@needs_native
+def test_sums_go_on_when_steps_are_compiled_again():
+    """While one episode has parameters of its own, all steps are done on arrays."""
+    ours, theirs = (
+        FMUVectorEnv(
+            lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks
+        )
+        for hooks in ("compiled", "per_env")
+    )
+    first = np.array([True, False, False])
+    overriding = {"reset_mask": first, "model_parameters": {"m": 0.06}}
+    for options in ({}, overriding, {"reset_mask": first}):
+        for envs in ours, theirs:
+            envs.reset(seed=1 if not options else None, options=options)
+        for actions in sampled_actions(ours, 4):
+            for mine, other in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
+                require_equal(mine, other)
+    ours.close()
+    theirs.close()
+
+
+class Scaling(Drawing):
+    """The first step reads a start value that later values have no type for."""
+
+    def __init__(self):
+        super().__init__(episode_variables={"last": 0.1, "scaled": 0.0}, max_episode_steps=5)
+
+    def _update(self):
+        self.variables["scaled"] = np.float64(3.0 * self.variables["last"])
+        self.variables["last"] = np.float32(0.5) * self.action[0]
+
+    def _reward_policy(self):
+        return self.variables["scaled"]
+
+
+@needs_native
+def test_the_first_step_of_one_environment_reads_the_whole_start_value():
+    compiled, ended = require_same(lambda hooks: with_hooks(Scaling, hooks), steps=40)
+    assert compiled > 20
+    assert ended > 5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import math
@@ -154,6 +155,7 @@ class CsvStore:
     """Writes a CSV file; each row is in the file at once, so that an interruption loses none."""
 
     def __init__(self, path: Path, columns: Sequence[Quantity]) -> None:
+        self._path = path
         self._file = path.open("x", encoding="utf-8", newline="")
         self._writer = csv.writer(self._file, lineterminator="\n")
         self._kinds = [column.kind for column in columns]
@@ -167,7 +169,13 @@ class CsvStore:
                 for value, kind in zip(row, self._kinds, strict=True)
             ]
             self._writer.writerow([*cells, block.faults.get(number, "")])
-        self._file.flush()
+        try:
+            self._file.flush()
+        except OSError as error:  # a full disk: what is in the file stays
+            with contextlib.suppress(OSError):
+                self._file.close()
+            error.filename = str(self._path)
+            raise
 
     @staticmethod
     def _cell(value: float, kind: str, texts: Mapping[float, str]) -> Any:

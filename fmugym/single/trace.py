@@ -23,7 +23,7 @@ from fmugym.vector.hooks.graph import Cell
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
-from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, array_of, lifted, scalar_of
+from fmugym.vector.hooks.scalars import Scalar, ScalarGraph, SmallArray, array_of, lifted, scalar_of
 from fmugym.vector.hooks.symbolic import SymbolicParameters, symbolic_outputs
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.tables import tables_in
@@ -63,7 +63,8 @@ def kind_of(value: Any) -> Kind | None:
     if isinstance(value, Scalar):
         return Kind(value.dtype, value.weak, None)
     if isinstance(value, Symbols):
-        return Kind(value.dtype, None, value.shape)
+        is_number = isinstance(value, SmallArray) and value.is_number
+        return Kind(value.dtype, None, None if is_number else value.shape)
     if type(value) in _DTYPES:
         return Kind(_DTYPES[type(value)], type(value), None)
     if not isinstance(value, np.generic) and type(value) is not np.ndarray:

@@ -131,7 +131,8 @@ class Interface:
         low, high = self._limits(variable)
         if not low <= high:
             raise ConfigError(
-                f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds'"
+                f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds', "
+                "or 'min' and 'max' in a task file"
             )
         return low, high
 

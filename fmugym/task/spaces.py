@@ -95,7 +95,8 @@ def _space(interface: Interface, variables: tuple[Variable, ...]) -> spaces.Spac
         return spaces.Discrete(len(values))
     if all(variable.kind == "boolean" for variable in variables):
         return spaces.MultiBinary(len(variables))
-    limits = np.array([_box_limits(interface, v) for v in variables], dtype=np.float32)
+    with np.errstate(over="ignore"):  # beyond float32 there is no limit
+        limits = np.array([_box_limits(interface, v) for v in variables], dtype=np.float32)
     return spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
 
 

@@ -6,6 +6,7 @@ solvers. What changes is an error of these settings.
 
 from __future__ import annotations
 
+import logging
 import statistics
 import time
 from collections.abc import Iterator
@@ -41,6 +42,10 @@ _SECONDS: Final = 2.0
 
 _NOTHING: Final = 1e-9
 """Outputs that vary by a smaller fraction of their size do not vary."""
+
+
+_silent: Final = logging.Logger("fmugym.validate.settings", logging.CRITICAL + 1)
+"""Drops what the FMU says: it may fail with settings that are not those of the task."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,7 @@ class Replay:
             What the FMU gave; None if it does not begin with these settings.
         """
         spec = replace(self.spec, warm_up_steps=0, **changes)
-        opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec)
+        opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec, log=_silent)
         isolation = None if opening.fmu.bundled else "process"
         try:
             pool = opening.open(1, rehearse=False, isolation=isolation)

@@ -138,8 +138,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _told(error: Exception) -> str:
     """An error in a line; those of the system without their numbers."""
-    if not isinstance(error, OSError) or error.filename is None:
+    if not isinstance(error, OSError):
         return str(error)
+    if error.filename is None:
+        return error.strerror or str(error)
     if isinstance(error, FileExistsError):
         return f"{error.filename} exists; name a new file"
     return f"{error.filename}: {error.strerror}"

@@ -111,6 +111,9 @@ def _train(arguments: argparse.Namespace) -> None:
             _tell_what_is_kept(plan)
             write_outcome(plan, title_of(arguments.task), tell)
             raise
+        except OSError as error:  # libraries that write a model do not say where
+            error.filename = error.filename or str(plan.folder)
+            raise
     write_outcome(plan, title_of(arguments.task), tell)
     _show(plan, scores, arguments)
 

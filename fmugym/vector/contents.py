@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -17,6 +18,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import READINGS
+from fmugym.vector.hooks.tables import functions_of, places_of
 
 __all__ = ["Contents", "borrowed", "differs"]
 
@@ -24,6 +26,9 @@ _NOT_COMPARED: Final = frozenset(
     {*READINGS, "_in_hooks", "_input_row", "_output_row", "_observation_row"}
 )
 """Attributes that the caller of hooks and the pool change."""
+
+_LARGEST_OUTSIDE: Final = 2000
+"""Global variables with more elements are taken for data, which no hook changes."""
 
 _OURS: Final = ("fmugym", "gymnasium", "logging")
 """Packages whose objects hooks only read."""
@@ -58,9 +63,10 @@ class Contents:
 
     Args:
         env: The environment.
+        outside: Whether to keep the global variables to which its methods refer, too.
     """
 
-    def __init__(self, env: FMUEnv) -> None:
+    def __init__(self, env: FMUEnv, outside: bool = False) -> None:
         self._attributes = vars(env)
         self._before = dict(self._attributes)
         self._kept: list[_Kept] = []
@@ -68,8 +74,14 @@ class Contents:
         for name, value in self._before.items():
             if name not in _NOT_COMPARED:
                 self._keep(name, value, seen)
+        places = _places_outside(env) if outside else ()
+        self._outside = [(place, name, place[name]) for place, name in places]
+        self._first_outside = len(self._kept)
+        for _, name, value in self._outside:
+            largest = self._first_outside + _LARGEST_OUTSIDE
+            self._keep(name or type(value).__name__, value, seen, largest)
 
-    def _keep(self, attribute: str, value: Any, seen: set[int]) -> None:
+    def _keep(self, attribute: str, value: Any, seen: set[int], largest: float = math.inf) -> None:
         waiting = [value]
         while waiting:
             value = waiting.pop()
@@ -78,7 +90,7 @@ class Contents:
             seen.add(id(value))
             with suppress(Exception):  # users' objects may fail in any way
                 kind = _kind_of(value)
-                if kind is None:
+                if kind is None or _size_of(value) + len(self._kept) > largest:
                     continue
                 contents = kind.copy(value)
                 self._kept.append(_Kept(attribute, value, kind, contents))
@@ -96,21 +108,79 @@ class Contents:
 
     def changed_in_place(self) -> set[str]:
         """The names of the attributes whose values have changed in place."""
-        return {one.attribute for one in self._kept if _has_changed(one)}
+        kept = self._kept[: self._first_outside]
+        return {one.attribute for one in kept if _has_changed(one)}
+
+    def changed_outside(self) -> str | None:
+        """The name of a global variable that was set, or whose value has changed in place.
+
+        What was only added to a list or a dict does not count: it may be a record or a cache.
+        """
+        for place, name, value in self._outside:
+            if differs(value, place[name]):
+                return name or type(value).__name__
+        kept = self._kept[self._first_outside :]
+        return next((k.attribute for k in kept if _has_changed(k) and not _was_added_to(k)), None)
 
     def restore(self) -> None:
         """Undo all changes."""
         for one in filter(_has_changed, self._kept):
             with suppress(Exception):  # as above
                 one.kind.restore(one.value, one.contents)
+        for place, name, value in self._outside:
+            if place[name] is not value:
+                place[name] = value
         _restore_dict(self._attributes, self._before)
 
 
+def _places_outside(env: FMUEnv) -> Iterator[tuple[dict[str, Any], str]]:
+    """Where the methods of a class find values outside of it: globals, and in closures.
+
+    Instances of classes of other packages are left out: they may lead anywhere.
+    """
+    seen: set[tuple[int, str]] = set()
+    for function in functions_of(env):
+        own = (function.__module__ or "").partition(".")[0]
+        for place, name in places_of(function):
+            known = id(place), name
+            if known not in seen and _is_followed(place[name], own):
+                seen.add(known)
+                yield place, name
+
+
+def _is_followed(value: Any, own: str) -> bool:
+    if isinstance(value, (ModuleType, type, FunctionType, gymnasium.Env)):
+        return False
+    is_known = isinstance(value, (*_KINDS, bool, int, float, np.generic))
+    return is_known or type(value).__module__.partition(".")[0] == own
+
+
+def _size_of(value: Any) -> int:
+    if isinstance(value, np.ndarray):
+        return value.size
+    return len(value) if isinstance(value, (list, dict, set, tuple, deque)) else 1
+
+
+def _was_added_to(kept: _Kept) -> bool:
+    """Whether a container has all that it had, and more."""
+    value, before = kept.value, kept.contents
+    if isinstance(value, dict):
+        return all(name in value and not differs(before[name], value[name]) for name in before)
+    if isinstance(value, (list, deque)):
+        return not differs(before, list(value)[: len(before)])
+    return False
+
+
 @contextmanager
-def borrowed(env: FMUEnv) -> Iterator[Contents]:
-    """Use an environment for calls of its hooks; afterwards it and its objects are as before."""
+def borrowed(env: FMUEnv, outside: bool = False) -> Iterator[Contents]:
+    """Use an environment for calls of its hooks; afterwards it and its objects are as before.
+
+    Args:
+        env: The environment.
+        outside: Whether this is to hold for global variables, too.
+    """
     before, env._in_hooks = env._in_hooks, True
-    contents = Contents(env)
+    contents = Contents(env, outside)
     try:
         yield contents
     finally:

@@ -74,7 +74,12 @@ class _WarmUpTracer(Tracer):
     def programs(self) -> tuple[Program, Program]:
         """The programs before and after a step."""
         env: Any = self._env
-        with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+        with (
+            exclusive(),
+            borrowed(env, outside=True),
+            tables_in(env),
+            reading(env, Readings.of(env)),
+        ):
             env._own = replace(env._own, update=True)
             env._get_inputs = self._choose
             env._update = self._update

@@ -115,8 +115,6 @@ static PyObject *mask_of(Infos *in, const Origin *origin) {
 
 static PyObject *value_of(Infos *in, size_t number, const Origin *origin) {
     Maker *maker = &in->values[number];
-    const size_t size = maker->size / in->count;
-    const char *const end = origin->mask + in->count;
     char *memory;
 
     if (origin->mask == NULL) {
@@ -126,6 +124,8 @@ static PyObject *value_of(Infos *in, size_t number, const Origin *origin) {
     if (value == NULL) {
         return NULL;
     }
+    const size_t size = maker->size / in->count;
+    const char *const end = origin->mask + in->count;
     memset(memory, 0, maker->size);
     for (const char *at = origin->mask; (at = memchr(at, 1, (size_t)(end - at))) != NULL; at++) {
         const size_t place = (size_t)(at - origin->mask) * size;

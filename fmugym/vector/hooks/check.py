@@ -48,6 +48,9 @@ _READ_ONLY = (
 _WRITING = ("_get_inputs", "_update")
 """Hooks that are not called for environments that start an episode, and may write variables."""
 
+_OUTSIDE = "outside: "
+"""Precedes the names of global variables among those of what hooks have changed."""
+
 _EPISODES, _STEPS = 2, 3
 """How many states of the FMU are tried; each is tried at other magnitudes, too."""
 
@@ -72,7 +75,11 @@ def find_difference(env: FMUEnv) -> str | None:
     if obstacle is not None:
         return obstacle
     hooks = [hook for hook in ORDER if hook not in _IDLE or hook in env._own]
-    with np.errstate(all="ignore"), warnings.catch_warnings(), borrowed(env) as contents:
+    with (
+        np.errstate(all="ignore"),
+        warnings.catch_warnings(),
+        borrowed(env, outside=True) as contents,
+    ):
         warnings.simplefilter("ignore")
         kinds = [sample_states(env, some) for some in (_SCALES[:1], _SCALES[1:], _WILD_SCALES)]
         for name in hooks:
@@ -218,6 +225,8 @@ class _Comparison(NamedTuple):
         changed = next((name for _, name in calls if name is not None), None)
         if changed == "variables":
             return "changes self.variables, which only _update may do"
+        if changed is not None and changed.startswith(_OUTSIDE):
+            return f"changes {changed.removeprefix(_OUTSIDE)}, which all environments share"
         if is_natural and changed is not None:
             return f"changes self.{changed}, which belongs in 'episode_variables'"
         together, changed = self._call(copied(self.batch))
@@ -237,8 +246,10 @@ class _Comparison(NamedTuple):
             result = _result_of(self.env, self.name)
             after = _read_only(Readings.of(self.env), self.name)
         changed = [name for name, row in before.items() if differs(row, after[name])]
-        attribute = self.contents.changed()
+        attribute, outside = self.contents.changed(), self.contents.changed_outside()
         self.contents.restore()
+        if outside is not None:
+            attribute = f"{_OUTSIDE}{outside}"
         return result, changed[0] if changed else attribute
 
 
@@ -246,7 +257,8 @@ def _read_only(readings: Readings, hook: str) -> dict[str, Any]:
     """Copy the readings that a hook must not change, by the names of the attributes."""
     rows: dict[str, Any] = {name: np.copy(getattr(readings, name)) for name in _READ_ONLY}
     if hook not in _WRITING:
-        rows["variables"] = {name: np.copy(row) for name, row in readings.variables.items()}
+        variables = readings.variables.items()  # a hook may have written anything
+        rows["variables"] = {n: v.copy() if type(v) is np.ndarray else v for n, v in variables}
     return rows | {"out": np.copy(readings.values)}
 
 

@@ -34,7 +34,7 @@ def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
             last bits may differ if hooks multiply matrices.
     """
     own = copied(batch)
-    with np.errstate(all="ignore"), borrowed(env), reading(env, own):
+    with np.errstate(all="ignore"), borrowed(env, outside=True), reading(env, own):
         comparison = _Comparison(env, task)
         comparison.compare_inputs()
         comparison.compare_judgement()

@@ -28,6 +28,7 @@ from fmugym.vector.hooks.symbols import (
 __all__ = [
     "FUNCTIONS",
     "Table",
+    "functions_of",
     "is_foreign",
     "is_table",
     "names_in",
@@ -305,7 +306,7 @@ def tables_in(env: Any) -> Iterator[None]:
     These are the arrays that the methods of its class, and functions that these call, refer to by
     a global name, as an attribute of a module or as a variable of a surrounding function.
     """
-    functions = _functions_of(env)
+    functions = functions_of(env)
     places = [place for function in functions for place in places_of(function)]
     held = [(place, name, place[name]) for place, name in places if is_table(place[name])]
     for place, name, value in held:
@@ -331,7 +332,7 @@ class _Variable(dict[str, Any]):
 _OURS: Final = ("fmugym", "gymnasium", "numpy")
 
 
-def _functions_of(env: Any) -> list[FunctionType]:
+def functions_of(env: Any) -> list[FunctionType]:
     """The functions of a class, and those that they call by name, without those of packages."""
     classes = [cls for cls in type(env).__mro__ if not is_foreign(cls.__module__)]
     waiting = [value for cls in classes for value in vars(cls).values()]

@@ -112,7 +112,7 @@ def trace_hooks(
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
-    with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
+    with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
         return Tracer(env, attributes).task()
 
 
@@ -172,7 +172,7 @@ class Tracer:
             names = element_names((), "attribute", name)
             vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
         symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
-        self._contents = Contents(self._env)
+        self._contents = Contents(self._env, outside=True)
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make nodes of what it returns."""
@@ -428,9 +428,11 @@ def in_hook(env: FMUEnv, name: str) -> Iterator[None]:
 
 def require_unchanged(contents: Contents) -> None:
     """Raise an ``UntraceableError`` if a hook has changed an attribute in place."""
-    changed = contents.changed()
+    changed, outside = contents.changed(), contents.changed_outside()
     if changed is not None:
         raise UntraceableError(f"it changes self.{changed}")
+    if outside is not None:
+        raise UntraceableError(f"it changes {outside}, which all environments share")
 
 
 def _placed(env: FMUEnv, name: str, error: Exception) -> str:
