@@ -326,7 +326,9 @@ class PerEnvEngine(Engine):
                 env.previous_action, env.previous_state, env.action = before, state, action
                 parts.append(writer.packed(env._get_inputs(), action))
             rows = writer.unpacked(parts)
-            for place in np.flatnonzero(~np.isfinite(rows).all(axis=1)).tolist():
+            finite = np.isfinite(rows)
+            if not finite.all():
+                place = int(finite.all(axis=1).argmin())
                 index = running[place]
                 writer.checked(rows[place], actions[index])
             return rows
