@@ -333,6 +333,7 @@ class TestInterruption:
         def interrupted(*_, **__):
             raise KeyboardInterrupt
 
+        monkeypatch.setattr(program, "end_as_after_ctrl_c", lambda: None)
         monkeypatch.delitem(sys.modules, "fmugym.tools.cli")
         monkeypatch.delattr("fmugym.tools.cli", raising=False)
         monkeypatch.setattr("builtins.__import__", interrupted)

@@ -669,6 +669,30 @@ def test_generated_expressions(reward, observed, variable):
     require_equal(env, task)
 
 
+@pytest.mark.parametrize(
+    "variable",
+    [
+        "np.interp(self.state[0], [-1.0, 0.0, 2.0], [3.0, -1.0, 1.0])",
+        "np.searchsorted([-1.0, 0.0, 2.0], self.state[0])",
+        "np.digitize(self.state[0], [-1.0, 0.0, 2.0])",
+        "np.choose(1, [self.state[0], 2.0])",
+        "np.argmax(self.action)",
+        "np.argmin(self.action)",
+        "np.average(self.action)",
+        "np.nan_to_num(self.state[0])",
+    ],
+)
+def test_variables_that_are_numbers_of_numpy(variable):
+    """These functions give numbers, and no arrays without dimensions."""
+    env = expression_task("1.0", "1.0", variable)()
+    action = np.array([0.25, -0.5], np.float32)
+    env.reset(seed=0)
+    env.step(action)
+    env.step(action)
+    require_equal(env, trace_single(env, action))
+    env.close()
+
+
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
 @pytest.mark.parametrize("name", ["require_equal", "make_late"])
 def test_what_a_signal_handler_raises_while_hooks_are_compiled_comes_out(monkeypatch, name):

@@ -24,6 +24,9 @@ _PATIENCE: Final = 5.0
 _begun: Final = threading.Event()
 """Set when Python has begun to end the program."""
 
+_readers: Final[list[socket.socket]] = []
+"""Stay open as long as the process: Python writes the numbers of signals to their other ends."""
+
 
 class SignalledEnd(KeyboardInterrupt):
     """A signal asks the program to end.
@@ -66,6 +69,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 def _watch(numbers: set[int]) -> None:
     """Watch for signals in a thread, which runs also while the main thread is in an FMU."""
     reader, writer = socket.socketpair()
+    _readers.append(reader)
     writer.setblocking(False)
     signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
     threading.Thread(target=_end_by_force, args=(reader, numbers), daemon=True).start()

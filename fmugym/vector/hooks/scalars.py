@@ -83,7 +83,8 @@ class ScalarGraph(Graph):
 _PATCHED_SCALARS: Final = frozenset(
     {"take", "sum", "prod", "mean", "std", "var", "any", "all", "max", "min", "amax", "amin"}
     | {"ptp", "norm", "look_up", "median", "quantile", "percentile", "nansum", "nanprod"}
-    | {"nanmin", "nanmax", "nanmean", "nanvar", "nanstd", "nanmedian"}
+    | {"nanmin", "nanmax", "nanmean", "nanvar", "nanstd", "nanmedian", "average"}
+    | {"argmax", "argmin", "interp", "searchsorted", "digitize", "choose", "nan_to_num"}
 )
 """Functions that return numbers instead of arrays without dimensions."""
 
