@@ -313,6 +313,7 @@ def test_a_drawn_parameter_cannot_be_set_for_some_only(make):
 
 def test_methods_of_all_and_of_some_keep_what_they_write(make):
     venv = make(Reaching)
+    venv.seed(0)  # no pendulum starts where it is done in the first step
     venv.reset()
     assert venv.env_method("loosen", 2.0) == [0.02] * 3
     assert venv.env_method("loosen", factor=10.0, indices=[1]) == [0.2]
