@@ -16,7 +16,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from vector_tools import CART_POLE, Drawing, require_equal, sampled_actions
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    grow,
+    protect,
+    require_equal,
+    reshape,
+    retype,
+    sampled_actions,
+)
 
 from fmugym import FMUVectorEnv, SimulationError
 from fmugym.pool import has_native_pool
@@ -222,22 +231,6 @@ def test_single_observations_that_are_held_do_not_change(task, form):
     wanted = [row for infos in told(task) for row in observations_in(infos["final_obs"])]
     for mine, other in zip(kept, wanted, strict=True):
         require_equal(np.asarray(mine), other)
-
-
-def reshape(row):
-    row.shape = (row.size, 1, 1)
-
-
-def retype(row):
-    row.dtype = np.uint8
-
-
-def protect(row):
-    row.flags.writeable = False
-
-
-def grow(row):
-    row.resize(1000, refcheck=False)
 
 
 def refer(row):

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 from gymnasium import spaces
-from vector_tools import Drawing, RingError, Ringing, handler  # noqa: F401
+from vector_tools import (
+    Drawing,
+    RingError,
+    Ringing,
+    handler,  # noqa: F401  # the fixture "handler"
+)
 
 import fmugym
 from fmugym import ConfigError

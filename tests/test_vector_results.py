@@ -8,7 +8,7 @@ import weakref
 import gymnasium as gym
 import numpy as np
 import pytest
-from vector_tools import CART_POLE, Drawing, sampled_actions
+from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sampled_actions
 
 from fmugym import ConfigError, FMUVectorEnv
 from fmugym.pool import has_native_pool
@@ -101,27 +101,10 @@ def test_what_the_caller_holds_does_not_change(task, hold):
         require_same([np.asarray(array) for array in held], copies)
 
 
-def reshape(array):
-    array.shape = (array.size, 1)
-
-
-def retype(array):
-    array.dtype = np.uint8
-
-
-def protect(array):
-    array.flags.writeable = False
-
-
 def shrink(array):
     array.resize(1, refcheck=False)
 
 
-def grow(array):
-    array.resize(1000, refcheck=False)
-
-
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("change", [reshape, retype, protect, shrink, grow])
 @pytest.mark.filterwarnings("ignore:Setting the:DeprecationWarning")
 def test_what_the_caller_changes_in_place_does_not_come_back(task, change):

@@ -2,7 +2,12 @@
 
 import numpy as np
 import pytest
-from vector_tools import Drawing, RingError, Ringing, handler  # noqa: F401
+from vector_tools import (
+    Drawing,
+    RingError,
+    Ringing,
+    handler,  # noqa: F401  # the fixture "handler"
+)
 
 from fmugym.vector import FMUVectorEnv
 

@@ -302,3 +302,22 @@ def handler():
     before = signal.signal(signal.SIGTERM, ring)
     yield
     signal.signal(signal.SIGTERM, before)
+
+
+# What callers may do to an array of results in place.
+
+
+def reshape(array):
+    array.shape = (array.size, 1, 1)
+
+
+def retype(array):
+    array.dtype = np.uint8
+
+
+def protect(array):
+    array.flags.writeable = False
+
+
+def grow(array):
+    array.resize(1000, refcheck=False)

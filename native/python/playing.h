@@ -19,8 +19,6 @@ enum {
     PLAY_BUFFERS
 };
 
-enum { MOST_DIMENSIONS = 8 };
-
 /* The result of prepare_play. It never changes; the next call replaces it as a whole. */
 typedef struct {
     Play play;

@@ -12,8 +12,6 @@
 
 enum { NEXT, CURRENT, PREVIOUS, WANTED, KEPT, STEP_COUNT, SINGLE_BUFFERS };
 
-enum { MOST_DIMENSIONS = 8 };
-
 /* An attribute of the environment that its programs depend on. */
 typedef struct {
     PyObject *name, *value;

@@ -5,6 +5,8 @@
 
 #include "python.h"
 
+enum { MOST_DIMENSIONS = 8 }; /* of an action */
+
 /* A program, and references to everything that it uses. */
 typedef struct {
     Program program;
