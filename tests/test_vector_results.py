@@ -105,6 +105,7 @@ def shrink(array):
     array.resize(1, refcheck=False)
 
 
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("change", [reshape, retype, protect, shrink, grow])
 @pytest.mark.filterwarnings("ignore:Setting the:DeprecationWarning")
 def test_what_the_caller_changes_in_place_does_not_come_back(task, change):
