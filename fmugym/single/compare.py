@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.signals import is_of_signal_handler
+from fmugym.signals import let_through
 from fmugym.single.purity import unchanged_globals
 from fmugym.single.trace import SingleTask, kind_of
 from fmugym.task.readings import Readings, reading
@@ -163,8 +163,7 @@ class _Comparison:
             try:
                 inputs = self._inputs_of(index)
             except Exception as error:  # hooks may raise anything
-                if is_of_signal_handler(error):
-                    raise
+                let_through(error)
                 return False
             if _leaves_to_python(self._wanted[:, index], np.array(inputs)):
                 return False
@@ -174,8 +173,7 @@ class _Comparison:
                 observed = None if self._task.seen else ()  # the pool's, or that of a hook left
                 result = conclude(env, env._form, False, False, observed)
             except Exception as error:  # as above
-                if is_of_signal_handler(error):
-                    raise
+                let_through(error)
                 return False
             if _leaves_to_python(self._judged[-1][index], np.asarray(result[1])):
                 return False
@@ -297,8 +295,7 @@ def _call(env: FMUEnv, hook: str) -> None:
     try:
         getattr(env, hook)()
     except Exception as error:  # hooks may raise anything
-        if is_of_signal_handler(error):
-            raise
+        let_through(error)
 
 
 def _require_nothing_changed(hook: str, changed: str | None) -> None:

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.signals import is_of_signal_handler
+from fmugym.signals import let_through
 from fmugym.single.compare import require_equal
 from fmugym.single.left import HooksLeft, require_few
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
@@ -103,8 +103,7 @@ class Player:
             make_late(FMUEnv)
             self._task, self._known = task, len(vars(env))
         except Exception as reason:  # hooks may raise anything
-            if is_of_signal_handler(reason):
-                raise
+            let_through(reason)
             env._player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
             if self._required:
@@ -193,8 +192,7 @@ class Player:
         try:
             self._wanted[:] = self._left.inputs(env, action)
         except Exception as error:  # hooks may raise anything
-            if is_of_signal_handler(error):
-                raise
+            let_through(error)
             self.may_have_moved = True
             return False
         self.may_have_moved = True

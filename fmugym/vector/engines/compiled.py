@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
-from fmugym.signals import is_of_signal_handler
+from fmugym.signals import let_through
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
@@ -225,8 +225,7 @@ class CompiledEngine(BatchEngine):
             require_same(self.env, Readings.of(self.env), found)
             task = found
         except Exception as reason:  # as in find_programs
-            if is_of_signal_handler(reason):
-                raise
+            let_through(reason)
             logger.info("the hooks cannot be compiled any more: %s", reason)
         finally:
             self._prepare(task)
