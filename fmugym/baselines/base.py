@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.checks import KnownArguments, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Controller", "FloatArray", "Numbers", "Signal", "check_numbers"]
+__all__ = ["Controller", "FloatArray", "Numbers", "Signal", "attribute_of", "check_numbers"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -57,8 +57,8 @@ class Controller(KnownArguments, ABC):
         self._is_vector = hasattr(env, "single_action_space")
         self.count = env.num_envs if self._is_vector else 1
         self.space = env.single_action_space if self._is_vector else env.action_space
-        self.time_step = _attribute(env, "config").time_step
-        self.names = _names_of(env) if names is None else tuple(names)
+        self.time_step = attribute_of(env, "config").time_step
+        self.names = self._names_of(env) if names is None else tuple(names)
         self._prepare()
         self.reset()
         return self
@@ -78,13 +78,7 @@ class Controller(KnownArguments, ABC):
         """
         if not hasattr(self, "names"):
             raise ConfigError(f"call {type(self).__name__}.bind(env) before act")
-        rows = np.atleast_2d(np.asarray(observation, dtype=np.float64))
-        if rows.shape != (self.count, len(self.names)):
-            raise ConfigError(
-                f"expected an observation of {self._shape()}, got one of shape "
-                f"{np.shape(observation)}"
-            )
-        actions = self._as_actions(self._decide(rows))
+        actions = self._as_actions(self._decide(self._rows(observation)))
         return actions if self._is_vector else actions[0]
 
     def reset(self, mask: npt.NDArray[np.bool_] | None = None) -> None:
@@ -106,6 +100,26 @@ class Controller(KnownArguments, ABC):
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         """Forget the episodes of some environments."""
+
+    def _names_of(self, env: Any) -> tuple[str, ...]:
+        """The names of what the environment lets observe."""
+        names: tuple[str, ...] | None = attribute_of(env, "observation_names")
+        if names is None:
+            raise ConfigError(
+                "the elements of these observations have no names, because a hook makes them; give "
+                "bind their names in order"
+            )
+        return names
+
+    def _rows(self, observation: Any) -> FloatArray:
+        """Observations as numbers, shape (N, k)."""
+        rows = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        if rows.shape != (self.count, len(self.names)):
+            raise ConfigError(
+                f"expected an observation of {self._shape()}, got one of shape "
+                f"{np.shape(observation)}"
+            )
+        return rows
 
     # Shared by controllers.
 
@@ -143,7 +157,7 @@ class Controller(KnownArguments, ABC):
         space = self.space
         if isinstance(space, spaces.Discrete):
             least, largest = self._limits()
-            return np.clip(np.rint(values), least, largest).astype(space.dtype)
+            return np.clip(np.rint(values.ravel()), least, largest).astype(space.dtype)
         values = values.reshape(len(values), *space.shape or ())
         if isinstance(space, spaces.Box):
             values = np.clip(values, space.low, space.high)
@@ -170,17 +184,7 @@ def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:
     return check_number(what, value, **limits)
 
 
-def _attribute(env: Any, name: str) -> Any:
+def attribute_of(env: Any, name: str) -> Any:
     """An attribute of an environment, or of the first of many."""
     base = env.unwrapped
     return base.get_attr(name)[0] if hasattr(base, "get_attr") else getattr(base, name)
-
-
-def _names_of(env: Any) -> tuple[str, ...]:
-    names: tuple[str, ...] | None = _attribute(env, "observation_names")
-    if names is None:
-        raise ConfigError(
-            "the elements of these observations have no names, because a hook makes them; give "
-            "bind their names in order"
-        )
-    return names

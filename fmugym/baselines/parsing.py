@@ -18,7 +18,7 @@ from fmugym.baselines.feedforward import Schedule
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Search", "controller_of", "search_of"]
+__all__ = ["Search", "controller_of", "has_range", "search_of"]
 
 _KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "pid": PID}
 
@@ -26,6 +26,8 @@ _EXAMPLES: Final[dict[type[Controller], str]] = {
     Hysteresis: "hysteresis of=T setpoint=21 band=0.5",
     PID: "pid of=T setpoint=21 kp=0.5",
 }
+
+_RANGE: Final = re.compile(r"\.\.(?=[^.])")
 
 _DECADE: Final = 10.0
 """Ranges whose ends differ by this factor are searched on a logarithmic scale."""
@@ -72,16 +74,17 @@ class Search:
         kind: The name of its class in texts.
         fixed: The arguments that are given.
         ranges: The numbers to be found, each with the values to be tried.
+        negative: The names of those whose values are minus those in ``ranges``.
     """
 
     kind: str
     fixed: Mapping[str, Any]
     ranges: Mapping[str, Uniform | LogUniform]
+    negative: frozenset[str] = frozenset()
 
     def make(self, **numbers: Any) -> Controller:
         """Make the controller with some numbers, which are rounded as in ``text``."""
-        found = {name: _rounded(value) for name, value in numbers.items()}
-        return _made(_KINDS[self.kind], {**self.fixed, **found})
+        return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
 
     def text(self, numbers: Mapping[str, float]) -> str:
         """The controller with some numbers, as ``controller_of`` reads it."""
@@ -90,9 +93,12 @@ class Search:
         words = [f"{name}={str(value).removesuffix('.0')}" for name, value in given.items()]
         return shlex.join([self.kind, *words])
 
-    def numbers(self, found: Mapping[str, float]) -> dict[str, float]:
+    def numbers(self, found: Mapping[str, Any]) -> dict[str, Any]:
         """The numbers as ``text`` has them."""
-        return {name: _rounded(value) for name, value in found.items()}
+        return {
+            name: _rounded(-value if name in self.negative else value)
+            for name, value in found.items()
+        }
 
     def at_an_end(self, found: Mapping[str, float]) -> list[str]:
         """The numbers that are within a hundredth of an end of their ranges."""
@@ -110,7 +116,7 @@ def search_of(text: str) -> Search:
     Args:
         text: As for ``controller_of``, with ``LOW..HIGH`` in the place of numbers that are to be
             found: ``"pid of=T setpoint=20..22 kp=0.05..5 ti=1800..400000"``. A range whose ends
-            are positive and differ by a factor of ten or more is searched on a logarithmic scale.
+            have one sign and differ by a factor of ten or more is searched on a logarithmic scale.
 
     Raises:
         ConfigError: If there is no such controller, nothing is to be found, or an argument is
@@ -119,10 +125,14 @@ def search_of(text: str) -> Search:
     kind, arguments = _parts(text)
     if kind == "schedule":
         raise ConfigError(f"a schedule cannot be tuned; known are: {', '.join(_KINDS)}")
-    found = {name: _range(name, value) for name, value in arguments.items()}
-    ranges = {name: one for name, one in found.items() if one is not None}
+    ends = {name: _ends(name, value) for name, value in arguments.items() if has_range(value)}
+    negative = frozenset(name for name, (_, high) in ends.items() if high < 0)
+    ranges = {
+        name: _range(-high, -low) if name in negative else _range(low, high)
+        for name, (low, high) in ends.items()
+    }
     fixed = {name: value for name, value in arguments.items() if name not in ranges}
-    search = Search(kind, fixed, ranges)
+    search = Search(kind, fixed, ranges, negative)
     search.make(**{name: one.low for name, one in ranges.items()})  # raises for wrong arguments
     search.make(**{name: one.high for name, one in ranges.items()})
     if not ranges:
@@ -133,15 +143,20 @@ def search_of(text: str) -> Search:
     return search
 
 
-def _range(name: str, value: Any) -> Uniform | LogUniform | None:
-    """The range that a text gives; None if it gives none."""
-    parts = re.split(r"\.\.(?=[^.])", value) if isinstance(value, str) else []
-    if len(parts) != 2:
-        return None
+def has_range(text: Any) -> bool:
+    """Whether a text has ``LOW..HIGH`` in the place of a number."""
+    return isinstance(text, str) and _RANGE.search(text) is not None
+
+
+def _ends(name: str, value: str) -> tuple[float, float]:
+    low, high = _RANGE.split(value, maxsplit=1)
     try:
-        low, high = map(float, parts)
+        return float(low), float(high)
     except ValueError:
         raise ConfigError(f"expected a range such as {name}=0.05..5, got {shown(value)}") from None
+
+
+def _range(low: float, high: float) -> Uniform | LogUniform:
     is_wide = low > 0 and high >= _DECADE * low
     return LogUniform(low, high) if is_wide else Uniform(low, high)
 

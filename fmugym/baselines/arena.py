@@ -1,0 +1,114 @@
+"""Many controllers play the same episodes, side by side in one vector environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from fmugym.baselines.base import Controller, FloatArray
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "Outcome"]
+
+MOST_ENVS: Final = 512
+"""As many environments step together, unless the caller says less."""
+
+MOST_STEPS: Final = 10_000
+"""Steps after which an episode without an end is stopped."""
+
+Make = Callable[[FloatArray], Controller]
+"""Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
+
+
+class Outcome(NamedTuple):
+    """What n candidates have reached in k episodes.
+
+    Attributes:
+        returns: The total rewards, shape (n, k).
+        costs: The total of each cost that the arena watches, shape (n, k, c).
+    """
+
+    returns: FloatArray
+    costs: FloatArray
+
+
+class Arena:
+    """A vector environment in which candidates play the same episodes.
+
+    The environments are made when they are needed. Where candidates and episodes are too many for
+    them, they play in groups, with the same result.
+
+    Args:
+        make_env: A function that makes the environment, or its class.
+        most_envs: The largest number of environments.
+        most_steps: Steps after which an episode is stopped.
+        costs: The names of costs to add up.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[[], Any],
+        most_envs: int = MOST_ENVS,
+        most_steps: int = MOST_STEPS,
+        costs: Sequence[str] = (),
+    ) -> None:
+        self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
+        self._costs, self._envs = tuple(costs), None
+        self.steps = 0
+
+    steps: int
+    """The steps of all environments until now."""
+
+    _envs: FMUVectorEnv | None
+
+    def close(self) -> None:
+        """Close the environments."""
+        if self._envs is not None:
+            self._envs.close()
+        self._envs = None
+
+    def play(self, make: Make, numbers: FloatArray, seeds: Sequence[int]) -> Outcome:
+        """Let candidates play.
+
+        Args:
+            make: Makes the controller of a group.
+            numbers: What the candidates differ in, shape (n, k).
+            seeds: The seeds of their episodes.
+        """
+        jobs = np.arange(len(numbers) * len(seeds))
+        envs = self._opened(len(jobs))
+        groups = []
+        for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
+            who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
+            controller = make(numbers[who]).bind(envs)
+            totals = self._play(envs, controller, [seeds[index] for index in which.tolist()])
+            groups.append(totals[:, : len(part)])
+        totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
+        return Outcome(totals[0], np.moveaxis(totals[1:], 0, -1))
+
+    def _opened(self, jobs: int) -> FMUVectorEnv:
+        """Environments for so many episodes, or as many as there may be."""
+        size = min(jobs, self._most_envs)
+        if self._envs is None or self._envs.num_envs < size:
+            self.close()
+            self._envs = FMUVectorEnv(self._make_env, size)
+        return self._envs
+
+    def _play(self, envs: FMUVectorEnv, controller: Controller, seeds: list[int]) -> FloatArray:
+        """The total rewards and costs of one episode in each environment, shape (1 + c, N)."""
+        observations, infos = envs.reset(seed=seeds)
+        totals = np.zeros((1 + len(self._costs), len(seeds)))
+        running = np.ones(len(seeds), dtype=bool)
+        for _ in range(self._most_steps):
+            actions = controller.act(observations, infos)
+            observations, rewards, terminated, truncated, infos = envs.step(actions)
+            totals[0] += np.where(running, rewards, 0.0)
+            for row, name in enumerate(self._costs, 1):
+                totals[row] += np.where(running, infos["costs"][name], 0.0)
+            self.steps += len(seeds)
+            running &= ~(terminated | truncated)
+            if not running.any():
+                break
+        return totals

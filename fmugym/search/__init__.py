@@ -1,0 +1,1 @@
+"""The search for policies: weights are found by playing, without gradients."""

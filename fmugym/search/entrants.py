@@ -1,0 +1,108 @@
+"""Who takes part in a search: controllers with numbers to be found, and classes of policies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.baselines.arena import Arena, Outcome
+from fmugym.baselines.base import FloatArray
+from fmugym.baselines.cma import CMA
+
+__all__ = ["MOST_EPISODES", "NO_MERIT", "Entrant", "Merit", "merits_of"]
+
+Merit = tuple[float, float]
+"""How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
+
+NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
+
+MOST_EPISODES: Final = 64
+_AGREEMENT: Final = 0.3
+"""If the orders by two halves of the episodes correlate less, a round has too few of them."""
+
+_FADE: Final = 0.3
+
+
+def merits_of(outcome: Outcome, limits: Sequence[float]) -> list[Merit]:
+    """The merit of each candidate: those within the limits of all costs come first.
+
+    Args:
+        outcome: What they have reached.
+        limits: What each cost may add up to in an episode.
+    """
+    means: FloatArray = outcome.costs.mean(axis=1)
+    bounds = np.array(limits, np.float64)
+    sizes = np.where(bounds == 0.0, 1.0, np.abs(bounds))
+    excess = (np.maximum(means - bounds, 0.0) / sizes).sum(axis=1)
+    returns = outcome.returns.mean(axis=1)
+    return list(zip((-excess).tolist(), returns.tolist(), strict=True))
+
+
+@dataclass
+class Entrant:
+    """One search, and what has come of it.
+
+    Attributes:
+        cma: The search.
+        make: Makes a controller for N environments from their numbers, shape (N, n).
+        episodes: How many each candidate plays in a round.
+        quota: How many rounds it has in any case.
+        rounds: How many it has had.
+        merit: That of the best candidate in validation.
+        best: Its numbers, shape (n,).
+        gained: The round in which it was found.
+    """
+
+    cma: CMA
+    make: Any
+    episodes: int
+    quota: int = 0
+    rounds: int = 0
+    merit: Merit = NO_MERIT
+    best: FloatArray = field(default_factory=lambda: np.empty(0))
+    gained: int = 0
+    agreement: float = 1.0
+
+    def play(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> Merit:
+        """Do a round, and return the merit of its best candidate.
+
+        Ranks decide, so that the scale of rewards does not matter.
+        """
+        found = self.cma.ask()
+        outcome = arena.play(self.make, found, seeds)
+        merits = merits_of(outcome, limits)
+        order = sorted(range(len(found)), key=merits.__getitem__, reverse=True)
+        self.cma.tell(np.array(order))
+        self.rounds += 1
+        self._note_agreement(outcome.returns)
+        return merits[order[0]]
+
+    def _note_agreement(self, returns: FloatArray) -> None:
+        """Take more episodes where chance decides on the order of candidates."""
+        half = returns.shape[1] // 2
+        if not 0 < half < MOST_EPISODES // 2:
+            return
+        parts: list[FloatArray] = np.split(returns, 2, axis=1)
+        ranks = [_ranks(np.mean(part, axis=1)) for part in parts]
+        if all(one.any() for one in ranks):  # otherwise all have reached the same
+            now = float(np.corrcoef(*ranks).min())
+            self.agreement += _FADE * (now - self.agreement)
+        if self.agreement < _AGREEMENT:
+            self.episodes, self.agreement = 2 * self.episodes, 1.0
+
+    def validate(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> None:
+        """Let the mean of the search play, and keep it if it is the best until now."""
+        outcome = arena.play(self.make, self.cma.mean[None], seeds)
+        (merit,) = merits_of(outcome, limits)
+        if merit > self.merit:
+            self.merit, self.best, self.gained = merit, self.cma.mean.copy(), self.rounds
+
+
+def _ranks(values: Any) -> FloatArray:
+    """Ranks, equal ones for equal values."""
+    _, inverse = np.unique(values, return_inverse=True)
+    return inverse.astype(np.float64)

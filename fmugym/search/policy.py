@@ -1,0 +1,279 @@
+"""Policies as arrays: a controller, and a network that corrects what it decides."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.baselines.base import Controller, FloatArray, attribute_of
+from fmugym.errors import ConfigError
+from fmugym.search.flattening import choices_of, rows_of, width_of
+
+__all__ = ["LIMIT", "Form", "Policy", "Scale"]
+
+_NOTHING: Final = np.empty(0)
+
+Memory = tuple[Any, ...]
+"""What a policy keeps from one step to the next: arrays of numbers, or of symbols."""
+
+LIMIT: Final = 5.0
+"""The largest magnitude of a scaled feature."""
+
+_FADE: Final = 0.05
+"""The part of the way that the leaky integral of an observation follows it in a step."""
+
+_CONSTANT: Final = 1e-8
+"""A feature whose deviation is smaller than this, beside its mean, counts as constant."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """A class of policies.
+
+    Attributes:
+        name: What it is called.
+        hidden: The widths of the hidden layers, which end in a tanh.
+        history: Whether the network also sees the last change of each observation, its leaky
+            integral, and the last action.
+        blind: Whether the network sees nothing, so that it gives constants.
+    """
+
+    name: str
+    hidden: tuple[int, ...] = ()
+    history: bool = False
+    blind: bool = False
+
+    def features(self, observed: int, acting: int) -> int:
+        """How many numbers the network sees."""
+        if self.blind:
+            return 0
+        return 3 * observed + acting if self.history else observed
+
+    def shapes(self, observed: int, acting: int) -> list[tuple[int, int]]:
+        """The inputs, the constant one included, and the outputs of each layer."""
+        widths = [self.features(observed, acting), *self.hidden, acting]
+        return [(before + 1, after) for before, after in itertools.pairwise(widths)]
+
+    def size(self, observed: int, acting: int) -> int:
+        """The number of weights."""
+        return sum(before * after for before, after in self.shapes(observed, acting))
+
+    def layers(self, weights: FloatArray, observed: int, acting: int) -> Iterator[FloatArray]:
+        """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
+
+        Args:
+            weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
+                step length suits all.
+            observed: The number of observations.
+            acting: The number of outputs.
+        """
+        place = 0
+        for before, after in self.shapes(observed, acting):
+            part = weights[:, place : place + before * after]
+            yield part.reshape(-1, before, after) / math.sqrt(before)
+            place += before * after
+
+
+class Scale:
+    """Learns what features are like: their mean and their deviation.
+
+    Args:
+        count: How many features there are.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count, self._sums = 0, np.zeros((2, count))
+
+    def __call__(self, features: FloatArray) -> tuple[float, float]:
+        """Take features of shape (f, N) into account, and leave them as they are."""
+        self._count += features.shape[1]
+        self._sums += np.sum([features, features**2], axis=2)
+        return 0.0, 1.0
+
+    def fixed(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and divisor of each feature, shape (f,); constant ones are not made larger."""
+        mean, square = self._sums / self._count
+        deviation = np.sqrt(np.maximum(square - mean**2, 0.0))
+        is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
+        return mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
+
+
+class Policy(Controller):
+    """A controller whose action a network corrects.
+
+    Of a ``Box`` the action is that of the controller, and half of the range times what the network
+    gives. Of a ``Discrete`` or a ``MultiDiscrete`` the largest output of each part chooses. Without
+    weights it is the controller's own action.
+
+    Args:
+        baseline: The controller; None for the middle of the range, or the first of the choices.
+        form: What the network sees, and its layers; None for no network.
+        weights: Shape (n,) with n from ``Form.size``, or (N, n) with those of each environment.
+        scale: Mean and divisor of each feature, shape (f,). Or a ``Scale``, which then learns from
+            the features.
+        task: The names of the observations, and the action space in words, that it is for; None
+            for any.
+    """
+
+    def __init__(
+        self,
+        baseline: Controller | None,
+        form: Form | None = None,
+        weights: FloatArray = _NOTHING,
+        scale: Scale | tuple[FloatArray, FloatArray] = (_NOTHING, _NOTHING),
+        task: tuple[tuple[str, ...], str] | None = None,
+    ) -> None:
+        self.baseline, self.form, self.task = baseline, form, task
+        self.weights, self.scale = weights, scale
+
+    def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
+        """See ``Controller.bind``; observations may be of any numeric space."""
+        is_vector = hasattr(env, "single_observation_space")
+        self._seen = env.single_observation_space if is_vector else env.observation_space
+        names = tuple(self._names_of(env) if names is None else names)
+        if self.baseline is not None:
+            self.baseline.bind(env, names)
+        return super().bind(env, names)
+
+    def _names_of(self, env: Any) -> tuple[str, ...]:
+        names = attribute_of(env, "observation_names")
+        return names or tuple(map(str, range(width_of(self._seen))))
+
+    def _rows(self, observation: Any) -> FloatArray:
+        return rows_of(self._seen, observation, self.count)
+
+    def _prepare(self) -> None:
+        space: Any = self.space
+        self._choices = choices_of(space)
+        self.parts = tuple(map(len, self._choices))
+        pairs = () if self.parts else zip(space.low.flat, space.high.flat, strict=True)
+        self.limits = tuple((float(low), float(high)) for low, high in pairs)
+        self.acting = sum(self.parts) or len(self.limits)
+        self._require_task()
+        if self.form is not None:
+            weights = np.atleast_2d(self.weights)
+            self._layers = list(self.form.layers(weights, len(self.names), self.acting))
+
+    def _require_task(self) -> None:
+        """Refuse another task than that of the agent; the text names what differs."""
+        if self.task is None or self.task == (self.names, str(self.space)):
+            return
+        names, space = self.task
+        own, other = (
+            [n for n in a if n not in b] for a, b in ((names, self.names), (self.names, names))
+        )
+        told = "; ".join(
+            text
+            for found, text in (
+                (own, f"it observes {', '.join(own)}, which this task does not give"),
+                (other, f"this task also gives {', '.join(other)}"),
+                (space != str(self.space), f"its actions are {space}, here they are {self.space}"),
+            )
+            if found
+        )
+        raise ConfigError(f"the agent is for another task: {told or 'the order differs'}")
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        if self.baseline is not None:
+            self.baseline.reset(mask)
+        starts = [np.repeat(one[:, None], self.count, axis=1) for one in self.starts]
+        if mask.all():
+            self._memory = tuple(starts)
+        else:
+            pairs = zip(starts, self._memory, strict=True)
+            self._memory = tuple(np.where(mask, start, now) for start, now in pairs)
+
+    # What it decides; observations and features come first, environments last.
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        if self.baseline is None:
+            base = np.repeat(np.array(self.middle)[:, None], self.count, axis=1)
+        else:
+            base = self.baseline._decide(rows).reshape(self.count, -1).T
+        action, self._memory = self.step(rows.T, self._memory, base, self._network)
+        return np.stack(action, axis=-1)
+
+    @property
+    def middle(self) -> list[float]:
+        """The middle of the range of each number, or the first choice of each part."""
+        return [float(one[0]) for one in self._choices] or [(a + b) / 2 for a, b in self.limits]
+
+    @property
+    def starts(self) -> Memory:
+        """What the network sees of the past, at the beginning of an episode."""
+        if self.form is None or not self.form.history:
+            return ()
+        width = len(self.names)
+        return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
+
+    def step(
+        self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
+    ) -> tuple[list[Any], Memory]:
+        """Decide once; all values may be arrays or symbols.
+
+        Args:
+            observed: Shape (k, ...).
+            memory: What the last step has returned, or ``starts``.
+            base: What the controller has decided, shape (m, ...).
+            network: Gives the corrections for features of shape (f, ...). If actions are discrete,
+                it gives the chosen elements.
+
+        Returns:
+            The elements of the action, and what to keep.
+        """
+        features, *kept = self._features(observed, memory)
+        given = None if self.form is None else network(features)
+        if self.parts:
+            action = list(base if given is None else given)
+        else:
+            changes = [0.0] * self.acting if given is None else given
+            action = list(map(_corrected, base, changes, self.limits))
+        return action, (*kept, self._told(action)) if kept else ()
+
+    def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
+        """What the network sees, and what it shall see of this step in the next one."""
+        if not memory:
+            return (observed[:0],) if self.form is not None and self.form.blind else (observed,)
+        last, leaky, told = memory
+        is_first = np.isnan(last)
+        change = np.where(is_first, 0.0, observed - last)
+        leaky = np.where(is_first, observed, leaky + _FADE * (observed - leaky))
+        return np.concatenate([observed, change, leaky, told]), observed, leaky
+
+    def _told(self, action: Sequence[Any]) -> Any:
+        """The action as the network sees it in the next step.
+
+        Numbers go from -1 to 1. Of a choice, the chosen element is 1 and the others are 0.
+        """
+        if self.parts:
+            told = [one == n for one, all_ in zip(action, self._choices, strict=True) for n in all_]
+            return 1.0 * np.stack(told)
+        pairs = zip(action, self.limits, strict=True)
+        return np.stack([(2.0 * one - low - high) / (high - low) for one, (low, high) in pairs])
+
+    def _network(self, features: FloatArray) -> Any:
+        """The outputs for features of shape (f, N), row by row, so that groups do not matter."""
+        mean, divisor = self.scale(features) if callable(self.scale) else self.scale
+        values = np.clip((features.T - mean) / divisor, -LIMIT, LIMIT)[:, None]
+        *hidden, last = self._layers
+        for layer in hidden:
+            values = np.tanh(values @ layer[:, :-1] + layer[:, -1:])
+        outputs = (values @ last[:, :-1] + last[:, -1:])[:, 0].T
+        if not self.parts:
+            return outputs
+        split = np.split(outputs, np.cumsum(self.parts)[:-1])
+        return [
+            one[0] + part.argmax(axis=0) for one, part in zip(self._choices, split, strict=True)
+        ]
+
+
+def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:
+    """An element of the action: that of the controller, and the change in halves of the range."""
+    low, high = limits
+    return np.clip(np.clip(base, low, high) + (high - low) / 2 * change, low, high)

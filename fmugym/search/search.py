@@ -1,0 +1,273 @@
+"""The search for a policy: a baseline is tuned, then classes of policies compete with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.baselines import Controller
+from fmugym.baselines.arena import Arena
+from fmugym.baselines.base import FloatArray
+from fmugym.baselines.cma import CMA
+from fmugym.baselines.parsing import Search as Tunable
+from fmugym.baselines.tuning import Axes
+from fmugym.search.agent import Agent
+from fmugym.search.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
+from fmugym.search.policy import Form, Policy, Scale
+
+__all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
+
+VALIDATION: Final = 500_000
+"""Episodes of validation have seeds from here on, those of training have smaller ones."""
+
+_FINAL: Final = VALIDATION + 1000
+"""The first seed of the last validation, in which all candidates compete."""
+
+POPULATION: Final = 32
+EPISODES: Final = 4
+_VALIDATED: Final = 32
+_LAST: Final = 100
+_EVERY: Final = 5
+"""Rounds from one validation to the next."""
+
+_TUNING: Final = 20
+"""Rounds for the numbers of a controller."""
+
+_TRYING: Final = 5
+"""Rounds for each guess, of which the best then has the others, and for a constant action."""
+
+_LEAST: Final = 10
+_SHARE: Final = 10
+"""A class of policies has at least so many rounds, and this part of all rounds."""
+
+_PATIENCE: Final = 15
+"""A class that leads and gains nothing in so many rounds goes."""
+
+_LARGEST: Final = 30.0
+"""The largest root mean square of the weights."""
+
+_GROWTH: Final = 5.0
+"""Steps become so many times as large as the first ones, at most."""
+
+_MANY: Final = 200
+"""More weights than this are searched without covariances."""
+
+_LINEAR, _HISTORY = Form("linear"), Form("linear with history", history=True)
+_NETWORK, _CONSTANT = Form("network", hidden=(16,)), Form("constant action", blind=True)
+
+_SIGMAS: Final = {_LINEAR: 1.0, _HISTORY: 1.0, _NETWORK: 4.0, _CONSTANT: 1.0}
+"""The first steps of the weights; a quarter of it where they correct a controller."""
+
+
+@dataclass(frozen=True)
+class _Tuned:
+    """Makes controllers with the numbers of a tunable one."""
+
+    name: str
+    tunable: Tunable
+
+    def __call__(self, rows: FloatArray) -> Controller:
+        return Policy(self.tunable.make(**Axes(self.tunable.ranges).numbers(rows)))
+
+    def agent(self, best: FloatArray) -> Agent:
+        numbers = Axes(self.tunable.ranges).numbers(best[None])
+        found = {name: float(values[0]) for name, values in numbers.items()}
+        return Agent(f"tuned {self.name}", self.tunable.text(found))
+
+
+@dataclass(frozen=True)
+class _Policies:
+    """Makes policies of one form over one controller."""
+
+    under: Agent
+    form: Form
+    scale: Any
+
+    def __call__(self, rows: FloatArray) -> Controller:
+        return self.agent(rows).policy()
+
+    def agent(self, best: FloatArray) -> Agent:
+        name = (
+            self.form.name if self.under.text is None else f"{self.under.name} + {self.form.name}"
+        )
+        return Agent(name, self.under.text, self.form, best, self.scale)
+
+
+class Search:
+    """A search, which goes on round by round. Nothing in it depends on time.
+
+    Args:
+        sizes: How many numbers are observed, and how many choose an action.
+        fixed: Controllers that are ready.
+        tunable: Those with numbers to be found, by name.
+        guesses: Such controllers that nobody has declared: only the best of them is tuned.
+        limits: What each cost may add up to in an episode.
+        population: The candidates of a round.
+        episodes: How many each plays; 1 if all episodes are the same.
+        seed: Of the candidates and of the episodes.
+
+    Attributes:
+        rounds: How many there have been.
+        is_over: Whether nothing more is gained.
+        baseline: The best agent without a network, once it is known.
+    """
+
+    def __init__(
+        self,
+        sizes: tuple[int, int],
+        fixed: Sequence[Agent],
+        tunable: Mapping[str, Tunable],
+        guesses: Sequence[Tunable],
+        limits: Sequence[float] = (),
+        population: int = POPULATION,
+        episodes: int = EPISODES,
+        seed: int = 0,
+    ) -> None:
+        self._sizes, self._limits, self._fixed = sizes, tuple(limits), list(fixed)
+        self._population, self._episodes = population, episodes
+        self._rng = np.random.default_rng(seed)
+        self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
+        self._guesses = [self._tuner("guess", one, _TRYING) for one in guesses]
+        if not (fixed or tunable or guesses):
+            make = _Policies(Agent("", None), _CONSTANT, (np.empty(0), np.empty(0)))
+            self._tuned = [replace(self._entrant(make), quota=_TRYING)]
+        self._contenders: list[Entrant] = []
+        self._gone: list[Entrant] = []
+        self.baseline: Agent | None = None
+        self.rounds, self.is_over = 0, False
+
+    @property
+    def merit(self) -> Merit:
+        """The merit of the best agent in validation."""
+        known = [*self._tuned, *self._guesses, *self._contenders, *self._gone]
+        return max((one.merit for one in known), default=NO_MERIT)
+
+    # Rounds.
+
+    def advance(self, arena: Arena) -> None:
+        """Go on by one round, or by the two that tell what observations are like."""
+        waiting = self._waiting()
+        if waiting is not None:
+            self._play(waiting, arena)
+        elif self.baseline is None:
+            agents = [*self._fixed, *(one.make.agent(one.best) for one in self._tuned)]
+            self.baseline, self.baseline_merit = self._best_of(arena, agents, self._validation)
+            self._enter(arena, self.baseline)
+        else:
+            leaders = sorted(self._contenders, key=lambda one: one.merit)[-2:]
+            self._play(self._next(leaders), arena)
+            self._let_go(leaders)
+
+    def _waiting(self) -> Entrant | None:
+        """The controller that is to be tuned next."""
+        for one in [*self._tuned, *self._guesses]:
+            if one.rounds < one.quota:
+                return one
+        if self._guesses:
+            self._tuned.append(max(self._guesses, key=lambda one: one.merit))
+            self._tuned[-1].quota, self._guesses = _TUNING, []
+            return self._waiting()
+        return None
+
+    def _next(self, leaders: Sequence[Entrant]) -> Entrant:
+        """Who plays: one that has had less than its share, or else the leaders by turns."""
+        share = max(_LEAST, self.rounds // _SHARE)
+        behind = [one for one in self._contenders if one.rounds < share]
+        return behind[0] if behind else min(leaders, key=lambda one: one.rounds)
+
+    def _let_go(self, leaders: Sequence[Entrant]) -> None:
+        """Give a leader that gains nothing more episodes, and let it go if that is no use."""
+        for one in leaders:
+            if one.rounds - one.gained < _PATIENCE:
+                continue
+            if 1 < one.episodes < MOST_EPISODES:
+                one.episodes, one.gained = 2 * one.episodes, one.rounds
+            else:
+                self._contenders.remove(one)
+                self._gone.append(one)
+        self.is_over = not self._contenders
+
+    def _play(self, entrant: Entrant, arena: Arena) -> None:
+        entrant.play(arena, self._training(entrant.episodes), self._limits)
+        self.rounds += 1
+        if entrant.rounds % _EVERY == 0:
+            entrant.validate(arena, self._validation, self._limits)
+
+    def _training(self, count: int) -> list[int]:
+        return [int(seed) for seed in self._rng.integers(VALIDATION, size=count)]
+
+    @property
+    def _validation(self) -> range:
+        return range(VALIDATION, VALIDATION + (_VALIDATED if self._episodes > 1 else 1))
+
+    # Who takes part.
+
+    def _tuner(self, name: str, tunable: Tunable, quota: int = _TUNING) -> Entrant:
+        cma = Axes(tunable.ranges).search(self._population, self._rng)
+        return Entrant(cma, _Tuned(name, tunable), self._episodes, quota)
+
+    def _entrant(self, make: _Policies) -> Entrant:
+        form = make.form
+        size = form.size(*self._sizes)
+        sigma = _SIGMAS[form] * (1.0 if make.under.text is None else 0.25)
+        cma = CMA(
+            np.zeros(size),
+            sigma,
+            self._population,
+            self._rng,
+            separable=size > _MANY,
+            largest=_LARGEST,
+            largest_sigma=_GROWTH * sigma,
+        )
+        return Entrant(cma, make, self._episodes)
+
+    def _enter(self, arena: Arena, baseline: Agent) -> None:
+        """Find the scale of what is observed, and let classes of policies enter."""
+        middle = Agent("", None)
+        mean, divisor = self._scale(arena, baseline, middle)
+        over = [] if baseline.text is None else [(baseline, _LINEAR), (baseline, _HISTORY)]
+        alone = [(middle, _LINEAR), *([] if over else [(middle, _HISTORY)]), (middle, _NETWORK)]
+        for under, form in [*over, *alone]:
+            count = form.features(*self._sizes)
+            make = _Policies(under, form, (mean[:count], divisor[:count]))
+            self._contenders.append(self._entrant(make))
+
+    def _scale(self, arena: Arena, *agents: Agent) -> tuple[FloatArray, FloatArray]:
+        """What observations are like while each candidate adds another constant."""
+        scale = Scale(_HISTORY.features(*self._sizes))
+        size, acting = _HISTORY.size(*self._sizes), self._sizes[1]
+        for agent in agents:
+            rows = np.zeros((self._population, size))
+            rows[:, -acting:] = self._rng.uniform(-1, 1, (self._population, acting))
+            rows *= np.sqrt(_HISTORY.shapes(*self._sizes)[0][0])
+            make = _Policies(agent, _HISTORY, scale)
+            arena.play(make, rows, self._training(self._episodes))
+            self.rounds += 1
+        return scale.fixed()
+
+    # Who wins.
+
+    def _best_of(
+        self, arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]
+    ) -> tuple[Agent, Merit]:
+        """The best agent, the first one of equals."""
+        merits = [merits_of(one.play(arena, seeds), self._limits)[0] for one in agents]
+        best = max(range(len(agents)), key=merits.__getitem__)
+        return agents[best], merits[best]
+
+    def winner(self, arena: Arena) -> Agent | None:
+        """The best agent in new episodes of validation, the baseline among them.
+
+        Returns:
+            The agent; None if the search has been too short to find one.
+        """
+        known = [*self._contenders, *self._gone] if self.baseline else self._tuned + self._guesses
+        agents = [one.make.agent(one.best) for one in known if one.best.size]
+        agents = [*([self.baseline] if self.baseline else self._fixed), *agents]
+        if not agents:
+            return None
+        seeds = range(_FINAL, _FINAL + (_LAST if self._episodes > 1 else 1))
+        return self._best_of(arena, agents, seeds)[0]
