@@ -12,9 +12,10 @@ from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.pictures import svg_of
 from fmugym.tools.agents import FACTS, agent_player
 from fmugym.tools.diary import CURVE, REPORT, Diary, curve_of, draw_curve
+from fmugym.tools.evaluation import HELD_OUT_SEED
 from fmugym.tools.records import About
 from fmugym.tools.simulation import simulate
-from fmugym.tools.training import HELD_OUT_SEED, Plan
+from fmugym.tools.training import Plan
 
 __all__ = ["write_outcome"]
 
