@@ -341,10 +341,11 @@ def _judged(
     """Write the winner, and let it play beside the others."""
     facts = _save(quest.folder, course, winner)
     found = course.search
-    others = [one for one in [found.baseline, *found.others()] if one not in (None, winner)]
     if winner is found.baseline:
         tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-    agents = {one.name: one for one in [winner, *others] if one is not None}
+    agents = {winner.name: winner}
+    for other in [found.baseline or winner, *found.others()]:
+        agents.setdefault(other.name, other)
     verdict = judge(
         agents,
         quest.scenarios,
