@@ -229,10 +229,15 @@ class Truncated:
     high: float
 
     def __post_init__(self) -> None:
-        if has_method(self.distribution, "cdf"):
-            cdf, below = self.distribution.cdf, math.nextafter(self.low, -math.inf)
-            if not cdf(self.high) - cdf(below) >= _LEAST_SHARE:
-                raise ConfigError(f"{shown(self.distribution)}, which hardly ever draws that")
+        if self._probability_within() < _LEAST_SHARE:
+            raise ConfigError(f"{shown(self.distribution)}, which hardly ever draws that")
+
+    def _probability_within(self) -> float:
+        below = math.nextafter(self.low, -math.inf)
+        try:
+            return float(self.distribution.cdf(self.high) - self.distribution.cdf(below))
+        except Exception:  # no distribution of scipy.stats: it is not known
+            return 1.0
 
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value.

@@ -11,6 +11,7 @@ from scipy import stats
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, LogUniform, Normal, Uniform
 from fmugym.task import ranges
+from fmugym.testing import check_fmu_env
 
 FMU = fmugym.bundled_fmu("Pendulum")
 FRICTION = "'c'.*0.*inf N.m.*FMU's min and max"
@@ -147,6 +148,9 @@ class TestTaken:
             env.close()
         with pytest.raises(ConfigError, match=r"'c'.*0\.0 and 1\.0 N.m.*task gives"):
             fmugym.load(text("1001", ", max = 1000"))
+
+    def test_by_checks_that_change_parameters(self, make):
+        check_fmu_env(make({"g": (9.8, 9.82)}, g=9.81))
 
     def test_limits_that_a_conversion_rounds(self, text):
         for value in (0.1 + 0.2, 0.3):

@@ -47,7 +47,7 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
     if all(_lies_in(low, end, high) for end in ends):
         return value
     unit = "" if variable.unit is None else f" {variable.unit}"
-    text = f"between {low} and {high}{unit}, {_GIVEN if limits else _OF_FMU}"
+    text = f"between {low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
     if all(map(math.isfinite, ends)):
         found = shown(value) if ends[0] == ends[1] else f"{ends[0]} to {ends[1]} of {shown(value)}"
         raise _outside(variable, text, found)
