@@ -47,7 +47,7 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
     if all(_lies_in(low, end, high) for end in ends):
         return value
     unit = "" if variable.unit is None else f" {variable.unit}"
-    text = f"between {low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
+    text = f"{low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
     if all(map(math.isfinite, ends)):
         found = shown(value) if ends[0] == ends[1] else f"{ends[0]} to {ends[1]} of {shown(value)}"
         raise _outside(variable, text, found)
@@ -55,7 +55,7 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
         own = truncated(value, low, high)
     except ConfigError as error:
         raise _outside(variable, text, error) from None
-    _tell_once(f"{variable.name!r} is drawn again until it lies {text}")
+    _tell_once(f"{variable.name!r} is drawn again until it lies between {text}")
     return own
 
 
@@ -75,7 +75,7 @@ def _lies_in(low: float, value: float, high: float) -> bool:
 
 
 def _outside(variable: Variable, wanted: str, found: object) -> ConfigError:
-    return ConfigError(f"{variable.name!r} must lie {wanted}; got {found}")
+    return ConfigError(f"{variable.name!r} must lie between {wanted}; got {found}")
 
 
 def _tell_once(text: str) -> None:
