@@ -62,13 +62,13 @@ class TestRecord:
     def test_a_report_compares_controllers(self, tmp_path, capsys):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.html"
-        who = "--action", "0", "--action", "1"
+        who = "--action", "-10", "--action", "10"
         code, out, _ = run(capsys, "record", CART_POLE, *who, "--output", path)
         assert code == 0
-        assert [line.split(":")[0] for line in out.splitlines()] == ["action 0", "action 1"]
+        assert [line.split(":")[0] for line in out.splitlines()] == ["action -10", "action 10"]
         page = path.read_text(encoding="utf-8")
         assert page.count("<figure>") == 2
-        assert "<h2>action 0</h2>" in page
+        assert "<h2>action 10</h2>" in page
 
     def test_parquet(self, tmp_path, capsys):
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
@@ -104,7 +104,7 @@ class TestRecord:
             (["--output", "a.csv", "--action", "0", "--action", "1"], "one run, got 2"),
             (["--output", "a.csv", "--variables", "phy"], "'phi'"),
             (["--output", "a.csv", "--every", "0.03"], "0.02"),
-            (["--output", __file__.replace(".py", ".csv"), "--action", "9"], "'9'"),
+            (["--output", __file__.replace(".py", ".csv"), "--action", "19"], "'19'"),
         ],
     )
     def test_mistakes(self, arguments, fact, tmp_path, capsys, monkeypatch):

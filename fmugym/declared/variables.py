@@ -90,6 +90,11 @@ class Record:
         return self.min_on > 0 or self.min_off > 0
 
     @property
+    def range(self) -> tuple[float, float]:
+        """The lowest and the highest value of an action."""
+        return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
+
+    @property
     def fmu_name(self) -> str:
         """The name in the FMU.
 
