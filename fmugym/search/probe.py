@@ -37,6 +37,7 @@ class Probe:
         names: What is observed.
         actions: The action space, in words.
         acting: How many numbers choose an action.
+        ranges: The lowest and the highest value of each number; empty if actions are chosen.
         limits: What each cost may add up to in an episode.
         document: What the task declares; empty if it is no declared one.
         length: The steps of an episode; None if they are not limited.
@@ -48,6 +49,7 @@ class Probe:
     names: tuple[str, ...]
     actions: str
     acting: int
+    ranges: tuple[tuple[float, float], ...]
     limits: Mapping[str, float]
     document: Mapping[str, Any]
     length: int | None
@@ -82,6 +84,7 @@ class Probe:
             policy.names,
             str(policy.space),
             policy.acting,
+            policy.limits,
             limits,
             document,
             length,
