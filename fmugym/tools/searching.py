@@ -171,9 +171,9 @@ def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
 
 def _warnings(probe: Probe) -> list[str]:
     found = []
-    if len(probe.rewards) == 1:
+    if probe.only_reward is not None:
         found.append(
-            f"the reward has been {probe.rewards[0]:g} in each step: what is to be learned?"
+            f"the reward has been {probe.only_reward:g} in each step: what is to be learned?"
         )
     if probe.length is None:
         found.append(f"episodes have no length; they are stopped after {probe.most_steps} steps")
