@@ -20,7 +20,8 @@ def load(config: Any = None, *, scenario: str | None = None, **arguments: Any) -
         config: The path of a TOML file, a dict with the same keys, or a ``Task``. See
             ``docs/task-file.md``.
         scenario: The name of a scenario of the task, in which the episodes then take place.
-        arguments: Arguments of the environment, such as ``render_mode``; see ``TaskEnv``.
+        arguments: Arguments of the environment, such as ``render_mode`` and ``master``; see
+            ``TaskEnv``.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the

@@ -17,6 +17,7 @@ from fmugym.tools.options import (
     add_command,
     add_episodes,
     add_json,
+    add_master,
     add_players,
     check_numbers,
     only_player,
@@ -36,6 +37,7 @@ def add_dataset(commands: Commands) -> None:
     command = add_command(commands, "dataset", _dataset, text)
     command.add_argument("name", metavar="NAME", help="of the dataset, such as house/pi-v0")
     command.add_argument("--task", metavar="TASK", help=HELP_OF_TASK)
+    add_master(command)
     sources = command.add_mutually_exclusive_group()
     sources.add_argument(
         "--log", action="append", metavar="FILE", help="a CSV file of a plant; more than once"
@@ -78,7 +80,7 @@ def _dataset(arguments: argparse.Namespace) -> None:
         raise ConfigError("a new dataset needs --task; --output FOLDER reads an existing one")
     recordings = _recordings(arguments)
     about = {"author": arguments.author, "description": arguments.description}
-    with closing(maker_of(arguments.task, arguments.scenario)()) as env:
+    with closing(maker_of(arguments.task, arguments.scenario, arguments.master)()) as env:
         datasets.write_dataset(arguments.name, recordings, env, **about)
     _show(arguments, recordings, f"dataset {arguments.name}")
 
@@ -94,7 +96,7 @@ def _recordings(arguments: argparse.Namespace) -> list[Recording]:
 
 def _logged(arguments: argparse.Namespace) -> list[Recording]:
     columns = dict(map(_renaming, arguments.column))
-    make_env = maker_of(arguments.task, arguments.scenario)
+    make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
     found: list[Recording] = []
     for path in arguments.log:
         log = PlantLog.read(path)
@@ -114,7 +116,7 @@ def _played(arguments: argparse.Namespace) -> list[Recording]:
     check_numbers(arguments, "episodes", "steps")
     make_policy = only_player(arguments)
     with (
-        closing(maker_of(arguments.task, arguments.scenario)()) as env,
+        closing(maker_of(arguments.task, arguments.scenario, arguments.master)()) as env,
         progress(None, "dataset") as advance,
     ):
         recorder, policy = Recorder(env), make_policy(env)

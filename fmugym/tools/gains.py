@@ -77,7 +77,7 @@ def _tune(arguments: argparse.Namespace) -> None:
 
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
     """Search, and keep the best of each round."""
-    make_env = maker_of(arguments.task, arguments.scenario)
+    make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
     with progress(arguments.rounds, "tune", "rounds") as advance:
 
         def noted(best: Tuning) -> None:

@@ -59,7 +59,9 @@ def _simulate(arguments: argparse.Namespace) -> None:
             say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
 
     with shown_in_any_case(show), ExitStack() as stack:
-        env: Any = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
+        env: Any = stack.enter_context(
+            closing(maker_of(arguments.task, arguments.scenario, arguments.master)())
+        )
         policy = make_policy(env)
         if arguments.output is not None:
             env = stack.enter_context(closing(RecordSeries(env, path=arguments.output)))
@@ -133,7 +135,7 @@ def _record_one(
 ) -> None:
     """Record the episodes of one who acts."""
     with (
-        closing(maker_of(arguments.task, arguments.scenario)()) as env,
+        closing(maker_of(arguments.task, arguments.scenario, arguments.master)()) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
         policy = make_policy(env)
@@ -171,7 +173,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         for scenario in _scenarios(arguments):
-            make_env = maker_of(arguments.task, scenario)
+            make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario
             with progress(None, label) as advance:
                 played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
@@ -216,7 +218,8 @@ def add_bench(commands: Commands) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     report: Report | None = None
     with shown_in_any_case(lambda: _show_speeds(report, arguments)):
-        make, sizes = maker_of(arguments.task), arguments.envs or [8, 64, 1024]
+        make = maker_of(arguments.task, master=arguments.master)
+        sizes = arguments.envs or [8, 64, 1024]
         for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
             pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
 
