@@ -381,6 +381,8 @@ class TestCommandLine:
         for one in (HOUSE, path):
             assert main(["info", str(one), "--master", "jacobi"]) == 1
             assert "House.fmu is a single FMU" in capsys.readouterr().err
+        assert main(["validate", "somewhere:Own", "--master", "jacobi"]) == 1
+        assert "'somewhere:Own'" in capsys.readouterr().err
 
     def test_info_as_json(self, archive, capsys):
         assert main(["info", str(archive), "--json"]) == 0

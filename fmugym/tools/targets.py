@@ -52,7 +52,9 @@ def maker_of(
     if separator and name.isidentifier() and "/" not in module:
         if scenario is not None:
             raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
-        return partial(load, Task.from_dict({"class": target}), **own)
+        if master is not None:
+            raise ConfigError(f"{shown(target)} is no task file and chooses its own master")
+        return partial(load, Task.from_dict({"class": target}))
     if scenario is not None:
         own["scenario"] = scenario
     return partial(_registered, target, own)

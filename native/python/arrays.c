@@ -43,7 +43,7 @@ static bool take(Maker *maker, PyObject *type, int dimensions, const Py_ssize_t 
     maker->size = (size_t)PyArray_NBYTES(array);
     maker->flags = PyArray_FLAGS(array);
     memcpy(maker->strides, PyArray_STRIDES(array), (size_t)dimensions * sizeof *shape);
-    Py_DECREF(array);
+    Py_DECREF((PyObject *)array);
     return true;
 }
 
