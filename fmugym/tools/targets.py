@@ -35,14 +35,16 @@ def maker_of(
         master: Of a system, in the place of what its archive or task says.
 
     Returns:
-        A function that makes the environment. It takes arguments of the environment.
+        A function that makes the environment. It takes arguments of the environment, and
+        ``physical=True`` for the physical form of a task; an id and a class that takes no task
+        have one form only, which ``require_physical`` of the controllers may refuse.
 
     Raises:
         ConfigError: If there is no such thing, or the task has a mistake.
         FMULoadError: If the FMU cannot be read.
     """
     path = Path(target)
-    own = {} if master is None else {"master": master}
+    own: dict[str, Any] = {} if master is None else {"master": master}
     if path.suffix.lower() in _MODELS:
         task = Task.from_dict(tomllib.loads(Proposal(open_model(path)).text()))
         return partial(load, task, **own)
@@ -86,7 +88,9 @@ def _scenarios(task: Task | None) -> list[str]:
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
-def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
+def _registered(
+    env_id: str, arguments: dict[str, Any], physical: bool = False, **more: Any
+) -> FMUEnv:
     try:
         made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
