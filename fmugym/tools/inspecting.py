@@ -129,7 +129,7 @@ def add_validate(commands: Commands) -> None:
 
 
 def _validate(arguments: argparse.Namespace) -> int:
-    report = validate(maker_of(arguments.task))
+    report = validate(maker_of(arguments.task, takes_fmu=True))
     if arguments.json:
         say_json({"task": arguments.task, **report.as_dict()})
     else:
