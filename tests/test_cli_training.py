@@ -4,6 +4,7 @@ import csv
 import errno
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 import fmugym
 from fmugym import ConfigError
 from fmugym.tools.cli import main
-from fmugym.tools.evaluation import confidence
+from fmugym.tools.evaluation import confidence, evaluate, warning_of_one_reward
+from fmugym.tools.simulation import Player, action_of
 from fmugym.tools.training import arguments_of
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
@@ -129,6 +131,39 @@ def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "agent").exists()
 
 
+@pytest.mark.parametrize("command", ["simulate", "record", "evaluate", "tune", "train"])
+def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, capsys):
+    fmu = fmugym.bundled_fmu("Pendulum")
+    more = {
+        "record": ["--output", tmp_path / "a.csv"],
+        "tune": ["pid of=q setpoint=0 kp=0..1"],
+        "train": ["--output", tmp_path / "agent"],
+    }
+    code, out, err = run(capsys, command, fmu, *more.get(command, []))
+    assert (code, out) == (1, "")
+    assert "fmugym new Pendulum.fmu" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("reward", "terminated", "told"),
+    [
+        ("0", "q_dot > 0.3", "0 in every step"),
+        ("-1", "false", "-1 in every step"),
+        ("-1", "q_dot > 0.3", None),
+        ("-abs(q)", "false", None),
+    ],
+)
+def test_a_reward_that_never_changes_is_warned_of(reward, terminated, told):
+    task = {k: v for k, v in SCENARIOS.items() if k != "costs"}
+    task |= {"reward": reward, "terminated": terminated}
+    make_env, player = partial(fmugym.load, task), Player(partial(action_of, text="random"), False)
+    scores = evaluate(make_env, {"a": player, "b": player}, range(4), 100)
+    warning = warning_of_one_reward(scores)
+    assert (told is None) == (warning is None)
+    assert told is None or told in warning
+
+
 class TestTrain:
     @pytest.fixture(autouse=True)
     def sb3(self):
@@ -182,6 +217,15 @@ class TestTrain:
         text = (tmp_path / "agent" / "evaluations.csv").read_text()
         rows = list(csv.DictReader(text.splitlines()))
         assert {"early", "late"} < rows[0].keys()
+
+    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, capsys):
+        fmugym.Task.from_dict(SCENARIOS | {"reward": "0"}).write(tmp_path / "a.toml")
+        options = "--steps", "64", "--envs", "2", "--episodes", "1", "--output", tmp_path / "agent"
+        own = "n_steps=8", "batch_size=16"
+        code, _, err = run(capsys, "train", tmp_path / "a.toml", *own, *options)
+        assert code == 0
+        assert err.count("the reward was 0") == 1
+        assert err.count("in evaluation") > 2
 
     def test_an_interruption_keeps_the_best_agent(self, tmp_path, capsys, monkeypatch):
         def train(self):

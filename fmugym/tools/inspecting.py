@@ -131,7 +131,7 @@ def add_validate(commands: Commands) -> None:
 
 
 def _validate(arguments: argparse.Namespace) -> int:
-    report = validate(maker_of(arguments.task, master=arguments.master))
+    report = validate(maker_of(arguments.task, master=arguments.master, takes_fmu=True))
     if arguments.json:
         say_json({"task": arguments.task, **report.as_dict()})
     else:

@@ -22,7 +22,7 @@ from fmugym.errors import ConfigError, reason, shown
 from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
 from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
-from fmugym.tools.evaluation import Score, Wrap, evaluate
+from fmugym.tools.evaluation import Score, Wrap, evaluate, warning_of_one_reward
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Player
 from fmugym.tools.tracking import Tracker
@@ -354,7 +354,7 @@ class _Training:
         plan, steps = self._plan, self._steps
         if steps == self._progress["last"] and self.scores:
             return
-        is_new = steps != self._progress["last"]
+        is_new, is_first = steps != self._progress["last"], self._progress["last"] < 0
         self._progress |= {"last": steps, "updates": self._model._n_updates}
         make_policy = partial(policy_with, self._model, self._normalization())
         player = Player(make_policy, is_physical=False)
@@ -366,6 +366,9 @@ class _Training:
             )
         mean = sum(score.mean for score in self.scores) / len(self.scores)
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
+        warning = warning_of_one_reward(self.scores) if is_first else None
+        if warning is not None:
+            self._watch.tell(f"warning: {warning}")
         if is_new:
             self._note(steps, mean)
             self._keep_if_best(steps, mean)
