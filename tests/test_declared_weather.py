@@ -386,6 +386,15 @@ class TestWeatherInModelica:
             assert other.period == one.period == 2 * 86400
             np.testing.assert_allclose(at(other, hours), at(one, hours), rtol=1e-4, atol=1e-6)
 
+    def test_the_wind_turns_beyond_a_circle(self, tmp_path):
+        """Such tables have 370 degrees after 350, so that lines take the short way."""
+        usual = [value for _, value, _ in FIELDS.values()]
+        rows = [[i * 3600.0, *usual] for i in range(48)]
+        for i, row in enumerate(rows):
+            row[15] = 38000 + 10 * i
+        path = self.write(tmp_path / "weather.mos", rows)
+        np.testing.assert_allclose(at(read(path, "Wind Direction"), [0, 30.5]), [38000, 38305])
+
     def test_thirty_columns_of_something_else(self, tmp_path):
         rows = "\n".join(" ".join(map(str, [t, *range(2, 31)])) for t in (0, 100, 200))
         (tmp_path / "x.mos").write_text(f"#1\ndouble a(3,30)\n{rows}\n")

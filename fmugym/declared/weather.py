@@ -69,6 +69,9 @@ _CODES: Final[Mapping[str, float]] = {
 }
 """The fields of weather, and the number from which on a value is missing."""
 
+_CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
+"""The same in tables, which count turns of the wind beyond 360 degrees."""
+
 _MEANS: Final = (
     *("Extraterrestrial Horizontal Radiation", "Extraterrestrial Direct Normal Radiation"),
     *("Global Horizontal Radiation", "Direct Normal Radiation", "Diffuse Horizontal Radiation"),
@@ -118,7 +121,7 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
         dates, fields = np.split(np.array(cells, np.float64), [len(_DATES)], axis=1)
     except ValueError as error:
         raise ConfigError(f"{name} is no weather of EnergyPlus: {reason(error)}") from None
-    return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields)
+    return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields, _CODES)
 
 
 def _records(lines: Sequence[str]) -> tuple[int, list[list[str]]]:
@@ -146,9 +149,14 @@ def _end_of(row: Sequence[str], part: int, parts: int) -> float:
     return days * _DAY + (hour - 1 + part / parts) * _HOUR
 
 
-def _weather(before: Mapping[str, FloatArray], times: FloatArray, numbers: FloatArray) -> Table:
+def _weather(
+    before: Mapping[str, FloatArray],
+    times: FloatArray,
+    numbers: FloatArray,
+    codes: Mapping[str, float],
+) -> Table:
     """Weather of rows of fields. It lasts whole days, with a row for its first midnight or not."""
-    found = zip(_CODES.items(), numbers.T, strict=False)
+    found = zip(codes.items(), numbers.T, strict=False)
     fields = {name: np.where(values < code, values, np.nan) for (name, code), values in found}
     period = math.ceil((times[-1] - times[0]) / _DAY) * _DAY
     means = dict.fromkeys(_MEANS, float(np.diff(times[:2]).sum()))
@@ -198,7 +206,7 @@ def _modelica_table(
         raise ConfigError(f"{what} has no rows")
     times = _with_jumps(numbers[:, 0])
     if is_weather and shape[1] == 1 + len(_CODES):
-        return _weather({"time": times}, times, numbers[:, 1:])
+        return _weather({"time": times}, times, numbers[:, 1:], _CODES_OF_TABLES)
     columns = {str(i + 1) if i else "time": numbers[:, i] for i in range(shape[1])}
     period = float(numbers[-1, 0] - numbers[0, 0])
     return Table({**columns, "time": times}, period or _DAY)
