@@ -22,7 +22,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.tools.agents import (
     FACTS,
-    agent_policy,
+    agent_player,
     algorithm_of,
     imported_for_training,
     policy_with,
@@ -32,7 +32,7 @@ from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_ch
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
 from fmugym.tools.evaluation import Score, Wrap, evaluate
 from fmugym.tools.progress import Advance, no_progress
-from fmugym.tools.simulation import Policy
+from fmugym.tools.simulation import Player
 from fmugym.tools.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
@@ -381,7 +381,8 @@ class _Training:
         steps = self._steps
         if steps == self._progress["last"]:
             return
-        scores = self._scores(partial(policy_with, self._model, self._normalization()), self._wrap)
+        make_policy = partial(policy_with, self._model, self._normalization())
+        scores = self._scores(Player(make_policy, is_physical=False), self._wrap)
         mean = sum(score.mean for score in scores) / len(scores)
         self._progress |= {"last": steps, "updates": self._model._n_updates}
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
@@ -395,19 +396,15 @@ class _Training:
         """Let the agent in the folder play the episodes of the evaluations once more."""
         facts = json.loads((self._plan.folder / FACTS).read_text(encoding="utf-8"))
         self._watch.tell(f"the agent after {facts['steps']} steps was the best, and is kept")
-        return self._scores(agent_policy(self._plan.folder), lambda name: lambda env: env)
+        return self._scores(agent_player(self._plan.folder), lambda name: lambda env: env)
 
-    def _scores(
-        self, make_policy: Callable[[FMUEnv], Policy], wrap: Callable[[str], Wrap]
-    ) -> list[Score]:
+    def _scores(self, player: Player, wrap: Callable[[str], Wrap]) -> list[Score]:
         plan = self._plan
         seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
         return [
             score
             for name, make_env in plan.held_out.items()
-            for score in evaluate(
-                make_env, {name: make_policy}, seeds, plan.most_steps, wrap=wrap(name)
-            )
+            for score in evaluate(make_env, {name: player}, seeds, plan.most_steps, wrap=wrap(name))
         ]
 
     def _wrap(self, name: str) -> Wrap:
