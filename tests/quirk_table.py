@@ -132,7 +132,7 @@ QUIRKS = (
         "one saved state", "has one place for the FMU states of all instances",
         neighbours="libraries", log=DISTURB, versions=STATES,
     ),
-    Quirk("static buffer", "steps with a static buffer", neighbours="one thread", log=DISTURB),
+    Quirk("static buffer", "steps with a static buffer", neighbours="libraries", log=DISTURB),
     Quirk(
         "scratch file", "writes and reads a file among its resources",
         neighbours="processes", log=DISTURB,

@@ -165,8 +165,8 @@ static void integrate(Animal *me, double step_size) {
     const double gain = find_gain(me);
     const int steps = (int)(step_size * 1000.0 + 0.5);
 
-    buffer = *x;
     if (is(me, "static buffer")) {
+        buffer = *x;
         usleep(20);
         *x = buffer;
     }
