@@ -201,7 +201,7 @@ class _Notes:
         neighbours = answer.get("neighbours")
         return Verdict(
             complete=bool(answer.get("complete")),
-            deterministic=bool(answer.get("deterministic", True)),
+            noisy=tuple(answer.get("noisy", ())),
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             components=tuple(map(ResetMethod, answer.get("components", ()))),
             neighbours=None if neighbours is None else Neighbours(neighbours),

@@ -224,14 +224,14 @@ def _try_resets(request: Request, notes: Notes) -> Verdict:
         notes.stage(stage)
         skipped = stage in request.skip
         grades[method] = Grade.FAILS if skipped else rehearsal.grade(method)
-        notes.answer(resets=grades, deterministic=rehearsal.deterministic)
+        notes.answer(resets=grades, noisy=rehearsal.noisy)
         if grades[method] == Grade.BITWISE:
             break
     components = _try_components(request, rehearsal, grades, notes)
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
         _make_sample(rehearsal, request, notes)
     blind = notes.found("blind_start")
-    return Verdict(resets=grades, components=components, blind_start=blind)
+    return Verdict(resets=grades, components=components, noisy=rehearsal.noisy, blind_start=blind)
 
 
 def _try_components(
@@ -339,16 +339,24 @@ def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
         notes: Get the answer.
         alone: The verdict on a lone instance.
     """
-    method, blind = alone.reset_method, alone.blind_start
     spec = replace(
-        request.spec,
-        reset_method=method,
+        _without(request.spec, alone.noisy),
+        reset_method=alone.reset_method,
         component_resets=alone.components,
-        blind_start=blind,
+        blind_start=alone.blind_start,
     )
     request = replace(request, spec=spec)
     notes.answer(instances=2)
     notes.answer(neighbours=_need_of_several(request, notes))
+
+
+def _without(spec: PoolSpec, noisy: tuple[str, ...]) -> PoolSpec:
+    """Leave out the outputs that tell nothing about other instances, unless all are such."""
+    kept = [i for i, variable in enumerate(spec.outputs) if variable.name not in noisy]
+    if not kept:
+        return spec
+    samplings = tuple(spec.samplings[i] for i in kept) if spec.samplings else ()
+    return replace(spec, outputs=tuple(spec.outputs[i] for i in kept), samplings=samplings)
 
 
 def _need_of_several(request: Request, notes: Notes) -> Neighbours:
