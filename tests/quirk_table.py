@@ -30,7 +30,6 @@ STATES = (2, 3)
 NEEDS = {
     "independent": "share the process",
     "one initialization at a time": "are initialized one at a time",
-    "one thread": "are stepped by one thread",
     "libraries": "get a copy of the library each",
     "processes": "get a process with a copy of the FMU's files each",
 }

@@ -149,8 +149,6 @@ class TestEpisodes:
 
     @pytest.mark.parametrize("way", WAYS)
     def test_vector(self, make_fmu, version, quirk, way):
-        if (quirk.neighbours, way) == ("one thread", "two"):
-            way = "default"  # the caller knows better than to insist
         path = make_fmu(quirk.token, version)
         envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
         envs.reset(seed=3)
