@@ -37,6 +37,8 @@ class TaskEnv(FMUEnv):
     Attributes:
         task: The task.
         cost_limits: What the costs of an episode may add up to, by name, as the task says.
+        unphysical_keys: The keys of the task for which observations or actions are not in its
+            units; none in its physical form, which controllers need, see ``Task.physical``.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
@@ -63,6 +65,7 @@ class TaskEnv(FMUEnv):
         plan = Plan(self.task, describe(self.task, source), needs_reward)
         self._quantities_of_task = plan.quantities
         self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
+        self.unphysical_keys = plan.unphysical_keys
         if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(
                 f"{type(self).__name__} has a _get_inputs of its own, so that the file cannot say "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from fmugym.tools.options import (
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
 from fmugym.tools.records import Recording, require_format, require_picture, title_of
-from fmugym.tools.simulation import Policy, Summary, simulate
+from fmugym.tools.simulation import Player, Summary, simulate
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -50,7 +49,7 @@ def add_simulate(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
-    make_policy = only_player(arguments)
+    player, make_env = only_player(arguments), maker_of(arguments.task, arguments.scenario)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     summaries: list[Summary] = []
 
@@ -59,8 +58,8 @@ def _simulate(arguments: argparse.Namespace) -> None:
             say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
 
     with shown_in_any_case(show), ExitStack() as stack:
-        env: Any = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
-        policy = make_policy(env)
+        env: Any = stack.enter_context(closing(player.make_env(make_env)))
+        policy = player.make_policy(env)
         if arguments.output is not None:
             env = stack.enter_context(closing(RecordSeries(env, path=arguments.output)))
         total = _steps_of(env.unwrapped, arguments)
@@ -117,8 +116,8 @@ def _record(arguments: argparse.Namespace) -> None:
 
     try:
         with shown_in_any_case(show):
-            for name, make_policy in players.items():
-                _record_one(arguments, recording, name, make_policy, summaries[name])
+            for name, player in players.items():
+                _record_one(arguments, recording, name, player, summaries[name])
     except FMUGymError:
         recording.finish(arguments.seed)
         raise
@@ -128,15 +127,15 @@ def _record_one(
     arguments: argparse.Namespace,
     recording: Recording,
     name: str,
-    make_policy: Callable[[FMUEnv], Policy],
+    player: Player,
     summaries: list[Summary],
 ) -> None:
     """Record the episodes of one who acts."""
     with (
-        closing(maker_of(arguments.task, arguments.scenario)()) as env,
+        closing(player.make_env(maker_of(arguments.task, arguments.scenario))) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
-        policy = make_policy(env)
+        policy = player.make_policy(env)
         recorder = recording.begin(name, env, arguments.variables, arguments.every)
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):
             summaries.append(simulate(recorder, policy, seed, arguments.steps, advance))

@@ -32,7 +32,9 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
         scenario: A scenario of the task file; None for any episodes.
 
     Returns:
-        A function that makes the environment. It takes arguments of the environment.
+        A function that makes the environment. It takes arguments of the environment, and
+        ``physical=True`` for the physical form of a task; an id and a class that takes no task
+        have one form only, which ``require_physical`` of the controllers may refuse.
 
     Raises:
         ConfigError: If there is no such thing, or the task has a mistake.
@@ -77,7 +79,9 @@ def _scenarios(task: Task | None) -> list[str]:
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
-def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
+def _registered(
+    env_id: str, arguments: dict[str, Any], physical: bool = False, **more: Any
+) -> FMUEnv:
     try:
         made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
