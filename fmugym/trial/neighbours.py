@@ -223,8 +223,8 @@ def _with_long_calls(spec: PoolSpec, step_seconds: float) -> PoolSpec:
 
     Powers of two leave the step size that the FMU sees alone.
     """
-    wanted = min(_CALL_SECONDS / max(step_seconds, 1e-9), _MOST_SUBSTEPS)
-    factor = 2 ** int(math.log2(max(wanted, 1.0)))
+    wanted = _CALL_SECONDS / max(step_seconds, 1e-9)
+    factor = 2 ** int(math.log2(min(max(wanted, 1.0), _MOST_SUBSTEPS)))
     return replace(
         spec,
         time_step=spec.time_step * factor,
@@ -235,7 +235,7 @@ def _with_long_calls(spec: PoolSpec, step_seconds: float) -> PoolSpec:
 
 
 def _differ_in_threads(pair: Sequence[_Life], frugal: bool) -> bool:
-    """Let two instances play episodes at the same time, one or as many as there is time for."""
+    """Let both play at the same time, one episode or as many as there is time for."""
     alone = [life.play() for life in pair]
     deadline = time.perf_counter() + _THREAD_SECONDS
     barrier = threading.Barrier(len(pair))

@@ -13,6 +13,7 @@ import faulthandler
 import functools
 import json
 import logging
+import math
 import os
 import pickle
 import sys
@@ -386,7 +387,7 @@ def _watch_steps(request: Request, notes: Notes) -> Steps:
             return watch_steps(
                 request.candidate, _without_reloading(request.spec), request.starts or Starts()
             )
-    return Steps(Neighbours.INDEPENDENT, 0.0)
+    return Steps(Neighbours.INDEPENDENT, math.inf)
 
 
 def _disturbed_in_threads(
