@@ -12,12 +12,14 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.baselines import PID
+from fmugym.baselines import PID, controller_of
 from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.parsing import search_of
 from fmugym.search.agent import AGENT, Agent
 from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
+from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
@@ -551,3 +553,129 @@ class TestAgent:
                 agent.policy().bind(env)
         for fact in facts:
             assert fact in str(caught.value)
+
+
+class TestRanges:
+    def test_of_negative_numbers(self):
+        """They are searched on a logarithmic scale, too, and texts have their sign."""
+        search = search_of("pid of=T setpoint=-3..-1 kp=-5..-0.05 ti=10..2000 offset=-1..1")
+        assert search.ranges == {
+            "setpoint": fmugym.Uniform(1, 3),
+            "kp": fmugym.LogUniform(0.05, 5),
+            "ti": fmugym.LogUniform(10, 2000),
+            "offset": fmugym.Uniform(-1, 1),
+        }
+        found = {"setpoint": 2.0, "kp": 0.25, "ti": 100.0, "offset": -0.5}
+        assert search.text(found) == "pid of=T setpoint=-2 kp=-0.25 ti=100 offset=-0.5"
+        controller = controller_of(search.text(found))
+        assert vars(controller) == vars(search.make(**found))
+        assert (controller.kp, controller.setpoint) == (-0.25, -2.0)
+        made = search.make(**{name: np.array([value] * 2) for name, value in found.items()})
+        assert made.kp.tolist() == [-0.25, -0.25]
+        assert search.at_an_end(found | {"kp": 4.99}) == ["kp"]
+
+    @pytest.mark.parametrize(
+        ("word", "fact"), [("kp=-0.05..-5", "lower"), ("kp=5..1", "lower"), ("kp=a..1", "a..1")]
+    )
+    def test_that_are_none(self, word, fact):
+        with pytest.raises(ConfigError, match=fact):
+            search_of(f"pid of=T setpoint=1 {word}")
+
+    def test_where_a_number_is_needed(self):
+        text = "pid of=theta setpoint=0 kp=-5..-0.05"
+        with pytest.raises(ConfigError, match=r"kp=-5\.\.-0\.05 is a range"):
+            controller_of(text)
+        with closing(load(controllers={"pi": text})()) as env:
+            assert env.task.document["controllers"] == {"pi": text}
+        warm_up = {"period": "1s", "controller": "pi"}
+        with pytest.raises(ConfigError, match=r"controllers.pi.*kp=-5\.\.-0\.05 is a range"):
+            load(controllers={"pi": text}, warm_up=warm_up)()
+
+    @pytest.mark.parametrize(
+        "text", ["pid of=T setpoint=0 kp=5..1", "pid of=T kp=1..2", "pit kp=1..2"]
+    )
+    def test_in_a_task_are_checked(self, text):
+        with pytest.raises(ConfigError, match="controllers"):
+            load(controllers={"pi": text})()
+
+
+CONTROLLED = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "10s",
+    "variables": {
+        "tau": {"min": -0.1, "max": 0.3},
+        "q": {"min": -2, "max": 2},
+    },
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot", "goal"]},
+    "setpoints": {"goal": 1.0},
+}
+
+
+class TestGuesses:
+    @pytest.mark.parametrize(
+        ("changes", "pairs"),
+        [
+            ({"reward": "-abs(q - goal)"}, {("q", "goal")}),
+            ({"reward": "-(goal - q)**2"}, {("q", "goal")}),
+            (
+                {
+                    "reward": {
+                        "a": "-(q - 0.5)**2",
+                        "b": {"expr": "-abs(q_dot - goal)", "weight": 2},
+                    }
+                },
+                {("q", "0.5"), ("q_dot", "goal")},
+            ),
+            ({"reward": "-error**2", "expressions": {"error": "0.25 - q"}}, {("q", "0.25")}),
+            ({"reward": "-tau**2", "costs": {"far": {"expr": "max(q - 1, 0)"}}}, {("q", "1.0")}),
+            ({"reward": "-tau**2 - q * goal - q_dot"}, set()),
+            ({"reward": "1 - goal"}, set()),
+            ({"reward": "-abs(q - phi)", "variables": {"phi": {"name": "theta"}}}, set()),
+            (
+                {
+                    "reward": 1,
+                    "setpoints": {"goal": {"value": 1.0, "of": "q"}},
+                },
+                {("q", "goal")},
+            ),
+        ],
+        ids=[
+            "reward",
+            "reversed",
+            "terms",
+            "expression",
+            "costs",
+            "none",
+            "set point",
+            "unseen",
+            "of",
+        ],
+    )
+    def test_come_from_differences(self, changes, pairs):
+        changes = {"variables": CONTROLLED["variables"] | changes.pop("variables", {})} | changes
+        texts = guesses(**changes)
+        found = [(search_of(text).fixed["of"], search_of(text).fixed["setpoint"]) for text in texts]
+        assert {(of, str(setpoint)) for of, setpoint in found} == pairs
+        assert len(texts) == 2 * len(pairs)
+
+    def test_have_both_signs_and_ranges_of_the_task(self):
+        """The action has 0.4 Nm, and what is measured 4 rad, so that 0.1 Nm/rad is usual."""
+        first, second = map(search_of, guesses(reward="-abs(q - goal)"))
+        assert first.ranges == second.ranges
+        assert {first.negative, second.negative} == {frozenset(), frozenset({"kp"})}
+        gain, time = first.ranges["kp"], first.ranges["ti"]
+        assert (gain.low, gain.high) == pytest.approx((0.001, 10.0))
+        assert (time.low, time.high) == pytest.approx((0.05, 10.0))
+
+    def test_need_one_box_action(self):
+        levels = CONTROLLED["variables"] | {"tau": {"levels": [-0.1, 0.1]}}
+        assert guesses(reward="-abs(q - goal)", variables=levels, physical=False) == []
+        with closing(fmugym.envs.CartPoleEnv()) as env:
+            assert guessed_controllers({"reward": "x - 1"}, env) == []
+
+
+def guesses(physical=True, **changes):
+    document = CONTROLLED | changes
+    with closing(fmugym.load(fmugym.Task.from_dict(document), physical=physical)) as env:
+        return guessed_controllers(env.task.document, env)
