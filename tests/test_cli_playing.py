@@ -214,6 +214,18 @@ class TestBench:
             assert one["hooks"] == "compiled"
         assert report["time_step"] == 0.02
 
+    def test_parameters_are_drawn_as_resets_draw_them(self, caplog):
+        pendulum = {
+            "fmu": {"bundled": "Pendulum"},
+            "parameters": {"m": {"distribution": "uniform", "low": 0.05, "high": 0.1}},
+            "agent": {"actions": ["tau"], "observations": ["q"]},
+            "reward": "-abs(q)",
+            "time_step": 0.05,
+        }
+        *_, report = speed.bench(lambda: fmugym.load(pendulum), [4], 0.05)
+        assert all(0 < one.fmu_share <= 1 for one in report.speeds)
+        assert caplog.text == ""  # a pendulum without a mass would be an error
+
     def test_a_table_with_words_of_caution(self, capsys):
         code, out, _ = run(capsys, "bench", CART_POLE, "--envs", "4", "--seconds", "0.02")
         assert code == 0

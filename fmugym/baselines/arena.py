@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from fmugym.baselines.base import Controller, FloatArray
+from fmugym.errors import FMUGymError
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "Outcome"]
+__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Outcome"]
 
 MOST_ENVS: Final = 512
 """As many environments step together, unless the caller says less."""
@@ -20,6 +22,10 @@ MOST_STEPS: Final = 10_000
 
 Make = Callable[[FloatArray], Controller]
 """Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
+
+
+class CeilingError(FMUGymError):
+    """An arena may not take more steps."""
 
 
 class Outcome(NamedTuple):
@@ -45,6 +51,10 @@ class Arena:
         most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
         costs: The names of costs to add up.
+
+    Attributes:
+        steps: The steps of all environments until now.
+        ceiling: The largest number of them.
     """
 
     def __init__(
@@ -55,13 +65,9 @@ class Arena:
         costs: Sequence[str] = (),
     ) -> None:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
-        self._costs, self._envs = tuple(costs), None
-        self.steps = 0
-
-    steps: int
-    """The steps of all environments until now."""
-
-    _envs: FMUVectorEnv | None
+        self._costs = tuple(costs)
+        self._envs: FMUVectorEnv | None = None
+        self.steps, self.ceiling = 0, math.inf
 
     def close(self) -> None:
         """Close the environments."""
@@ -76,6 +82,9 @@ class Arena:
             make: Makes the controller of a group.
             numbers: What the candidates differ in, shape (n, k).
             seeds: The seeds of their episodes.
+
+        Raises:
+            CeilingError: If more steps are needed than there may be.
         """
         jobs = np.arange(len(numbers) * len(seeds))
         envs = self._opened(len(jobs))
@@ -102,6 +111,8 @@ class Arena:
         totals = np.zeros((1 + len(self._costs), len(seeds)))
         running = np.ones(len(seeds), dtype=bool)
         for _ in range(self._most_steps):
+            if self.steps + len(seeds) > self.ceiling:
+                raise CeilingError(f"all {self.ceiling:g} steps are done")
             actions = controller.act(observations, infos)
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             totals[0] += np.where(running, rewards, 0.0)

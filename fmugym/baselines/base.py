@@ -219,4 +219,4 @@ def require_physical(env: Any) -> None:
 def attribute_of(env: Any, name: str) -> Any:
     """An attribute of an environment, or of the first of many."""
     base = env.unwrapped
-    return base.get_attr(name)[0] if hasattr(base, "get_attr") else getattr(base, name)
+    return base._get_attr(name, [0])[0] if hasattr(base, "_get_attr") else getattr(base, name)

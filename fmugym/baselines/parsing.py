@@ -52,6 +52,12 @@ def controller_of(text: str) -> Controller:
     kind, arguments = _parts(text)
     if kind == "schedule":
         return Schedule(arguments)
+    for name, value in arguments.items():
+        if has_range(value):
+            raise ConfigError(
+                f"{name}={value} is a range, of which 'fmugym tune' and 'fmugym train' find the "
+                "best number"
+            )
     return _made(_KINDS[kind], arguments)
 
 

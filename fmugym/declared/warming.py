@@ -93,11 +93,17 @@ def read_warm_up(
 
 
 def _named_controllers(root: Entry) -> dict[str, Entry]:
-    """The controllers that a task names; each of them is checked."""
+    """The controllers that a task names; each of them is checked, also one with ranges."""
+    from fmugym.baselines.parsing import has_range, search_of
+
     section = root.child("controllers")
     known = {} if section.value is None else section.items()
     for one in known.values():
-        _controller(one, {})
+        if has_range(one.value):
+            with one.placing():
+                search_of(one.value)
+        else:
+            _controller(one, {})
     return known
 
 

@@ -12,7 +12,6 @@ from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.export.decisions import decision_of
-from fmugym.export.devices import without_imperfections
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
 
@@ -83,8 +82,7 @@ def agent_of(
     if name in _TAKEN:
         raise ConfigError(f"the name {name!r} is that of a file of C; choose another one")
     decision = decision_of(env, model, normalization)
-    with without_imperfections(env) as ideal:
-        logic = logic_of(ideal, decision, all_inputs=all_inputs, external=external)
+    logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
     return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
 
 

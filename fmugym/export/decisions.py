@@ -23,21 +23,27 @@ __all__ = ["Decision", "decision_of"]
 _MEMORY: Final = ("agent.last_observation", "agent.leaky_integral", "agent.last_action")
 _CONTROLLER: Final = "agent.controller"
 
+_Ask = Callable[[Any], Any]
+
+
+def _decided_by_network(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
+    return ask(seen), ()
+
 
 @dataclass(frozen=True)
 class Decision:
-    """How an agent decides.
+    """How an agent decides; by default as any network alone.
 
     Attributes:
         network: Its network; None for none.
-        decide: Takes the observation, shape (k, N), what the agent remembers, and a function that
-            asks the network. Returns the elements of the action, the environments last, and what
-            the agent remembers then. All values may be symbols.
+        decide: Takes the observation, symbols of shape (k, N), what the agent remembers, and a
+            function that asks the network. Returns the elements of the action, environments last,
+            and what the agent remembers then.
         starts: What it remembers at the beginning of an episode, by name.
     """
 
-    network: Network | None
-    decide: Callable[[Any, Sequence[Any], Callable[[Any], Any]], tuple[Any, Sequence[Any]]]
+    network: Network | None = None
+    decide: Callable[[Any, Sequence[Any], _Ask], tuple[Any, Sequence[Any]]] = _decided_by_network
     starts: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
 
@@ -56,8 +62,8 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
         return _of_policy(model.policy().bind(env), env.observation_space)
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if isinstance(network.space, spaces.Box):
-        return Decision(network, lambda seen, memory, ask: (network.limited(ask(seen)), memory))
-    return Decision(network, lambda seen, memory, ask: (ask(seen), memory))
+        return Decision(network, lambda seen, memory, ask: (network.limited(ask(seen)), ()))
+    return Decision(network)
 
 
 def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
@@ -68,11 +74,14 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
         starts[_CONTROLLER] = np.array(law.starts)
     network = _network_of(policy)
 
-    def decide(seen: Any, memory: Sequence[Any], ask: Callable[[Any], Any]) -> Any:
+    def constants(features: Any) -> Any:
+        return policy._network(np.empty(features.shape))
+
+    def decide(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
         rows = seen.cast(np.float64).T
         base, state = _of_controller(policy, rows, memory[len(past) :])
-        ask = ask if network else lambda features: policy._network(np.empty(features.shape))
-        action, past_now = policy.step(rows.T, tuple(memory[: len(past)]), base, ask)
+        given = ask if network else constants
+        action, past_now = policy.step(rows.T, tuple(memory[: len(past)]), base, given)
         chosen = policy._as_actions(np.stack(action, axis=-1))
         return np.moveaxis(chosen, 0, -1), [*past_now, *state]
 

@@ -8,6 +8,7 @@ what the agent remembers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -20,6 +21,7 @@ from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.decisions import Decision
+from fmugym.export.devices import without_imperfections
 from fmugym.export.external import found_in
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
@@ -42,6 +44,7 @@ _GIVEN: Final = "given"
 _ANY_ACTION: Final = "any action"
 _PAST_ACTIONS: Final = ("action", "previous_action")
 _SEED: Final = 0
+_OF_ANY: Final = Decision()
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,7 @@ class Parameter:
         field: The number of the ``Kept`` that holds it.
         element: Its place there.
         start: The value if nothing else is set.
-        variable: The plant's variable; None for an episode variable.
+        variable: The plant's variable, or ``START_TIME``; None for an episode variable.
     """
 
     name: str
@@ -116,7 +119,7 @@ class Logic:
 
 def logic_of(
     env: FMUEnv,
-    decision: Decision,
+    decision: Decision = _OF_ANY,
     *,
     all_inputs: bool = False,
     external: Collection[str] = (),
@@ -124,8 +127,9 @@ def logic_of(
     """Trace what a task and its agent do between measurements and inputs, but for the network.
 
     Args:
-        env: The environment. It is not stepped.
-        decision: From the observation to the action.
+        env: The environment. It is not stepped. What its sensors and actuators do is left out; see
+            ``without_imperfections``.
+        decision: From the observation to the action; by default that of any network.
         all_inputs: Whether the controller also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the controller is given as measurements, forecasts of
@@ -135,6 +139,13 @@ def logic_of(
         ConfigError: If a hook does what cannot be translated, or reads what a controller does not
             have, or the network is for another task. The text names the hook or the value.
     """
+    with without_imperfections(env) as ideal:
+        return _logic_of_ideal(ideal, decision, all_inputs, external)
+
+
+def _logic_of_ideal(
+    env: FMUEnv, decision: Decision, all_inputs: bool, external: Collection[str]
+) -> Logic:
     if env._own.step or env._own.reset:
         name = "step" if env._own.step else "reset"
         raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
@@ -221,19 +232,21 @@ class _ControllerTracer(Tracer):
             loaded(graph, "row", element_names(start.shape, "before", name), double)
             for name, start in self._decision.starts.items()
         ]
-        action, memory = self._decision.decide(as_symbols(graph, observed), memory, self._asked)
+        action, then = self._decision.decide(as_symbols(graph, observed), memory, self._asked)
         shape = space.shape or ()
         elements = as_symbols(graph, action).reshape(*shape, LANES)
-        kept = [self._nodes(one, None, double).tolist() for one in memory]
+        kept = [self._nodes(one, None, double).tolist() for one in then]
         return self._nodes(elements, shape, space.dtype), kept
 
     def _asked(self, features: Any) -> Any:
         """What the network gives for some features, which are noted."""
-        network: Any = self._decision.network
+        network, space = self._decision.network, self._env.action_space
         self._features = tuple(self._nodes(features, None, None).tolist())
-        network.require_fitting(len(self._features), self._env.action_space)
-        names = element_names((len(network.parts),), _GIVEN)
-        return loaded(self._graph, "row", names, network.gives)
+        if network is not None:
+            network.require_fitting(len(self._features), space)
+        names = element_names((math.prod(space.shape or ()),), _GIVEN)
+        dtype = np.dtype(space.dtype) if network is None else network.gives
+        return loaded(self._graph, "row", names, dtype)
 
     def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
         """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
@@ -397,9 +410,10 @@ class _Assembly:
 
     def _add_parameter(self, name: str) -> None:
         if name not in self._fields:
-            value = np.ravel(self._episode.parameters[name])
+            own = self._episode.parameters[name]
+            value, variable = np.ravel(own), self._env._interface.parameter(name, own)
             self._add(name, np.dtype(np.float64), value.tolist(), ())
-            self._note_parameters(name, value, self._env.fmu.variable(name))
+            self._note_parameters(name, value, variable)
 
     def _note_parameters(
         self, name: str, values: npt.NDArray[Any], variable: Variable | None

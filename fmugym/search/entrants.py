@@ -83,14 +83,12 @@ class Entrant:
 
     def _note_agreement(self, returns: FloatArray) -> None:
         """Take more episodes where chance decides on the order of candidates."""
-        half = returns.shape[1] // 2
-        if not 0 < half < MOST_EPISODES // 2:
+        if not 1 < returns.shape[1] < MOST_EPISODES:
             return
-        parts: list[FloatArray] = np.split(returns, 2, axis=1)
-        ranks = [_ranks(np.mean(part, axis=1)) for part in parts]
-        if all(one.any() for one in ranks):  # otherwise all have reached the same
-            now = float(np.corrcoef(*ranks).min())
-            self.agreement += _FADE * (now - self.agreement)
+        first, second = (_ranks(part.mean(axis=1)) for part in np.split(returns, 2, axis=1))
+        size = math.sqrt((first @ first) * (second @ second))
+        if size > 0:  # otherwise all have reached the same
+            self.agreement += _FADE * (float(first @ second) / size - self.agreement)
         if self.agreement < _AGREEMENT:
             self.episodes, self.agreement = 2 * self.episodes, 1.0
 
@@ -102,7 +100,8 @@ class Entrant:
             self.merit, self.best, self.gained = merit, self.cma.mean.copy(), self.rounds
 
 
-def _ranks(values: Any) -> FloatArray:
-    """Ranks, equal ones for equal values."""
+def _ranks(values: FloatArray) -> FloatArray:
+    """Ranks beside their mean, equal ones for equal values."""
     _, inverse = np.unique(values, return_inverse=True)
-    return inverse.astype(np.float64)
+    ranks: FloatArray = inverse - inverse.mean()
+    return ranks

@@ -9,8 +9,9 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.baselines.base import FloatArray
+from fmugym.errors import ConfigError
 
-__all__ = ["choices_of", "rows_of", "width_of"]
+__all__ = ["choices_of", "require_numbers", "rows_of", "width_of"]
 
 
 def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArray:
@@ -53,3 +54,34 @@ def choices_of(space: Any) -> list[range]:
     if isinstance(space, spaces.MultiBinary):
         return [range(2)] * int(np.prod(space.shape))
     return []
+
+
+def require_numbers(observed: spaces.Space[Any], acting: spaces.Space[Any]) -> None:
+    """Refuse spaces for which no policy can be searched.
+
+    Raises:
+        ConfigError: For images, texts and the like, and for actions without limits; the text has
+            the cure.
+    """
+    kinds = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
+    for part in _parts(observed):
+        if not isinstance(part, kinds) or len(part.shape or ()) > 1:
+            raise ConfigError(
+                f"a search needs numbers to observe, and {part} has none: give numbers by a hook, "
+                "or train with --algorithm PPO"
+            )
+    if not isinstance(acting, kinds):
+        raise ConfigError(f"a search needs a Box or Discrete of actions, got {acting}: flatten it")
+    if isinstance(acting, spaces.Box) and not acting.is_bounded():
+        raise ConfigError(
+            f"a search needs actions with limits, got {acting}: give 'bounds' in the config, or "
+            "'min' and 'max' in the task file"
+        )
+
+
+def _parts(space: Any) -> Iterator[Any]:
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for part in space.values() if isinstance(space, spaces.Dict) else space:
+            yield from _parts(part)
+    else:
+        yield space

@@ -113,6 +113,7 @@ class Search:
         rounds: How many there have been.
         is_over: Whether nothing more is gained.
         baseline: The best agent without a network, once it is known.
+        merit_of_baseline: Its merit in validation.
     """
 
     def __init__(
@@ -137,13 +138,23 @@ class Search:
         self._contenders: list[Entrant] = []
         self._gone: list[Entrant] = []
         self.baseline: Agent | None = None
+        self.merit_of_baseline = NO_MERIT
         self.rounds, self.is_over = 0, False
 
-    @property
-    def merit(self) -> Merit:
-        """The merit of the best agent in validation."""
-        known = [*self._tuned, *self._guesses, *self._contenders, *self._gone]
-        return max((one.merit for one in known), default=NO_MERIT)
+    def known(self) -> list[tuple[Agent, Merit]]:
+        """The agents that were found until now, and their merits in validation."""
+        if self.baseline is not None:
+            first, entrants = (
+                [(self.baseline, self.merit_of_baseline)],
+                self._contenders + self._gone,
+            )
+        else:
+            first, entrants = [], self._tuned + self._guesses
+        return [*first, *((one.make.agent(one.best), one.merit) for one in entrants if one.gained)]
+
+    def others(self) -> list[Agent]:
+        """The controllers that were declared, and have numbers now."""
+        return [*self._fixed, *(one.make.agent(one.best) for one in self._tuned if one.gained)]
 
     # Rounds.
 
@@ -153,8 +164,9 @@ class Search:
         if waiting is not None:
             self._play(waiting, arena)
         elif self.baseline is None:
-            agents = [*self._fixed, *(one.make.agent(one.best) for one in self._tuned)]
-            self.baseline, self.baseline_merit = self._best_of(arena, agents, self._validation)
+            self.baseline, self.merit_of_baseline = self._best_of(
+                arena, self.others(), self._validation
+            )
             self._enter(arena, self.baseline)
         else:
             leaders = sorted(self._contenders, key=lambda one: one.merit)[-2:]
@@ -264,9 +276,7 @@ class Search:
         Returns:
             The agent; None if the search has been too short to find one.
         """
-        known = [*self._contenders, *self._gone] if self.baseline else self._tuned + self._guesses
-        agents = [one.make.agent(one.best) for one in known if one.best.size]
-        agents = [*([self.baseline] if self.baseline else self._fixed), *agents]
+        agents = [agent for agent, _ in self.known()] or self._fixed
         if not agents:
             return None
         seeds = range(_FINAL, _FINAL + (_LAST if self._episodes > 1 else 1))

@@ -17,7 +17,8 @@ import numpy as np
 from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
-from fmugym.tools.simulation import Player, Policy
+from fmugym.search.agent import AGENT, Agent
+from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
 __all__ = [
     "FACTS",
@@ -83,7 +84,8 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
 def agent_player(folder: Path) -> Player:
     """Load the agent that ``train`` has written to a folder.
 
-    Only load agents from sources that you trust: the files hold pickles, which can run code.
+    Only load agents of Stable-Baselines3 from sources that you trust: their files hold pickles,
+    which can run code. Those of a search hold numbers only.
 
     Returns:
         The player. It makes no policy but raises ``ConfigError`` for an environment with other
@@ -92,6 +94,9 @@ def agent_player(folder: Path) -> Player:
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
+    if (folder / AGENT).exists():
+        policy = Agent.load(folder).policy()
+        return Player(partial(policy_of_controller, policy), is_physical=True)
     model, normalization = load_agent(folder)
     return Player(partial(_checked_policy, folder, model, normalization), is_physical=False)
 

@@ -19,10 +19,22 @@ from fmugym.tools.overview import plain
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Player, Summary, simulate
 
-__all__ = ["Score", "confidence", "each_score", "evaluate", "plot_scores", "table"]
+__all__ = [
+    "HELD_OUT_SEED",
+    "Score",
+    "confidence",
+    "each_score",
+    "evaluate",
+    "plot_scores",
+    "student",
+    "table",
+]
 
 _Z: Final = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
+
+HELD_OUT_SEED: Final = 1_000_000
+"""Episodes of tests and evaluations have seeds from here on, which no training uses."""
 
 _LEAST_WIDTH: Final = 0.01
 """The least width of an axis, as a fraction of its largest value."""
@@ -88,10 +100,10 @@ def confidence(values: Sequence[float]) -> float | None:
     count = len(values)
     if count < 2:
         return None
-    return _student(count - 1) * float(stdev(values)) / math.sqrt(count)
+    return student(count - 1) * float(stdev(values)) / math.sqrt(count)
 
 
-def _student(freedom: int) -> float:
+def student(freedom: int) -> float:
     """The 97.5 % quantile of Student's distribution.
 
     For one and two degrees of freedom it is a closed form. For more, see Abramowitz and Stegun,

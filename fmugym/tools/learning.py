@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import partial
+from math import isfinite
 from pathlib import Path
+from time import monotonic
 from typing import Any, Final
 
+from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.tools.agents import FACTS
 from fmugym.tools.checkpoints import CHECKPOINT
@@ -23,18 +28,19 @@ from fmugym.tools.options import (
     say_json,
     tell,
 )
-from fmugym.tools.outcome import write_outcome
-from fmugym.tools.progress import progress
+from fmugym.tools.outcome import write_curve, write_outcome
+from fmugym.tools.progress import Advance, progress
 from fmugym.tools.records import title_of
+from fmugym.tools.searching import STATE, Quest, search
 from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.tools.tracking import TRACKERS, tracker_for
-from fmugym.tools.training import Plan, Watch, arguments_of, facts_of, train
+from fmugym.tools.training import TRAINING, Plan, Watch, arguments_of, facts_of, train
 from fmugym.tools.tuning import tune
 
 __all__ = ["add_train"]
 
 _DEFAULTS: Final[dict[str, Any]] = {
-    "algorithm": "PPO",
+    "algorithm": None,
     "steps": 100_000,
     "envs": 8,
     "seed": 0,
@@ -46,41 +52,55 @@ _DEFAULTS: Final[dict[str, Any]] = {
 
 def add_train(commands: Commands) -> None:
     """Add ``train``."""
-    text = "train an agent with Stable-Baselines3, and keep the best one"
+    text = "find an agent that beats the controllers of the task, and compare it with them"
     command = add_command(commands, "train", _train, text)
     add_task(command)
+    command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
+    command.add_argument("--minutes", type=float, help="of the search, without its test; default 1")
     command.add_argument(
+        "--rounds", type=int, help="that the search ends with: repeats an earlier one"
+    )
+    command.add_argument(
+        "--candidates", type=int, metavar="N", help="of a round; default 32, 8 for slow FMUs"
+    )
+    command.add_argument("--steps", type=int, help="of all environments together, at most")
+    command.add_argument("--envs", type=int, help="that step together; default 512, or 8 with PPO")
+    command.add_argument("--seed", type=int, help="default 0")
+    command.add_argument("--episodes", type=int, help="of a test; default 100, 4 of each scenario")
+    command.add_argument(
+        "--resume", action="store_true", help="go on with the training in the folder"
+    )
+    _add_of_algorithms(command)
+    add_json(command)
+
+
+def _add_of_algorithms(command: argparse.ArgumentParser) -> None:
+    """Add the options for trainings with Stable-Baselines3."""
+    group = command.add_argument_group("with --algorithm (needs the extra sb3)")
+    group.add_argument(
         "arguments", nargs="*", metavar="KEY=VALUE", help="arguments of the algorithm"
     )
-    command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
-    command.add_argument("--algorithm", help="PPO (default), A2C, SAC, TD3, DQN ...")
-    command.add_argument("--steps", type=int, help="default 100000")
-    command.add_argument("--envs", type=int, help="that step together; default 8")
-    command.add_argument("--seed", type=int, help="default 0")
-    command.add_argument("--episodes", type=int, help="of an evaluation; default 5")
-    command.add_argument(
+    group.add_argument("--algorithm", help="PPO, A2C, SAC, TD3, DQN ... instead of the search")
+    group.add_argument(
         "--no-normalize",
         action="store_false",
         dest="normalize",
         default=None,
         help="without running normalization",
     )
-    command.add_argument(
-        "--resume", action="store_true", help="go on with the training in the folder"
-    )
-    command.add_argument(
+    group.add_argument(
         "--tune", type=int, metavar="N", help="first try N sets of arguments with Optuna"
     )
-    command.add_argument(
+    group.add_argument(
         "--tune-steps", type=int, metavar="N", help="of each of these; default a tenth of --steps"
     )
-    command.add_argument(
+    group.add_argument(
         "--record",
         action="append",
         metavar="GLOB",
         help="record these variables in training and evaluations, and write a report",
     )
-    command.add_argument(
+    group.add_argument(
         "--record-env",
         type=int,
         action="append",
@@ -88,15 +108,87 @@ def add_train(commands: Commands) -> None:
         help="the number of a recorded environment of the training; more than once for several; "
         "default 0",
     )
-    command.add_argument(
+    group.add_argument(
         "--record-every", type=float, metavar="SECONDS", help="between rows; default each step"
     )
-    command.add_argument("--record-format", help="csv (default) or parquet")
-    command.add_argument("--track", choices=sorted(TRACKERS), help="log to this library, too")
-    add_json(command)
+    group.add_argument("--record-format", help="csv (default) or parquet")
+    group.add_argument("--track", choices=sorted(TRACKERS), help="log to this library, too")
+
+
+_OF_ALGORITHMS: Final = (
+    *("arguments", "normalize", "tune", "tune_steps", "record", "record_env"),
+    *("record_every", "record_format", "track"),
+)
+_OF_SEARCHES: Final = ("minutes", "rounds", "candidates")
+_COUNTS: Final = ("rounds", "candidates", "steps", "envs", "episodes")
+_BETWEEN_LINES: Final = 10.0
 
 
 def _train(arguments: argparse.Namespace) -> None:
+    has_algorithm = arguments.resume and (arguments.output / TRAINING).exists()
+    if arguments.algorithm is None and not has_algorithm:
+        _refuse(arguments, _OF_ALGORITHMS, "is for trainings with --algorithm, such as PPO")
+        _search(arguments)
+    else:
+        _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")
+        _learn(arguments)
+
+
+def _refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
+    for name in names:
+        if getattr(arguments, name) not in (None, []):
+            raise ConfigError(
+                f"--{name.replace('_', '-')} {why}".replace("--arguments", "KEY=VALUE")
+            )
+
+
+def _search(arguments: argparse.Namespace) -> None:
+    given = {name: getattr(arguments, name) for name in _COUNTS}
+    counts = {name: value for name, value in given.items() if value is not None}
+    check_numbers(arguments, *counts)
+    if arguments.minutes is not None:
+        check_number("--minutes", arguments.minutes, positive=True)
+    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
+    scenarios = {name: partial(maker_of(arguments.task, name), physical=True) for name in names}
+    make_env = partial(make_env, physical=True)
+    quest = Quest(
+        make_env,
+        scenarios or {"unseen episodes": make_env},
+        arguments.output,
+        arguments.minutes,
+        seed=arguments.seed or 0,
+        **counts,
+    )
+    total = round(quest.seconds) if isfinite(quest.seconds) else None
+    with progress(total, "train", "s") as advance:
+        try:
+            verdict, facts = search(quest, tell, _now_and_then(advance), resume=arguments.resume)
+        except KeyboardInterrupt:
+            _tell_what_is_kept(arguments.output, STATE)
+            raise
+    write_curve(arguments.output, f"{title_of(arguments.task)}, trained by a search", tell)
+    if arguments.json:
+        say_json({"task": arguments.task, "output": arguments.output, **facts})
+    else:
+        say(verdict.text())
+        tell(f"{arguments.output} has the agent; --rounds {facts['rounds']} repeats the search")
+
+
+def _now_and_then(advance: Advance) -> Callable[[float, str], None]:
+    """Tell the scores in a line every ten seconds, and beside the bar."""
+    last = monotonic()
+
+    def show(seconds: float, text: str) -> None:
+        nonlocal last
+        advance(seconds, text)
+        if monotonic() - last > _BETWEEN_LINES:
+            last = monotonic()
+            tell(text)
+
+    return show
+
+
+def _learn(arguments: argparse.Namespace) -> None:
     plan, begin_tracker = _plan_of(arguments), None
     if arguments.track is not None:
         facts = {"task": arguments.task, "steps": plan.steps, **plan.facts()}
@@ -108,7 +200,7 @@ def _train(arguments: argparse.Namespace) -> None:
         try:
             scores = train(plan, resume=arguments.resume, watch=watch)
         except KeyboardInterrupt:
-            _tell_what_is_kept(plan)
+            _tell_what_is_kept(plan.folder, CHECKPOINT)
             write_outcome(plan, title_of(arguments.task), tell)
             raise
         except OSError as error:  # libraries that write a model do not say where
@@ -118,14 +210,14 @@ def _train(arguments: argparse.Namespace) -> None:
     _show(plan, scores, arguments)
 
 
-def _tell_what_is_kept(plan: Plan) -> None:
+def _tell_what_is_kept(folder: Path, state: str) -> None:
     """After Ctrl-C."""
-    if not (plan.folder / FACTS).exists():
+    if not (folder / FACTS).exists():
         tell("nothing was trained yet")
-    elif (plan.folder / CHECKPOINT).exists():
-        tell(f"{plan.folder} has the best agent until now; --resume goes on with the training")
+    elif (folder / state).exists():
+        tell(f"{folder} has the best agent until now; --resume goes on with the training")
     else:
-        tell(f"{plan.folder} has the best agent until now; the training was too short to resume it")
+        tell(f"{folder} has the best agent until now; the training was too short to resume it")
 
 
 def _plan_of(arguments: argparse.Namespace) -> Plan:

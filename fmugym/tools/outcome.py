@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -12,11 +14,12 @@ from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.pictures import svg_of
 from fmugym.tools.agents import FACTS, agent_player
 from fmugym.tools.diary import CURVE, REPORT, Diary, curve_of, draw_curve
+from fmugym.tools.evaluation import HELD_OUT_SEED
 from fmugym.tools.records import About
 from fmugym.tools.simulation import simulate
-from fmugym.tools.training import HELD_OUT_SEED, Plan
+from fmugym.tools.training import Plan
 
-__all__ = ["write_outcome"]
+__all__ = ["write_curve", "write_outcome"]
 
 
 def write_outcome(plan: Plan, title: str, tell: Callable[[str], None]) -> None:
@@ -29,16 +32,31 @@ def write_outcome(plan: Plan, title: str, tell: Callable[[str], None]) -> None:
         title: What the task is called.
         tell: Gets a line of text if Matplotlib is missing.
     """
+    figure = write_curve(plan.folder, f"{title}, trained with {plan.algorithm}", tell)
+    if figure is not None and plan.diary is not None:
+        _write_report(plan, plan.diary, title, {"Training": svg_of(figure)})
+
+
+def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
+    """Draw the curve of a training.
+
+    Args:
+        folder: That of the training. A picture that is there is replaced.
+        title: A line of text above.
+        tell: Gets a line of text if Matplotlib is missing.
+
+    Returns:
+        The figure of Matplotlib, or None if there is none.
+    """
     try:
-        figure = draw_curve(curve_of(plan.folder), f"{title}, trained with {plan.algorithm}")
-    except FileNotFoundError:  # an interruption came before the first evaluation
-        return
+        figure = draw_curve(curve_of(folder), title)
+    except FileNotFoundError:  # nothing was evaluated, for example after an interruption
+        return None
     except ConfigError as error:
         tell(f"there is no picture of the training: {error}")
-        return
-    figure.savefig(plan.folder / CURVE, dpi=100)
-    if plan.diary is not None:
-        _write_report(plan, plan.diary, title, {"Training": svg_of(figure)})
+        return None
+    figure.savefig(folder / CURVE, dpi=100)
+    return figure
 
 
 def _write_report(plan: Plan, diary: Diary, title: str, charts: Mapping[str, str]) -> None:

@@ -9,11 +9,11 @@ from importlib import import_module
 
 __all__ = ["Advance", "no_progress", "progress"]
 
-Advance = Callable[[int], None]
-"""Is told how many steps were done since the last call."""
+Advance = Callable[..., None]
+"""Is told how many steps were done since the last call, and perhaps a text to show beside."""
 
 
-def no_progress(steps: int) -> None:
+def no_progress(steps: float, text: str = "") -> None:
     """An ``Advance`` that shows nothing."""
 
 
@@ -35,4 +35,9 @@ def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Adva
         yield no_progress
         return
     with tqdm(total=total, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
-        yield bar.update
+
+        def advance(steps: float, text: str = "") -> None:
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(steps)
+
+        yield advance

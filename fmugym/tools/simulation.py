@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from fmugym.baselines import controller_of
+from fmugym.baselines import Controller, controller_of
 from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
@@ -17,7 +17,15 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.tools.progress import Advance, no_progress
 
-__all__ = ["Player", "Policy", "Summary", "action_of", "policy_of", "simulate"]
+__all__ = [
+    "Player",
+    "Policy",
+    "Summary",
+    "action_of",
+    "policy_of",
+    "policy_of_controller",
+    "simulate",
+]
 
 
 def _begin() -> None:
@@ -137,7 +145,16 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     given = named.get(text, text)
     if not isinstance(given, str):
         return action_of(env, str(given))
-    controller = controller_of(given).bind(env)
+    return policy_of_controller(controller_of(given), env)
+
+
+def policy_of_controller(controller: Controller, env: FMUEnv) -> Policy:
+    """Bind a controller to an environment.
+
+    Raises:
+        ConfigError: If it does not fit.
+    """
+    controller.bind(env)
     return Policy(controller.act, controller.reset)
 
 

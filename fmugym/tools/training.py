@@ -22,14 +22,13 @@ from fmugym.errors import ConfigError, reason, shown
 from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
 from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
-from fmugym.tools.evaluation import Score, Wrap, evaluate
+from fmugym.tools.evaluation import HELD_OUT_SEED, Score, Wrap, evaluate
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Player
 from fmugym.tools.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
 __all__ = [
-    "HELD_OUT_SEED",
     "TRAINING",
     "TRIALS",
     "Plan",
@@ -43,9 +42,6 @@ __all__ = [
 TRAINING: Final = "training.json"
 TRIALS: Final = "trials"
 _EVALUATIONS: Final = 10
-HELD_OUT_SEED: Final = 1_000_000
-"""Episodes of evaluations have seeds from here on, which no training uses."""
-
 _SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
 
 

@@ -1,0 +1,118 @@
+"""What a search has to know of a task before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.baselines.arena import MOST_STEPS
+from fmugym.env import FMUEnv
+from fmugym.search.flattening import require_numbers, rows_of
+from fmugym.search.policy import Policy
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["Probe"]
+
+_ENVS: Final = 8
+_QUICK: Final = 2e-3
+_MANY: Final = 128
+"""If a step takes less than this in seconds, so many environments tell its time: the overhead of a
+call is for all of them."""
+
+_STEPS: Final = 200
+_SECONDS: Final = 2.0
+"""A probe takes so many steps, or this time."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What is known of a task.
+
+    Attributes:
+        names: What is observed.
+        actions: The action space, in words.
+        acting: How many numbers choose an action.
+        limits: What each cost may add up to in an episode.
+        document: What the task declares; empty if it is no declared one.
+        length: The steps of an episode; None if they are not limited.
+        is_same: Whether all episodes are the same.
+        seconds: Real time of a step of one environment among many.
+        rewards: The rewards that were seen, at most two of them.
+    """
+
+    names: tuple[str, ...]
+    actions: str
+    acting: int
+    limits: Mapping[str, float]
+    document: Mapping[str, Any]
+    length: int | None
+    is_same: bool
+    seconds: float
+    rewards: tuple[float, ...]
+
+    @classmethod
+    def of(cls, make_env: Callable[[], FMUEnv], envs: int = _ENVS) -> Probe:
+        """Take some steps with random actions, which are the same in all environments.
+
+        Args:
+            make_env: A function that makes the environment.
+            envs: The largest number of environments.
+
+        Raises:
+            ConfigError: If no policy can be searched for the task.
+        """
+        with closing(make_env()) as env:
+            require_numbers(env.observation_space, env.action_space)
+            policy = Policy(None).bind(env)
+            limit = env.spec.max_episode_steps if env.spec is not None else None
+            length = env.config.max_episode_steps or limit
+            limits = dict(getattr(env, "cost_limits", {}))
+            document = env.task.document if hasattr(env, "task") else {}
+        with closing(FMUVectorEnv(make_env, min(envs, _ENVS))) as many:
+            is_same, seconds, rewards = _steps(many)
+        if seconds < _QUICK:
+            with closing(FMUVectorEnv(make_env, min(envs, _MANY))) as many:
+                seconds = _steps(many)[1]
+        return cls(
+            policy.names,
+            str(policy.space),
+            policy.acting,
+            limits,
+            document,
+            length,
+            is_same,
+            seconds,
+            rewards,
+        )
+
+    @property
+    def most_steps(self) -> int:
+        """The steps after which an episode is stopped."""
+        return self.length or MOST_STEPS
+
+    def round_time(self, candidates: int, episodes: int) -> float:
+        """About how many seconds a round takes."""
+        return self.seconds * self.most_steps * candidates * episodes
+
+
+def _steps(envs: FMUVectorEnv) -> tuple[bool, float, tuple[float, ...]]:
+    """Whether all environments go the same way, the seconds of a step, and some rewards."""
+    space, count = envs.single_observation_space, envs.num_envs
+    envs.single_action_space.seed(0)
+    observations, _ = envs.reset(seed=list(range(count)))
+    rows = rows_of(space, observations, count)
+    is_same, seen, steps, begin = bool((rows == rows[0]).all()), set[float](), 0, perf_counter()
+    over = False
+    while not over and steps < _STEPS and perf_counter() - begin < _SECONDS:
+        action = envs.single_action_space.sample()
+        observations, rewards, terminated, truncated, _ = envs.step(np.array([action] * count))
+        rows, steps = rows_of(space, observations, count), steps + 1
+        is_same = is_same and bool((rows == rows[0]).all() and (rewards == rewards[0]).all())
+        seen = seen if len(seen) > 1 else seen.union(rewards.tolist())
+        over = bool((terminated | truncated).all())
+    return is_same, (perf_counter() - begin) / (steps * count), tuple(seen)

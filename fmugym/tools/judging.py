@@ -1,0 +1,130 @@
+"""Who has won: agents play episodes that no search has seen."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.baselines.arena import Arena, Outcome
+from fmugym.search.agent import Agent
+from fmugym.tools.evaluation import HELD_OUT_SEED, student
+
+__all__ = ["Verdict", "judge"]
+
+_EPISODES: Final = 100
+_OF_SCENARIO: Final = 4
+"""Episodes of a test, and of each scenario if the task has some."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What agents have reached; all have played the same episodes.
+
+    Attributes:
+        outcomes: By name, what each has reached in the episodes of each scenario. The first one is
+            judged beside the second one.
+        scenarios: The names of the scenarios.
+        limits: What each cost may add up to in an episode, by name.
+    """
+
+    outcomes: Mapping[str, Sequence[Outcome]]
+    scenarios: Sequence[str]
+    limits: Mapping[str, float]
+
+    def total(self, name: str) -> float:
+        """The mean return of an agent, summed over the scenarios."""
+        return sum(float(one.returns.mean()) for one in self.outcomes[name])
+
+    def gain(self, name: str, other: str) -> tuple[float, float]:
+        """How much more one agent has reached than another one.
+
+        Returns:
+            The difference of the totals, and half the width of its 95 % confidence interval; that
+            is NaN if there is one episode only. The interval comes from the differences in each
+            episode beside their mean in the scenario.
+        """
+        pairs = zip(self.outcomes[name], self.outcomes[other], strict=True)
+        each = [(one.returns - two.returns).ravel() for one, two in pairs]
+        freedom = sum(len(values) - 1 for values in each)
+        if not freedom:
+            return sum(float(values.mean()) for values in each), math.nan
+        variance = sum(float(values.var(ddof=1)) / len(values) for values in each)
+        half = student(freedom) * math.sqrt(variance)
+        return sum(float(values.mean()) for values in each), half
+
+    def text(self) -> str:
+        """The verdict in a line."""
+        first, *others = self.outcomes
+        totals = ", ".join(f"{name} {self.total(name):.6g}" for name in self.outcomes)
+        told = [f"{totals}: {self._beside(first, other)}" for other in others[:1]] or [totals]
+        return "; ".join([*told, *self._costs()])
+
+    def _beside(self, name: str, other: str) -> str:
+        """One agent beside another one; per cent only if both totals have one sign."""
+        gain, half = self.gain(name, other)
+        base, unit = self.total(other), ""
+        if base * self.total(name) > 0:
+            gain, half, unit = 100 * gain / abs(base), 100 * half / abs(base), " %"
+        word = "better" if gain >= 0 else "worse"
+        interval = ""
+        if math.isfinite(half):
+            interval = f" ({abs(gain) - half:.3g} to {abs(gain) + half:.3g})"
+        doubt = ", which may be chance," if half >= abs(gain) else ""
+        return f"{abs(gain):.3g}{unit} {word} than {other}{interval}{doubt} in unseen episodes"
+
+    def _costs(self) -> Iterator[str]:
+        """The costs of the first two, beside their limits."""
+        for index, (cost, limit) in enumerate(self.limits.items()):
+            each = [
+                f"{name} {np.mean([one.costs[..., index].mean() for one in outcomes]):.4g}"
+                for name, outcomes in list(self.outcomes.items())[:2]
+            ]
+            yield f"{cost} {', '.join(each)} of at most {limit:g}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers in types that JSON has."""
+        return {
+            name: {
+                "total_reward": self.total(name),
+                "rewards": {
+                    scenario: one.returns.ravel().tolist()
+                    for scenario, one in zip(self.scenarios, outcomes, strict=True)
+                },
+                "mean_costs": {
+                    cost: float(np.mean([one.costs[..., index].mean() for one in outcomes]))
+                    for index, cost in enumerate(self.limits)
+                },
+            }
+            for name, outcomes in self.outcomes.items()
+        }
+
+
+def judge(
+    agents: Mapping[str, Agent],
+    scenarios: Mapping[str, Callable[[], Any]],
+    arena_of: Callable[[Callable[[], Any]], Arena],
+    limits: Mapping[str, float],
+    episodes: int | None,
+) -> Verdict:
+    """Let agents play.
+
+    Args:
+        agents: By name.
+        scenarios: Functions that make the environments, by name.
+        arena_of: Makes the arena for one of them.
+        limits: What each cost may add up to in an episode, by name.
+        episodes: How many episodes of each scenario; None for the default.
+    """
+    count = episodes or (_EPISODES if len(scenarios) < 2 else _OF_SCENARIO)
+    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + count)
+    outcomes: dict[str, list[Outcome]] = {name: [] for name in agents}
+    for make_env in scenarios.values():
+        with closing(arena_of(make_env)) as arena:
+            for name, agent in agents.items():
+                outcomes[name].append(agent.play(arena, seeds))
+    return Verdict(outcomes, list(scenarios), limits)

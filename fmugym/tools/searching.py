@@ -1,0 +1,358 @@
+"""Training without gradients: a search of policies, its course on disk, and its result."""
+
+from __future__ import annotations
+
+import csv
+import json
+import pickle
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import monotonic
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
+from fmugym.baselines.parsing import has_range, search_of
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, reason, shown
+from fmugym.search.agent import Agent
+from fmugym.search.entrants import NO_MERIT
+from fmugym.search.guessing import guessed_controllers
+from fmugym.search.probe import Probe
+from fmugym.search.search import EPISODES, POPULATION, Search
+from fmugym.tools.agents import FACTS
+from fmugym.tools.diary import EVALUATIONS
+from fmugym.tools.judging import Verdict, judge
+from fmugym.tools.training import require_new
+
+__all__ = ["Quest", "search"]
+
+STATE: Final = "search.pkl"
+_MINUTES: Final = 1.0
+_FEW: Final = 8
+"""Candidates of a round where the FMU is slow."""
+
+_ENOUGH: Final = 60
+_FEWEST: Final = 20
+"""Rounds that should fit with the usual candidates, and that must fit with few of them."""
+
+_LONGEST: Final = 2**31
+"""Steps of a scenario, which has a length of its own."""
+
+_BETWEEN_WRITES: Final = 5.0
+"""Seconds."""
+
+
+@dataclass(frozen=True)
+class Quest:
+    """What to search, and how long.
+
+    Attributes:
+        make_env: Makes the environment, in the physical form of its task.
+        scenarios: By name, functions that make the environments of the test.
+        folder: Where the agent is written; it must not exist, unless a search is resumed.
+        minutes: Real time without the test; None for one minute, or no limit if there are rounds.
+        rounds: The largest number of rounds, those of a resumed search included; None for any.
+        steps: The largest number of steps of all environments together; None for any.
+        envs: The largest number of environments that step together.
+        candidates: Of a round; None for what fits the speed of the FMU.
+        seed: Of candidates and episodes.
+        episodes: Of the test, in each scenario; None for the default.
+    """
+
+    make_env: Callable[[], FMUEnv]
+    scenarios: Mapping[str, Callable[[], FMUEnv]]
+    folder: Path
+    minutes: float | None = None
+    rounds: int | None = None
+    steps: int | None = None
+    envs: int = MOST_ENVS
+    candidates: int | None = None
+    seed: int = 0
+    episodes: int | None = None
+
+    @property
+    def seconds(self) -> float:
+        """The real time."""
+        if self.minutes is None:
+            return 60.0 * _MINUTES if self.rounds is None else np.inf
+        return 60.0 * self.minutes
+
+
+@dataclass
+class _Course:
+    """What a search that is resumed goes on with."""
+
+    search: Search
+    probe: Probe
+    candidates: int
+    seed: int
+    steps: int = 0
+
+
+def search(
+    quest: Quest,
+    tell: Callable[[str], None],
+    advance: Callable[[float, str], None],
+    *,
+    resume: bool = False,
+) -> tuple[Verdict, dict[str, Any]]:
+    """Search an agent, write it, and let it play the test.
+
+    An interruption by Ctrl-C ends the search; the best agent until then is in the folder.
+
+    Args:
+        quest: What to search.
+        tell: Gets lines of text.
+        advance: Is told after each round of the seconds since the last one, and of the scores.
+        resume: Whether to go on with the search in the folder.
+
+    Returns:
+        The verdict, and the facts of the agent.
+
+    Raises:
+        ConfigError: If no policy can be searched for the task, or there is nothing to resume.
+        FileExistsError: If the folder exists, unless a search is resumed.
+    """
+    if resume:
+        course = _resumed(quest.folder)
+    else:
+        require_new(quest.folder)
+        course = _begun(quest, tell)
+        quest.folder.mkdir(parents=True, exist_ok=True)
+    _tell_of_the_plan(quest, course, tell)
+    arena = _arena(quest, course.probe, quest.make_env)
+    with closing(arena):
+        arena.steps, arena.ceiling = course.steps, quest.steps or arena.ceiling
+        _Run(quest, course, arena, advance).run()
+        arena.ceiling = np.inf
+        winner = course.search.winner(arena)
+    if winner is None:
+        raise ConfigError(
+            f"{course.search.rounds} rounds are too few to find anything: give more --minutes"
+        )
+    return _judged(quest, course, winner, tell)
+
+
+def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
+    begin = monotonic()
+    probe = Probe.of(quest.make_env, quest.envs)
+    for line in _warnings(probe):
+        tell(line)
+    fixed, tunable = _declared(probe)
+    guesses: list[str] = []
+    if not fixed and not tunable and probe.document:
+        with closing(quest.make_env()) as env:
+            guesses = guessed_controllers(probe.document, env)
+    tell(_told_baseline([one.name for one in fixed], list(tunable), guesses))
+    episodes = 1 if probe.is_same else EPISODES
+    time = quest.seconds - (monotonic() - begin)
+    candidates = quest.candidates or _fitting(probe, time, episodes, tell)
+    made = Search(
+        (len(probe.names), probe.acting),
+        fixed,
+        {name: search_of(text) for name, text in tunable.items()},
+        [search_of(text) for text in guesses],
+        list(probe.limits.values()),
+        candidates,
+        episodes,
+        quest.seed,
+    )
+    return _Course(made, probe, candidates, quest.seed)
+
+
+def _warnings(probe: Probe) -> list[str]:
+    found = []
+    if len(probe.rewards) == 1:
+        found.append(
+            f"the reward has been {probe.rewards[0]:g} in each step: what is to be learned?"
+        )
+    if probe.length is None:
+        found.append(f"episodes have no length; they are stopped after {probe.most_steps} steps")
+    return [f"warning: {text}" for text in found]
+
+
+def _declared(probe: Probe) -> tuple[list[Agent], dict[str, str]]:
+    """The controllers of the task: those that are ready, and the texts of those with ranges."""
+    given = probe.document.get("controllers", {})
+    texts = {name: text for name, text in given.items() if isinstance(text, str)}
+    ready = [Agent(name, text) for name, text in texts.items() if not has_range(text)]
+    return ready, {name: text for name, text in texts.items() if has_range(text)}
+
+
+def _told_baseline(fixed: list[str], tunable: list[str], guesses: list[str]) -> str:
+    declared = [*fixed, *(f"{name} (to be tuned)" for name in tunable)]
+    if declared:
+        return f"to be beaten: {', '.join(declared)}, as the task declares"
+    if guesses:
+        return (
+            f"to be beaten: the best of {len(guesses)} PI controllers for the differences in the "
+            "reward, since the task declares no controllers"
+        )
+    return "to be beaten: the best constant action, since no controller suggests itself"
+
+
+def _fitting(probe: Probe, seconds: float, episodes: int, tell: Callable[[str], None]) -> int:
+    """As many candidates as leave time for enough rounds."""
+    if probe.round_time(POPULATION, episodes) * _ENOUGH <= seconds:
+        return POPULATION
+    time = probe.round_time(_FEW, episodes)
+    if time * _FEWEST > seconds:
+        tell(
+            f"a round of {_FEW} candidates takes about {time:.3g} s, so the time will do for the "
+            f"baseline only; for more, give --minutes {np.ceil(time * 2 * _FEWEST / 60):.0f}"
+        )
+    return _FEW
+
+
+def _tell_of_the_plan(quest: Quest, course: _Course, tell: Callable[[str], None]) -> None:
+    limits = []
+    if np.isfinite(quest.seconds):
+        limits.append(f"for {quest.seconds:g} s")
+    if quest.rounds is not None:
+        limits.append(f"until round {quest.rounds}")
+    if quest.steps is not None:
+        limits.append(f"for at most {quest.steps} steps")
+    kind = "one episode, as all are the same" if course.probe.is_same else "new episodes"
+    tell(
+        f"{course.candidates} candidates at a time play {kind} of up to "
+        f"{course.probe.most_steps} steps, {' and '.join(limits)}"
+    )
+
+
+def _arena(quest: Quest, probe: Probe, make_env: Callable[[], Any]) -> Arena:
+    most_steps = probe.most_steps if make_env is quest.make_env else _LONGEST
+    return Arena(make_env, quest.envs, most_steps, list(probe.limits))
+
+
+class _Run:
+    """Lets a search go on until its time is over, and writes what it has found."""
+
+    def __init__(
+        self, quest: Quest, course: _Course, arena: Arena, advance: Callable[[float, str], None]
+    ) -> None:
+        self._quest, self._course, self._arena = quest, course, arena
+        self._advance, self._written, self._noted = advance, monotonic(), NO_MERIT
+
+    def run(self) -> None:
+        """Search. What was found is written also if an exception ends the search."""
+        found, begin = self._course.search, monotonic()
+        last = begin
+        try:
+            while not self._is_over(last - begin):
+                found.advance(self._arena)
+                self._note()
+                now = monotonic()
+                self._advance(now - last, self._text())
+                last = now
+        except CeilingError:
+            pass
+        finally:
+            self._write()
+
+    def _is_over(self, seconds: float) -> bool:
+        found, rounds = self._course.search, self._quest.rounds
+        is_done = rounds is not None and found.rounds >= rounds
+        return found.is_over or is_done or seconds >= self._quest.seconds
+
+    def _text(self) -> str:
+        """The scores, for a line of progress."""
+        found = self._course.search
+        merits = [merit for _, merit in found.known()]
+        best = f", best {max(merits)[1]:.6g}" if merits else ""
+        beside = (
+            f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}" if found.baseline else ""
+        )
+        return f"round {found.rounds}{best}{beside}"
+
+    def _note(self) -> None:
+        """Add a line to the curve if a better agent than the baseline was found."""
+        found = self._course.search
+        best = max((merit for _, merit in found.known()), default=NO_MERIT)
+        if found.baseline is not None and best > self._noted:
+            self._noted = best
+            path = self._quest.folder / EVALUATIONS
+            is_new = not path.exists()
+            with path.open("a", encoding="utf-8", newline="") as file:
+                writer = csv.writer(file, lineterminator="\n")
+                if is_new:
+                    writer.writerow(["steps", "reward", found.baseline.name])
+                writer.writerow([self._arena.steps, best[1], found.merit_of_baseline[1]])
+        if monotonic() - self._written > _BETWEEN_WRITES:
+            self._write()
+
+    def _write(self) -> None:
+        """Write the best agent until now, and the state of the search."""
+        self._course.steps, self._written = self._arena.steps, monotonic()
+        known = self._course.search.known()
+        if known:
+            best, _ = max(known, key=lambda one: one[1])
+            _save(self._quest.folder, self._course, best)
+        path = self._quest.folder / STATE
+        part = path.with_suffix(".part")
+        part.write_bytes(pickle.dumps(self._course))
+        part.replace(path)
+
+
+def _save(folder: Path, course: _Course, agent: Agent) -> dict[str, Any]:
+    """Write an agent and its facts."""
+    probe, found = course.probe, course.search
+    agent = replace(agent, names=probe.names, actions=probe.actions)
+    agent.save(folder)
+    facts = {
+        "algorithm": "search",
+        "agent": agent.name,
+        "baseline": None if found.baseline is None else found.baseline.name,
+        "controller": agent.text,
+        "rounds": found.rounds,
+        "candidates": course.candidates,
+        "seed": course.seed,
+        "steps": course.steps,
+    }
+    (folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
+    return facts
+
+
+def _resumed(folder: Path) -> _Course:
+    """Read the state of a search; it is a pickle, which can run code.
+
+    Raises:
+        ConfigError: If there is none, or it is damaged.
+    """
+    try:
+        course = pickle.loads((folder / STATE).read_bytes())
+    except FileNotFoundError:
+        raise ConfigError(f"{shown(str(folder))} has no search to resume") from None
+    except Exception as error:  # a damaged file may raise anything
+        raise ConfigError(
+            f"the search in {shown(str(folder))} cannot be resumed: {reason(error)}"
+        ) from None
+    if not isinstance(course, _Course):
+        raise ConfigError(f"{STATE} in {shown(str(folder))} is of something else")
+    return course
+
+
+def _judged(
+    quest: Quest, course: _Course, winner: Agent, tell: Callable[[str], None]
+) -> tuple[Verdict, dict[str, Any]]:
+    """Write the winner, and let it play beside the others."""
+    facts = _save(quest.folder, course, winner)
+    found = course.search
+    if winner is found.baseline:
+        tell(f"nothing was found that beats {winner.name}: the folder has that controller")
+    agents = {winner.name: winner}
+    for other in [found.baseline or winner, *found.others()]:
+        agents.setdefault(other.name, other)
+    verdict = judge(
+        agents,
+        quest.scenarios,
+        lambda make_env: _arena(quest, course.probe, make_env),
+        course.probe.limits,
+        1 if course.probe.is_same else quest.episodes,
+    )
+    facts |= {"test": verdict.as_dict()}
+    (quest.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
+    return verdict, facts
