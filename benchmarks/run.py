@@ -34,6 +34,7 @@ import rollouts
 import single
 import systems
 import tasks
+import training
 import vector
 import windows
 from documents import DOCUMENTS
@@ -52,6 +53,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "isolation": isolation.tables,
     "windows": windows.tables,
     "overlap": overlap.tables,
+    "training": training.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,
 }

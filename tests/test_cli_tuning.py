@@ -14,8 +14,6 @@ from fmugym.baselines import PID
 from fmugym.baselines.parsing import search_of
 from fmugym.tools.cli import main
 
-pytest.importorskip("scipy", reason="needs SciPy: the extra identification")
-
 HOUSE = "fmugym/House-v0"
 RANGES = "pid of=T setpoint=20..22 kp=0.05..5 ti=14400"
 FEW = "--rounds", "2", "--candidates", "8", "--episodes", "2", "--steps", "100"

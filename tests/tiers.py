@@ -21,7 +21,6 @@ SLOW_MODULES = {
     "test_examples_house",
     "test_examples_planners",
     "test_examples_system",
-    "test_examples_train_house",
     "test_export",
     "test_export_fmu",
     "test_export_onnx",

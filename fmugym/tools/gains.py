@@ -13,7 +13,6 @@ from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
 from fmugym.declared.writing import as_toml
 from fmugym.errors import ConfigError, shown
-from fmugym.extras import imported
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -59,7 +58,6 @@ def add_tune(commands: Commands) -> None:
 
 def _tune(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "rounds", "candidates", "episodes", "steps")
-    imported("scipy", "identification")
     search = search_of(arguments.controller)
     output: Path | None = arguments.output
     if output is not None:

@@ -39,6 +39,11 @@ _ENOUGH: Final = 60
 _FEWEST: Final = 20
 """Rounds that should fit with the usual candidates, and that must fit with few of them."""
 
+_SLOW: Final = 1e-4
+_GROUP: Final = 8
+"""If a step takes longer than this in seconds, so many environments step together, so that an
+episode that has ended is not stepped on until the longest of many ends."""
+
 _LONGEST: Final = 2**31
 """Steps of a scenario, which has a length of its own."""
 
@@ -225,7 +230,8 @@ def _tell_of_the_plan(quest: Quest, course: _Course, tell: Callable[[str], None]
 
 def _arena(quest: Quest, probe: Probe, make_env: Callable[[], Any]) -> Arena:
     most_steps = probe.most_steps if make_env is quest.make_env else _LONGEST
-    return Arena(make_env, quest.envs, most_steps, list(probe.limits))
+    envs = quest.envs if probe.seconds < _SLOW else min(quest.envs, _GROUP)
+    return Arena(make_env, envs, most_steps, list(probe.limits))
 
 
 class _Run:
