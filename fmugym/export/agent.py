@@ -14,6 +14,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.export.decisions import decision_of
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
+from fmugym.search.agent import Agent as FoundAgent
 
 __all__ = ["Agent", "agent_of"]
 
@@ -89,7 +90,10 @@ def agent_of(
 def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:
     spec = getattr(env, "spec", None)
     task = type(env).__name__ if spec is None else str(spec.id)
+    policy = type(model).__name__
+    if isinstance(model, FoundAgent):
+        policy = model.name if model.text is None else f"{model.name} ({model.text})"
     return (
-        f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {type(model).__name__}.",
+        f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {policy}.",
         "Compile it with -ffp-contract=off for the same numbers on every processor.",
     )

@@ -127,7 +127,10 @@ class _Model:
 
     def _metadata(self) -> dict[str, str]:
         logic = self._logic
-        starts = {name: list(k.starts) for name, k in zip(self._fields, logic.kept, strict=True)}
+        starts = {
+            name: [None if start != start else start for start in kept.starts]  # JSON has no NaN
+            for name, kept in zip(self._fields, logic.kept, strict=True)
+        }
         facts: dict[str, Any] = {
             "sample_time": logic.time_step,
             "measurements": [{"name": v.name, "unit": v.unit} for v in logic.measurements],
