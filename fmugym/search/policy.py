@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["LIMIT", "Form", "Policy", "Scale"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -78,6 +78,9 @@ class Form:
             part = weights[:, place : place + before * after]
             yield part.reshape(-1, before, after) / math.sqrt(before)
             place += before * after
+
+
+CONSTANT: Final = Form("constant action", blind=True)
 
 
 class Scale:
