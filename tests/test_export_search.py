@@ -13,7 +13,8 @@ from test_export_fmu import controller_of
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.export import agent_of, write_fmu
+from fmugym.baselines import controller_of as controller_from
+from fmugym.export import agent_of, write_c, write_fmu
 from fmugym.search.agent import Agent
 from fmugym.search.policy import Form, Policy
 from fmugym.tools.cli import main
@@ -143,6 +144,18 @@ class TestInC:
         controller = compiled(exported, tmp_path)
         controller.begin()
         require_same(played(env, agent, controller.step), different=1)
+        env.close()
+
+    def test_of_a_controller_in_python(self, tmp_path):
+        env, texts = heater({"agent": PRESENT}), []
+        policy = Agent("by hand", PID).policy().bind(env)
+        policy.act(np.array([20.0, 1.0]))
+        for model in (policy, controller_from(PID), Agent("by hand", PID)):
+            folder = tmp_path / str(len(texts))
+            folder.mkdir()
+            texts.append(write_c(agent_of(env, model), folder)[1].read_text())
+        assert texts[0] == texts[1] == texts[2]
+        assert policy.baseline._state[1] == 20.0  # it is as before
         env.close()
 
     def test_a_second_episode_begins_as_the_first_one(self, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from fmugym.baselines.base import Controller
 from fmugym.baselines.feedback import Law
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
@@ -58,8 +60,10 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     Raises:
         ConfigError: If the agent cannot be exported, or is for another task.
     """
-    if isinstance(model, Agent):
-        return _of_policy(model.policy().bind(env), env.observation_space)
+    model = model.policy() if isinstance(model, Agent) else model
+    if isinstance(model, Controller):
+        policy = deepcopy(model) if isinstance(model, Policy) else Policy(deepcopy(model))
+        return _of_policy(policy.bind(env), env.observation_space)
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if isinstance(network.space, spaces.Box):
         return Decision(network, lambda seen, memory, ask: (network.limited(ask(seen)), ()))
@@ -71,7 +75,7 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
     _require_known(law, observed)
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
     if isinstance(law, Law):
-        starts[_CONTROLLER] = np.array(law.starts)
+        starts[_CONTROLLER] = np.array(law.starts, np.float64).reshape(-1)
     network = _network_of(policy)
 
     def constants(features: Any) -> Any:
@@ -91,8 +95,8 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
 def _require_known(law: Any, observed: spaces.Space[Any]) -> None:
     if law is not None and not isinstance(law, Law):
         raise ConfigError(
-            f"an agent with a {type(law).__name__} cannot be exported; with a PID or a Hysteresis "
-            "it can be"
+            f"a controller of type {type(law).__name__} cannot be exported; a PID or a Hysteresis "
+            "can be"
         )
     parts = observed.spaces.values() if isinstance(observed, spaces.Dict) else [observed]
     if not all(isinstance(part, spaces.Box) for part in parts):
