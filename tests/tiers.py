@@ -25,6 +25,7 @@ SLOW_MODULES = {
     "test_export_fmu",
     "test_export_onnx",
     "test_export_sb3",
+    "test_export_search",
     "test_fuzz",
     "test_fuzz_face",
     "test_fuzz_hooks",

@@ -242,11 +242,10 @@ class Policy(Controller):
         """
         features, *kept = self._features(observed, memory)
         given = None if self.form is None else network(features)
-        if self.parts:
+        if given is None or self.parts:
             action = list(base if given is None else given)
         else:
-            changes = [0.0] * self.acting if given is None else given
-            action = list(map(_corrected, base, changes, self.limits))
+            action = list(map(_corrected, base, given, self.limits))
         return action, (*kept, self._told(action)) if kept else ()
 
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
