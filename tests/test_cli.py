@@ -2,9 +2,11 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 import zlib
 
@@ -379,6 +381,30 @@ class TestSkeleton:
         command = [sys.executable, "made.py"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert "DecayEnv keeps the contract" in done.stdout, done.stderr
+
+
+class TestNew:
+    def test_what_it_leaves_out_is_counted(self, make_fmu, capsys):
+        rows = [parameter(f"p{n}", f'<Real start="{n}"/>') for n in range(47)]
+        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
+        made = capsys.readouterr()
+        assert [f"# p{n} = {n}.0" in made.out for n in (39, 40)] == [True, False]
+        assert "# 7 more are listed by: fmugym info" in made.out
+        assert "7 parameters are left out; 'fmugym info' lists them" in made.err
+
+    def test_locals_that_look_like_results_are_listed(self, make_fmu, capsys):
+        """As comments: each is a line of [variables] once its # is gone."""
+        real = '<Real unit="{}"/>'
+        wanted = {"room.T[1]": "degC", "P": "W", "E.total": "kWh"}
+        rows = [variable(name, real.format(unit), "local") for name, unit in wanted.items()]
+        rows += [variable("room.T_start", real.format("K"), "local", "fixed")]
+        rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
+        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
+        text = capsys.readouterr().out
+        table = text[text.index("# These locals") :].partition("\n[agent]")[0]
+        table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
+        assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
+        assert tomllib.loads(text)["variables"].keys() == {"u"}
 
 
 def assert_skeleton_runs(path):

@@ -42,7 +42,7 @@ _MOST_FILES: Final = 20
 """Files may extend each other in a chain of this length."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Task:
     """A declared task.
 
@@ -55,7 +55,14 @@ class Task:
     """
 
     document: Mapping[str, Any]
-    sources: tuple[Source, ...] = field(compare=False, repr=False)
+    sources: tuple[Source, ...] = field(compare=False)
+
+    def __repr__(self) -> str:
+        if "class" in self.document:
+            return f"Task({self.name!r}: {shown(self.document['class'])})"
+        agent = self.root.child("agent")
+        seen, done = (shown(agent.child(key).value) for key in ("observations", "actions"))
+        return f"Task({self.name!r}: {done} -> {seen})"
 
     @classmethod
     def of(cls, config: Any) -> Task:
@@ -292,6 +299,10 @@ def _relative_path(path: str, folder: Path) -> str:
 
 def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
     fmu, data, system = document.get("fmu"), document.get("data"), document.get("system")
+    config = document.get("config")
+    if isinstance(config, dict) and "preload" in config:
+        preload = _mapped_libraries(config["preload"], function)
+        document = document | {"config": config | {"preload": preload}}
     if isinstance(system, dict):
         document = document | {"system": _mapped_system(system, function)}
     if isinstance(fmu, str):
@@ -301,6 +312,16 @@ def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
             "data": {name: _mapped_path(d, function) for name, d in data.items()}
         }
     return document
+
+
+def _mapped_libraries(preload: Any, function: Any) -> Any:
+    """Map the paths of libraries. A bare name is for the loader of the system to find."""
+    if isinstance(preload, list):
+        return [_mapped_libraries(one, function) for one in preload]
+    if not isinstance(preload, str) or not os.path.dirname(preload):
+        return preload
+    path = function(preload)
+    return path if os.path.dirname(path) else f"./{path}"
 
 
 def _mapped_system(system: dict[str, Any], function: Any) -> dict[str, Any]:
