@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -66,8 +65,8 @@ def _imported(entry: Entry) -> Any:
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise entry.error(f"{shown(module)} cannot be imported: {error}") from error
-        near = [path.stem for folder in sys.path for path in sorted(Path(folder).glob("*.py"))]
-        raise entry.error(unknown_name("module", module, near)) from None
+        near = unknown_name("module", module, (path.stem for path in sorted(Path().glob("*.py"))))
+        raise entry.error(f"{near} (looked in {shown(str(Path.cwd()))}, too)") from None
     except Exception as error:  # a module may do anything
         what = f"{type(error).__name__}: {reason(error)}"
         raise entry.error(f"{shown(module)} cannot be imported: {what}") from error

@@ -192,6 +192,10 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv
             return read(path, status.st_mtime_ns, status.st_size)
+    except FileNotFoundError:
+        near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
+        missing = unknown_name("file", path.name, near)
+        raise file.error(f"{missing} (looked in {shown(str(path.parent))})") from None
     except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_integer, check_mapping, check_path
+from fmugym.checks import check_mapping, check_path, integer_of
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.warming import period_of
@@ -202,7 +202,7 @@ def _read(path: Path) -> Source:
     except FileNotFoundError:
         near = sorted(file.name for file in path.parent.glob("*.toml"))
         error = unknown_name("task file", path.name, near)
-        raise ConfigError(f"{error}; looked in {shown(str(path.parent))}") from None
+        raise ConfigError(f"{error} (looked in {shown(str(path.parent))})") from None
     except OSError as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     try:
@@ -231,14 +231,10 @@ def _check(source: Source) -> None:
     if root.child("description").value is not None:
         root.child("description").text()
     version = root.child("version")
-    if version.value is not None:
-        with version.placing():
-            check_integer(
-                f"the version of the format (this is fmugym with version {VERSION})",
-                version.value,
-                1,
-                VERSION,
-            )
+    if version.value is not None and integer_of(version.value) != VERSION:
+        raise version.error(
+            f"this fmugym reads version {VERSION} of the format, got {shown(version.value)}"
+        )
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
