@@ -224,7 +224,7 @@ class EnvConfig:
             raise ConfigError(
                 f"keep_initial_states must be True or False, got {shown(self.keep_initial_states)}"
             )
-        if isinstance(self.archive_limits, Mapping):
+        if self.archive_limits is not None:
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()
 
@@ -385,7 +385,9 @@ def _number(what: str, value: Any, *, may_be_boolean: bool = False) -> Any:
     return check_number(what, value, may_be_boolean=may_be_boolean)
 
 
-def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:
+def _archive_limits(limits: Any) -> ArchiveLimits:
+    if isinstance(limits, ArchiveLimits):
+        return limits
     known = [f.name for f in fields(ArchiveLimits)]
     items = check_mapping("archive_limits", limits)
     for name in items:

@@ -1,11 +1,13 @@
 """The settings that ``fmugym validate`` recommends, for models whose needs are known."""
 
-import json
 import math
+import os
+import re
 import subprocess
 import sys
 import tomllib
 from functools import partial
+from pathlib import Path
 
 import exchange_tools
 import foreign_lag

@@ -210,7 +210,7 @@ def _misfit(text: str, error: SyntaxError) -> str:
     column = _column(text, error.offset - 1)
     if error.msg != "invalid syntax":  # such as "'(' was never closed"
         return f"{error.msg} (column {column})"
-    hint = "; equality is ==" if text[column - 1 : column] == "=" else ""
+    hint = "; comparisons are == != < <= > >=" if text[column - 1 : column] == "=" else ""
     return f"column {column} does not fit{hint}"
 
 
