@@ -102,8 +102,8 @@ class EnvConfig:
             episodes still begin as they should.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
-        preload: Shared libraries to load before the FMU's; a relative path is relative to the
-            class's file.
+        preload: Shared libraries to load before the FMU's; a relative path is relative to the file
+            of the class or of the task.
         probe_timeout: Seconds of real time that a call of an unknown FMU may take in its trial in a
             process of its own. An initialization may take ten times as long. None to skip the
             trial.

@@ -139,6 +139,14 @@ class TestValidate:
         assert report.verdict == verdict
         assert report.recommended.get("normalize", False) == ("big reaches" in text)
 
+    @pytest.mark.parametrize("normalize", [False, True])
+    def test_figures_are_in_the_units_of_the_task(self, normalize):
+        variables = {"tau": {"min": -0.01, "max": 0.01}, "q": {"unit": "deg", "min": 1, "max": 5}}
+        task = TASK | {"variables": variables, "agent": TASK["agent"] | {"normalize": normalize}}
+        (finding,) = [one for one in validate(lambda: fmugym.load(task)).findings if one.cure]
+        assert "limits: q (-" in finding.text
+        assert "to 180.1 deg)" in finding.text
+
     def test_a_sound_task(self):
         report = validate(lambda: fmugym.load(TASK))
         assert report.verdict == "ok"

@@ -21,7 +21,7 @@ def test_objects_are_shown_in_one_informative_line():
     told = f"FMU({str(path)!r}: House, FMI 2.0, 4 inputs, 9 outputs, 17 parameters)"
     assert repr(fmugym.FMU(path)) == told
     task = fmugym.Task.read(HERE.parent / "examples" / "cart_pole.toml")
-    assert repr(task).startswith("Task('cart_pole.toml': ['push'] -> ['x', ")
+    assert repr(task).startswith("Task('cart_pole.toml': ['f'] -> ['x', ")
     assert repr(fmugym.Task.from_dict({"class": "a:B"})) == "Task('task': 'a:B')"
     env.close()
     many.close()

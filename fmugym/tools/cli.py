@@ -27,7 +27,7 @@
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
-``--steps N``. All commands take ``--json``.
+``--steps N``. All commands take ``--json``, ``-q`` and ``-v``; those that write files ``--force``.
 
 ``info``, ``new``, ``skeleton``, ``stand-in`` and ``compile`` execute nothing of the FMU, the others
 do. Output is printable text; letters that the console lacks are escaped. The exit code is 0; 1 if
