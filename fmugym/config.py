@@ -389,6 +389,8 @@ def _archive_limits(limits: Any) -> ArchiveLimits:
     if isinstance(limits, ArchiveLimits):
         return limits
     known = [f.name for f in fields(ArchiveLimits)]
+    if not isinstance(limits, Mapping):
+        raise ConfigError(f"archive_limits must be ArchiveLimits or a dict, got {shown(limits)}")
     items = check_mapping("archive_limits", limits)
     for name in items:
         if name not in known:

@@ -405,7 +405,7 @@ MISTAKES = {
         "0.02",
     ),
     "tiny step": ('"20ms"', '1e-320\nepisode_length = "1s"', "line 3", "multiple"),
-    "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "math:Pie"),
+    "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "class of math 'Pie'"),
     "previous of memory": ('"-abs(q)"', '"previous(time)"', "line 3", "'time'"),
     "arguments": ('"-abs(q)"', '"hypot(q)"', "line 3", "2 arguments, got 1"),
     "upper case": ('["tau"]', '["TAU"]', "line 7", "'tau'"),

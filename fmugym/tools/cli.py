@@ -98,8 +98,8 @@ from fmugym.tools.showing import add_demo
 from fmugym.tools.streams import (
     drop_output,
     escape_what_consoles_lack,
-    has_text,
     keep_output_from_fmus,
+    named,
 )
 
 __all__ = ["main"]
@@ -126,12 +126,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     escape_what_consoles_lack()
     arguments = _parsed(argv)
     printed = None if argv is not None else keep_output_from_fmus(shown=arguments.verbose)
-    try:
-        with speaking(arguments):
+    with speaking(arguments):
+        try:
             return _code_of(arguments)
-    finally:
-        if printed is not None and has_text(printed):
-            note(f"what FMUs and their libraries printed is in {printed}; -v shows it")
+        finally:
+            if printed is not None and (file := named(printed)):
+                note(f"what FMUs and their libraries printed is in {file}; -v shows it")
 
 
 def _code_of(arguments: argparse.Namespace) -> int:

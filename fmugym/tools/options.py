@@ -132,7 +132,7 @@ def add_common(command: argparse.ArgumentParser) -> None:
 
 
 def add_json(command: argparse.ArgumentParser) -> None:
-    """Add the option that all commands have."""
+    """Add the option for results that programs read."""
     command.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -250,8 +250,9 @@ def speaking(arguments: argparse.Namespace) -> Iterator[None]:
     """Say as much as ``--quiet`` and ``--verbose`` ask for."""
     logger, handler = logging.getLogger("fmugym"), logging.StreamHandler(sys.stderr)
     handler.setLevel(logging.ERROR if arguments.quiet else logging.INFO)
-    level, logger.level = logger.level, logging.INFO if arguments.verbose else logger.level
-    token = quiet.set(arguments.quiet)
+    token, level = quiet.set(arguments.quiet), logger.level
+    if arguments.verbose:
+        logger.setLevel(logging.INFO)
     if arguments.quiet or arguments.verbose:
         logger.addHandler(handler)
     try:
@@ -271,14 +272,15 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
     Raises:
         ConfigError: If a file exists, or its folder does not.
     """
-    old = {}
-    for path in _outputs_of(arguments):
+    old: dict[Path, Path] = {}
+    paths = list(_outputs_of(arguments))
+    for path in paths:
         require_folder(path)
         if path.is_file() and not arguments.force:
             raise ConfigError(f"{path} exists; name a new file, or replace it with --force")
-        if path.is_file():
-            old[path] = path.rename(path.with_name(f".{path.name}.{os.getpid()}"))
     try:
+        for path in filter(Path.is_file, paths):
+            old[path] = path.rename(path.with_name(f".{path.name}.{os.getpid()}"))
         yield
     finally:
         for path, aside in old.items():

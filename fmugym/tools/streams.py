@@ -6,15 +6,16 @@ import contextlib
 import ctypes
 import io
 import os
+import shutil
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
-__all__ = ["drop_output", "escape_what_consoles_lack", "has_text", "keep_output_from_fmus"]
+__all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus", "named"]
 
 
-def keep_output_from_fmus(*, shown: bool) -> Path | None:
+def keep_output_from_fmus(*, shown: bool) -> BinaryIO | None:
     """Let the standard streams have what Python prints; all else goes elsewhere.
 
     FMUs print what they like. A table, or the JSON that another program reads, must not have it
@@ -25,7 +26,7 @@ def keep_output_from_fmus(*, shown: bool) -> Path | None:
         shown: Whether it goes to the standard error instead of a file.
 
     Returns:
-        The file.
+        The file, which has no name, so that nothing is left of it after any end of the process.
     """
     with contextlib.suppress(OSError, AttributeError, io.UnsupportedOperation):
         if (sys.stdout.fileno(), sys.stderr.fileno()) != (1, 2):
@@ -35,11 +36,10 @@ def keep_output_from_fmus(*, shown: bool) -> Path | None:
             os.dup2(2, 1)
             return None
         sys.stderr = _apart(sys.stderr)
-        handle, name = tempfile.mkstemp(prefix="fmugym-printed-", suffix=".txt")
-        os.dup2(handle, 1)
-        os.dup2(handle, 2)
-        os.close(handle)
-        return Path(name)
+        file = tempfile.TemporaryFile()  # noqa: SIM115, it lives as long as the process
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        return file
     return None
 
 
@@ -51,18 +51,20 @@ def _apart(stream: Any) -> Any:
         "w",
         encoding=stream.encoding,
         errors=stream.errors,
-        buffering=1 if stream.line_buffering else -1,
+        buffering=1 if stream.line_buffering or stream.write_through else -1,
     )
 
 
-def has_text(path: Path) -> bool:
-    """Whether FMUs have printed something to a file; an empty one is removed."""
+def named(printed: BinaryIO) -> Path | None:
+    """Give what FMUs have printed a file with a name; None if they have printed nothing."""
     with contextlib.suppress(OSError, AttributeError, TypeError):  # Windows has no such library
         ctypes.CDLL(None).fflush(None)
-    if path.stat().st_size:
-        return True
-    path.unlink()
-    return False
+    if not printed.seek(0, os.SEEK_END):
+        return None
+    printed.seek(0)
+    with tempfile.NamedTemporaryFile(prefix="fmugym-printed-", suffix=".txt", delete=False) as file:
+        shutil.copyfileobj(printed, file)
+    return Path(file.name)
 
 
 def escape_what_consoles_lack() -> None:
