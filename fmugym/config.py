@@ -89,7 +89,8 @@ class EnvConfig:
         episode_variables: Values of the task itself by name (targets, integrals, histories):
             numbers, distributions drawn at each reset, or arrays of both. ``_update`` may write
             them; it assigns new arrays.
-        bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
+        bounds: ``(low, high)`` by name, used instead of the FMU's own min and max for the spaces,
+            and as the range of parameters and start values.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
         fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
             ones, before ``on_fault`` applies.
