@@ -19,6 +19,7 @@ from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.extras import imported
 from fmugym.search.agent import AGENT, Agent
 from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
@@ -44,13 +45,7 @@ def imported_for_training(name: str) -> Any:
     Raises:
         ConfigError: If it is missing.
     """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"this needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
-            "pip install 'fmugym-toolbox[sb3]'"
-        ) from error
+    return imported(name, "sb3")
 
 
 def algorithm_of(name: str) -> Any:
@@ -135,8 +130,8 @@ class TrainedModel:
             own, other = getattr(self._model, f"{what}_space"), getattr(env, f"{what}_space")
             if type(own) is not type(other) or own.shape != other.shape:
                 raise ConfigError(
-                    f"the agent in {shown(str(self._folder))} is for another task: its {what} "
-                    f"space is {own}, that of the task is {other}"
+                    f"the agent in {shown(str(self._folder))} is for another task: its {what}s are "
+                    f"{_kind(own)}, those of the task are {_kind(other)} ({_names(what, env)})"
                 )
         self._policy = policy_with(self._model, self._normalization, env.unwrapped)
         return self
@@ -199,6 +194,16 @@ def _normalization_in(folder: Path) -> Any:
         raise ConfigError(f"{_NORMALIZATION} in {shown(str(folder))} is of something else")
     normalization.training = False
     return normalization
+
+
+def _kind(space: Any) -> str:
+    """A space without its limits, which may be long arrays."""
+    return f"{type(space).__name__} of shape {space.shape}"
+
+
+def _names(what: str, env: FMUEnv) -> str:
+    seen = env.observation_names or env.config.model_output_names
+    return ", ".join(seen if what == "observation" else env.config.model_input_names)
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
