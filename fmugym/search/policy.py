@@ -161,6 +161,7 @@ class Policy(Controller):
         self._require_task()
         if self.form is not None:
             weights = np.atleast_2d(self.weights)
+            self._require_sizes(self.form, weights)
             self._layers = list(self.form.layers(weights, len(self.names), self.acting))
 
     def _require_task(self) -> None:
@@ -181,6 +182,15 @@ class Policy(Controller):
             if found
         )
         raise ConfigError(f"the agent is for another task: {told or 'the order differs'}")
+
+    def _require_sizes(self, form: Form, weights: FloatArray) -> None:
+        sizes = len(self.names), self.acting
+        given = [(weights.shape[1], form.size(*sizes), "weights")]
+        if not callable(self.scale):
+            given += [(len(one), form.features(*sizes), "scales") for one in self.scale]
+        for count, needed, what in given:
+            if count != needed:
+                raise ConfigError(f"a {form.name} needs {needed} {what} here, got {count}")
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:
@@ -260,9 +270,13 @@ class Policy(Controller):
         return np.stack([(2.0 * one - low - high) / (high - low) for one, (low, high) in pairs])
 
     def _network(self, features: FloatArray) -> Any:
-        """The outputs for features of shape (f, N), row by row, so that groups do not matter."""
+        """The outputs for features of shape (f, N), row by row, so that groups do not matter.
+
+        Rows are contiguous, as products of rows with gaps may be rounded in another way.
+        """
         mean, divisor = self.scale(features) if callable(self.scale) else self.scale
-        values = np.clip((features.T - mean) / divisor, -LIMIT, LIMIT)[:, None]
+        rows = np.ascontiguousarray(features.T)
+        values = np.clip((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
         *hidden, last = self._layers
         for layer in hidden:
             values = np.tanh(values @ layer[:, :-1] + layer[:, -1:])
