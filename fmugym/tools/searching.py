@@ -183,7 +183,10 @@ def _warnings(probe: Probe) -> list[str]:
 def _declared(probe: Probe) -> tuple[list[Agent], dict[str, str]]:
     """The controllers of the task: those that are ready, and the texts of those with ranges."""
     given = probe.document.get("controllers", {})
-    texts = {name: text for name, text in given.items() if isinstance(text, str)}
+    texts = {
+        name: one if isinstance(one, str) else f"schedule 00:00={one}"  # a constant action
+        for name, one in given.items()
+    }
     ready = [Agent(name, text) for name, text in texts.items() if not has_range(text)]
     return ready, {name: text for name, text in texts.items() if has_range(text)}
 
