@@ -14,7 +14,7 @@ from fmugym.baselines import controller_of
 from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.base import FloatArray
 from fmugym.errors import ConfigError, reason, shown
-from fmugym.search.policy import Form, Policy
+from fmugym.search.policy import CONSTANT, Form, Policy
 
 __all__ = ["AGENT", "Agent"]
 
@@ -45,6 +45,13 @@ class Agent:
     scale: Any = (np.empty(0), np.empty(0))
     names: tuple[str, ...] = ()
     actions: str = ""
+
+    @classmethod
+    def constant(cls, name: str, value: float, ranges: Sequence[tuple[float, float]]) -> Self:
+        """The agent that always gives all numbers of the action one value."""
+        middles = np.array([(low + high) / 2 for low, high in ranges])
+        halves = np.array([(high - low) / 2 for low, high in ranges])
+        return cls(name, None, CONSTANT, (value - middles) / halves)
 
     def policy(self) -> Policy:
         """The controller, to be bound to an environment.

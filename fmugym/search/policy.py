@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["LIMIT", "Form", "Policy", "Scale"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -78,6 +78,9 @@ class Form:
             part = weights[:, place : place + before * after]
             yield part.reshape(-1, before, after) / math.sqrt(before)
             place += before * after
+
+
+CONSTANT: Final = Form("constant action", blind=True)
 
 
 class Scale:
@@ -239,11 +242,10 @@ class Policy(Controller):
         """
         features, *kept = self._features(observed, memory)
         given = None if self.form is None else network(features)
-        if self.parts:
+        if given is None or self.parts:
             action = list(base if given is None else given)
         else:
-            changes = [0.0] * self.acting if given is None else given
-            action = list(map(_corrected, base, changes, self.limits))
+            action = list(map(_corrected, base, given, self.limits))
         return action, (*kept, self._told(action)) if kept else ()
 
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:

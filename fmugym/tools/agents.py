@@ -94,29 +94,30 @@ def agent_player(folder: Path) -> Player:
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
-    if (folder / AGENT).exists():
-        policy = Agent.load(folder).policy()
-        return Player(partial(policy_of_controller, policy), is_physical=True)
     model, normalization = load_agent(folder)
+    if isinstance(model, Agent):
+        return Player(partial(policy_of_controller, model.policy()), is_physical=True)
     return Player(partial(_checked_policy, folder, model, normalization), is_physical=False)
 
 
 def load_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
-    """Load the model of an agent.
+    """Load an agent of a search, or the model of one of Stable-Baselines3.
 
-    Only load agents from sources that you trust: the files hold pickles, which can run code.
+    Only load the latter from sources that you trust: their files hold pickles, which can run code.
 
     Args:
         path: The folder of a training, or the file of a model.
         algorithm: The name of the algorithm of a file; a folder knows its own.
 
     Returns:
-        The model, and its ``VecNormalize``, or None. That of a file is ``normalization.pkl`` beside
-        it, if there is one.
+        The agent or model, and its ``VecNormalize``, or None. That of a file is
+        ``normalization.pkl`` beside it, if there is one.
 
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
+    if (path / AGENT).exists():
+        return Agent.load(path), None
     file = path if path.is_file() else path / _MODEL
     kind = algorithm_of(algorithm if path.is_file() else _algorithm_in(path))
     try:
