@@ -828,8 +828,8 @@ class TestSearch:
             searched(tmp_path / "agent", rounds=3, controllers=one)
 
     def test_a_folder_that_exists_is_refused(self, tmp_path):
+        (tmp_path / "other.txt").touch()
         with pytest.raises(FileExistsError, match=str(tmp_path)):
-            (tmp_path / "other.txt").touch()
             searched(tmp_path)
 
     def test_few_rounds_find_no_less_than_what_is_there(self, tmp_path):
