@@ -26,6 +26,7 @@ from fmugym.checks import (
     number_of,
 )
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = [
     "Choice",
@@ -288,7 +289,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
         return value
     try:
         drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
-    except Exception as error:
+    except ordinary(Exception) as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
     if isinstance(drawn, str):
         return drawn
@@ -322,7 +323,7 @@ def _items(values: Any) -> list[Any]:
         return []
     try:
         return list(values)
-    except Exception:  # an iterable of the caller's that fails
+    except ordinary(Exception):  # an iterable of the caller's that fails
         return []
 
 

@@ -32,6 +32,7 @@ from gymnasium.utils.seeding import np_random
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.signals import ordinary
 from fmugym.task.generators import row_of, state_of
 from fmugym.task.snapshot import require_scope
 
@@ -119,7 +120,7 @@ class Recording:
                 raise ValueError("it is of another version of the format")
             header["stream"] = tuple(header["stream"])
             return cls(**{name: header[name] for name in FACTS}, **arrays)
-        except Exception as error:  # a damaged file may raise anything
+        except ordinary(Exception) as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"{shown(str(path))} is no recording of an episode: {error}"
             ) from None

@@ -24,6 +24,7 @@ from fmugym.checks import check_text
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.libraries import make_vector_env
 
 try:
@@ -104,7 +105,7 @@ class _Files:
         """
         try:
             data = Path(path).expanduser().read_bytes()
-        except OSError as error:
+        except ordinary(OSError) as error:
             raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
         place = f"{hashlib.sha256(data).hexdigest()[:16]}/{Path(path).name}"
         self.contents[place] = data
@@ -218,6 +219,6 @@ def _processors() -> int:
     """How many processors Ray has given to this runner; 1 where Ray says nothing."""
     if not ray.is_initialized():
         return 1
-    with suppress(Exception):  # the driver has no resources of its own
+    with Ignoring(Exception):  # the driver has no resources of its own
         return max(1, int(ray.get_runtime_context().get_assigned_resources().get("CPU", 1)))
     return 1

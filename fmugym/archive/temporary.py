@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import functools
 import os
 import re
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from fmugym.errors import FMULoadError
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest", "sweep"]
 
@@ -37,7 +37,7 @@ def folder_name() -> Path:
     try:
         sweep()
         return Path(tempfile.gettempdir(), name)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
 
@@ -49,9 +49,9 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(0o700)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         _made_in[folder] = os.getcwd()
 
 
@@ -80,7 +80,7 @@ def _remove(folder: Path) -> None:
 
 
 def _leave(folder: Path, directory: str) -> None:
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         if Path.cwd().is_relative_to(folder.resolve()):
             os.chdir(directory)
 
@@ -108,7 +108,7 @@ def _namespace() -> int:
     """Identify the numbering of processes: containers that share a folder may number them alike."""
     try:
         return os.stat("/proc/self/ns/pid").st_ino
-    except OSError:
+    except ordinary(OSError):
         return 0
 
 

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from fmugym.archive.description import Unit
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import ordinary
 
 __all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
 
@@ -147,7 +148,7 @@ def _parsed(name: str) -> Any:
     text = re.sub(r"(?<=[\w)])\^", "**", text).replace("%", "percent")
     try:
         return _pint()[1].Unit(text)
-    except Exception as error:  # pint passes on errors of the parsers that it uses
+    except ordinary(Exception) as error:  # pint passes on errors of the parsers that it uses
         raise ConfigError(
             f"{shown(name)} is no unit that is known ({type(error).__name__})"
         ) from None

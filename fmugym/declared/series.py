@@ -21,6 +21,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
@@ -192,7 +193,7 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv
             return read(path, status.st_mtime_ns, status.st_size)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
 

@@ -20,6 +20,7 @@ from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = ["KEYS", "VERSION", "Task"]
 
@@ -196,7 +197,7 @@ def _read(path: Path) -> Source:
         near = sorted(file.name for file in path.parent.glob("*.toml"))
         error = unknown_name("task file", path.name, near)
         raise ConfigError(f"{error}; looked in {shown(str(path.parent))}") from None
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     try:
         document = tomllib.loads(text)

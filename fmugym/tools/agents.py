@@ -16,6 +16,7 @@ import numpy as np
 from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.signals import ordinary
 from fmugym.tools.simulation import Policy
 
 __all__ = [
@@ -117,7 +118,7 @@ def load_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
         return kind.load(file, device="cpu"), _normalization_in(file.parent)
     except ConfigError:
         raise
-    except Exception as error:  # a damaged file may raise anything
+    except ordinary(Exception) as error:  # a damaged file may raise anything
         raise ConfigError(
             f"the agent in {shown(str(path))} cannot be read: {reason(error)}"
         ) from error
@@ -127,7 +128,7 @@ def _algorithm_in(folder: Path) -> str:
     try:
         facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
         return str(facts["algorithm"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import ConfigError
+from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
 from fmugym.tools.checkpoints import CHECKPOINT
 from fmugym.tools.diary import Diary
@@ -111,7 +112,7 @@ def _train(arguments: argparse.Namespace) -> None:
             _tell_what_is_kept(plan)
             write_outcome(plan, title_of(arguments.task), tell)
             raise
-        except OSError as error:  # libraries that write a model do not say where
+        except ordinary(OSError) as error:  # libraries that write a model do not say where
             error.filename = error.filename or str(plan.folder)
             raise
     write_outcome(plan, title_of(arguments.task), tell)

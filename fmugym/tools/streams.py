@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import sys
+
+from fmugym.signals import Ignoring
 
 __all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus"]
 
@@ -18,7 +19,7 @@ def keep_output_from_fmus() -> None:
     undone.
     """
     old = sys.stdout
-    with contextlib.suppress(OSError, AttributeError, io.UnsupportedOperation):
+    with Ignoring(OSError, AttributeError, io.UnsupportedOperation):
         if old.fileno() != 1 or not isinstance(old, io.TextIOWrapper):
             return
         old.flush()

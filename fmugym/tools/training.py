@@ -19,6 +19,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.signals import ordinary
 from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
 from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
@@ -206,7 +207,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
     try:
         facts: dict[str, Any] = json.loads((folder / TRAINING).read_text(encoding="utf-8"))
         return {"steps": facts["steps"], **facts}
-    except (OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
 
 

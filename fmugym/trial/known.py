@@ -11,6 +11,7 @@ from typing import Any
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError
 from fmugym.pool.bundle import SaveMethod
+from fmugym.signals import ordinary
 from fmugym.trial.cache import cache_folder, recall, remember
 from fmugym.trial.candidate import Candidate, content_key, content_of, verdict_key
 from fmugym.trial.verdict import Verdict
@@ -66,11 +67,11 @@ def locks_of(candidate: Candidate) -> str:
     try:
         folder = cache_folder() / "licences"
         folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):
+    except ordinary(OSError, RuntimeError):
         folder = Path(tempfile.gettempdir()) / name / "licences"
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
     return str(folder / content_of(candidate))
 
