@@ -11,7 +11,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +18,7 @@ from typing import Any, Final
 import gymnasium
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
-from fmugym.caching import cache_folder
+from fmugym.caching import lasting_folder
 from fmugym.checks import check_text
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
@@ -124,18 +123,12 @@ class _Files:
         Returns:
             Their folder.
         """
-        root = _folder()
+        root = lasting_folder("ray")
         for place, data in self.contents.items():
             file = root / place
             if not file.exists():
                 _write(file, data)
         return root
-
-
-def _folder() -> Path:
-    with suppress(RuntimeError):
-        return cache_folder() / "ray"
-    return Path(tempfile.gettempdir()) / "fmugym-ray"
 
 
 def _write(file: Path, data: bytes) -> None:

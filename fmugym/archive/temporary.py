@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+from fmugym.caching import is_own
 from fmugym.errors import FMULoadError
 from fmugym.signals import Ignoring, ordinary
 
@@ -96,11 +97,13 @@ def remove_rest() -> None:
 
 @functools.cache
 def sweep() -> None:
-    """Remove the folders that killed processes have left; done once in a process."""
+    """Remove the folders that killed processes of this user have left; once in a process."""
     for folder in Path(tempfile.gettempdir()).glob("fmugym-*"):
         name = _NAME.fullmatch(folder.name)
         if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
-            shutil.rmtree(folder, ignore_errors=True)
+            with Ignoring(OSError):  # another process has removed it
+                if is_own(folder):
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 @functools.cache
@@ -117,7 +120,7 @@ def _is_alive(pid: int) -> bool:
         return True
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # the number may be anybody's invention
         return False
     except PermissionError:
         return True

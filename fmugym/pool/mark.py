@@ -80,7 +80,6 @@ class Mark:
             raise OSError("crashes are only noted on Linux, by the C extension")
         from fmugym import _native
 
-        folder.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=folder, prefix="new-")
         try:
             os.write(handle, bytes(_SIZE))  # a full disk must show here, not in the handler

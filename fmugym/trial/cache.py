@@ -15,7 +15,7 @@ from typing import Final
 from fmugym.caching import cache_folder
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["cache_folder", "recall", "remember"]
+__all__ = ["recall", "remember"]
 
 logger = logging.getLogger(__name__)
 
@@ -39,17 +39,15 @@ def recall(key: str) -> str | None:
             if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
                 return None
             return file.read(_LARGEST).decode()
-    except ordinary(OSError, RuntimeError, ValueError):
+    except ordinary(OSError, ValueError):
         return None
 
 
 def remember(key: str, text: str) -> None:
     """Cache a text under a key, which is a file name."""
     try:
-        folder = cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
-        _replace(folder / key, text)
-    except ordinary(OSError, RuntimeError) as error:
+        _replace(cache_folder() / key, text)
+    except ordinary(OSError) as error:
         logger.debug("nothing is remembered: %s", error)
 
 

@@ -32,7 +32,7 @@ from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
-from fmugym.signals import Ignoring
+from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     is_known_to_harm,
@@ -325,7 +325,7 @@ def _verdict(
 def _remains(candidate: Candidate) -> Remains:
     try:
         return remains_of(*marks_of(candidate))
-    except RuntimeError:  # there is no folder for caches
+    except ordinary(OSError):  # there is no folder for caches
         return Remains([], [])
 
 
@@ -350,7 +350,7 @@ def _mark(candidate: Candidate) -> Mark | None:
         return None
     try:
         return Mark.attempt(*marks_of(candidate))
-    except RuntimeError:
+    except ordinary(OSError):
         return None
 
 

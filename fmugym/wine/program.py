@@ -51,11 +51,9 @@ def wine_folder() -> Path:
         FMULoadError: If there can be none.
     """
     try:
-        folder = cache_folder() / "wine"
-        folder.mkdir(parents=True, exist_ok=True)
-    except ordinary(OSError, RuntimeError) as error:
+        return cache_folder("wine").absolute()
+    except ordinary(OSError) as error:
         raise FMULoadError(f"Wine needs a folder in the cache folder: {error}") from None
-    return folder.absolute()
 
 
 @contextlib.contextmanager
