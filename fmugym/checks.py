@@ -6,10 +6,12 @@ methods fail. It returns the value in its plain Python type, or raises ``ConfigE
 
 from __future__ import annotations
 
+import errno
 import inspect
 import math
 import operator
 import os
+import stat
 from collections.abc import Iterable, Mapping
 from numbers import Real
 from pathlib import Path
@@ -39,6 +41,7 @@ __all__ = [
     "integer_of",
     "number_of",
     "parts_of_array",
+    "require_regular",
 ]
 
 LARGEST_COUNT: Final = 2**31 - 1
@@ -267,6 +270,16 @@ def check_dict(what: str, value: Any) -> dict[Any, Any]:
         with Ignoring(Exception):  # a mapping of the caller's whose methods fail
             return dict(value)
     raise ConfigError(f"{what} must be a dict, got {shown(value)}")
+
+
+def require_regular(path: Path) -> None:
+    """Refuse pipes and devices, which may never end.
+
+    Raises:
+        OSError: If the path is none of a regular file.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file")
 
 
 def check_path(what: str, value: Any) -> Path:

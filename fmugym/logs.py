@@ -28,7 +28,7 @@ from gymnasium import spaces
 
 from fmugym.archive.units import conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number
+from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -125,6 +125,7 @@ class PlantLog:
 
 def _cells(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
+        require_regular(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             names, *rows = [row for row in csv.reader(file) if row]
     except ordinary(OSError, UnicodeDecodeError, csv.Error) as error:

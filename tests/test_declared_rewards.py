@@ -1,4 +1,7 @@
-"""What is said of a declared reward that is not finite."""
+"""What is said of a declared reward that is not finite, and of tasks that are too large."""
+
+import os
+import time
 
 import pytest
 
@@ -65,3 +68,38 @@ def test_a_sum_of_finite_terms(task):
     with fmugym.load(task('[reward]\nmuch = "1e308"\nmore = "theta_0 * 0 + 1e308"')) as env:
         assert "much" in (text := fault_of(env))
         assert "more" in text
+
+
+def in_a_row(text, count):
+    """Expressions, each of which reads the one before."""
+    lines = [
+        'e0 = "theta"',
+        *(f'e{i} = "{text}"'.replace("E", f"e{i - 1}") for i in range(1, count)),
+    ]
+    return "\n".join(["[expressions]", *lines, ""])
+
+
+LARGE = {
+    "doubled": ("[expressions]\n", in_a_row("E + E", 30)),
+    "many operands": ("[expressions]\n", in_a_row("max(E, 1, E, 2, E, 3, E, 4, E, E, E, E)", 9)),
+    "long row": ("[expressions]\n", in_a_row("E + 1", 900)),
+    "many terms": ('reward = "1"', "[reward]\n" + "".join(f'r{i} = "{i}"\n' for i in range(3000))),
+    "power of powers": ("tau = {", 'theta = { unit = "deg**9**9**9" }\ntau = {'),
+    "power of numbers": ("tau = {", 'theta = { unit = "(9**99)**99 deg" }\ntau = {'),
+    "device": ('reward = "1"', 'reward = "1"\nextends = "/dev/zero"'),
+    "pipe": ('reward = "1"', 'reward = "1"\nextends = "pipe"'),
+    "data": ("[agent]", '[data.x]\nfile = "pipe"\ncolumn = "a"\nstep = "1s"\n[agent]'),
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such pipes and devices")
+@pytest.mark.parametrize("case", LARGE)
+def test_what_is_too_large_is_refused_at_once(task, case):
+    path = task('reward = "1"')
+    fmugym.load(path).close()  # what is imported and read only once
+    os.mkfifo(path.parent / "pipe")
+    path.write_text(path.read_text().replace(*LARGE[case]))
+    begin = time.process_time()
+    with pytest.raises(fmugym.ConfigError, match=r"swing\.toml"):
+        fmugym.load(path)
+    assert time.process_time() - begin < 1.5

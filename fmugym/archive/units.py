@@ -142,11 +142,18 @@ def _pint() -> tuple[Any, Any]:
     return pint, pint.UnitRegistry(on_redefinition="ignore")
 
 
+_EXPONENT: Final = re.compile(r"\*\*\s*(\(\s*)?[-+]?\d{1,3}([./]\d{1,3})?(?(1)\s*\))(?!\s*\*\*)")
+_HARMLESS: Final = re.compile(r"(?!.*\*\*)(\b[^\W\d]\w*\b|\b1\b|\W){0,200}")
+"""Names and ones, besides exponents: pint would compute powers of numbers, of any size."""
+
+
 def _parsed(name: str) -> Any:
     """A unit in the way of writing of Modelica and FMI, where ``.`` multiplies: ``W/(m2.K)``."""
     text = re.sub(r"(?<=[A-Za-z%])(-?\d+)", r"**(\1)", name.replace(".", "*"))
     text = re.sub(r"(?<=[\w)])\^", "**", text).replace("%", "percent")
     try:
+        if not _HARMLESS.fullmatch(_EXPONENT.sub(" ", text)):
+            raise ValueError(text)
         return _pint()[1].Unit(text)
     except ordinary(Exception) as error:  # pint passes on errors of the parsers that it uses
         raise ConfigError(

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_option, check_path
+from fmugym.checks import check_option, check_path, require_regular
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
@@ -189,6 +189,7 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
     """The cells of each column. Environments of one task read a file once."""
     path = check_path("file", file.text())
     try:
+        require_regular(path)
         status = path.stat()
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_integer, check_mapping, check_path
+from fmugym.checks import check_integer, check_mapping, check_path, require_regular
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.warming import period_of
@@ -190,6 +190,7 @@ def _root(source: Source) -> Entry:
 
 def _read(path: Path) -> Source:
     try:
+        require_regular(path)
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
