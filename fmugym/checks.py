@@ -290,9 +290,7 @@ def check_path(what: str, value: Any) -> Path:
     """
     try:
         return Path(os.fsdecode(value)).expanduser()
-    except ordinary(
-        Exception
-    ):  # a TypeError; or nobody has this home, or the object's own method fails
+    except ordinary(Exception):  # nobody has this home, or the object's method fails
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
 
 

@@ -90,7 +90,8 @@ class EnvConfig:
         episode_variables: Values of the task itself by name (targets, integrals, histories):
             numbers, distributions drawn at each reset, or arrays of both. ``_update`` may write
             them; it assigns new arrays.
-        bounds: ``(low, high)`` by name, used for the spaces instead of the FMU's own min and max.
+        bounds: ``(low, high)`` by name, used instead of the FMU's own min and max for the spaces,
+            and as the range of parameters and start values.
         on_fault: What a failed step does: truncate or terminate the episode, or raise.
         fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
             ones, before ``on_fault`` applies.
@@ -356,9 +357,7 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
     """
     try:
         array: npt.NDArray[Any] = np.array(value, np.float64)
-    except ordinary(
-        Exception
-    ):  # lists that make no array, distributions, or objects that are no numbers
+    except ordinary(Exception):  # no array, distributions, or objects that are no numbers
         array = _drawn_array(what, value)
     is_float = array.dtype != object
     if not array.size or (is_float and not np.isfinite(array).all()):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -26,7 +26,7 @@ from fmugym.checks import (
     number_of,
 )
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.signals import ordinary
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "Choice",
@@ -37,9 +37,10 @@ __all__ = [
     "Uniform",
     "as_distribution",
     "draw",
-    "highest_of",
     "is_distribution",
     "recipe_of",
+    "support_of",
+    "truncated",
 ]
 
 
@@ -146,7 +147,7 @@ class Normal(KnownArguments):
         object.__setattr__(self, "std", abs(self.std))  # numpy refuses -0.0
         if not self.low <= self.mean <= self.high:
             raise ConfigError(f"{self}: mean must lie between low and high")
-        if self._probability_within() < 0.01:
+        if self._probability_within() < _LEAST_SHARE:
             raise ConfigError(f"{self}: low and high are too close for redraws; use Uniform")
 
     def _probability_within(self) -> float:
@@ -215,6 +216,49 @@ class Choice(KnownArguments):
         return Recipe("weighted", (*(cumulated / cumulated[-1]).tolist(), *values), limits)
 
 
+@dataclass(frozen=True)
+class Truncated:
+    """A distribution of any kind, redrawn until the value lies in ``[low, high]``.
+
+    Raises:
+        ConfigError: See ``truncated``.
+    """
+
+    distribution: Any
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if self._probability_within() < _LEAST_SHARE:
+            raise ConfigError(f"{shown(self.distribution)}, which hardly ever draws that")
+
+    def _probability_within(self) -> float:
+        below = math.nextafter(self.low, -math.inf)
+        try:
+            return float(self.distribution.cdf(self.high) - self.distribution.cdf(below))
+        except ordinary(Exception):  # no distribution of scipy.stats: it is not known
+            return 1.0
+
+    def sample(self, rng: np.random.Generator) -> float:
+        """Draw one value.
+
+        Raises:
+            ConfigError: If no draw of very many lies within the limits.
+        """
+        for _ in range(_MOST_REDRAWS):
+            value = check_number(f"what {self} draws", draw(self.distribution, rng))
+            if self.low <= value <= self.high:
+                return value
+        raise ConfigError(
+            f"{shown(self.distribution)} has not drawn a value between {self.low} and {self.high} "
+            f"in {_MOST_REDRAWS} draws"
+        )
+
+    def support(self) -> tuple[float, float]:
+        """The limits."""
+        return self.low, self.high
+
+
 _KINDS: Final[Mapping[str, type[Any]]] = {
     "uniform": Uniform,
     "log_uniform": LogUniform,
@@ -223,15 +267,37 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
 }
 _OURS: Final = tuple(_KINDS.values())
 _LARGEST: Final = float(np.finfo(np.float64).max)
+_LEAST_SHARE: Final = 0.01
+"""Of the draws that must lie within limits, so that there are few redraws."""
+
+_MOST_REDRAWS: Final = 10_000
 
 
-def highest_of(distribution: Any) -> float:
-    """The highest value that can be drawn; minus infinity if that is not known."""
+def support_of(distribution: Any) -> tuple[float, float]:
+    """The lowest and the highest value that can be drawn; infinite where that is not known."""
     if isinstance(distribution, Choice):
-        return max(map(float, distribution.values))
-    if isinstance(distribution, Uniform | LogUniform):
-        return float(distribution.high)
-    return -math.inf
+        values = list(map(float, distribution.values))
+        return min(values), max(values)
+    if isinstance(distribution, Uniform | LogUniform | Normal):
+        return float(distribution.low), float(distribution.high)
+    with Ignoring(Exception):  # no distribution of scipy.stats, or not of single numbers
+        low, high = map(float, distribution.support())
+        return low, high
+    return -math.inf, math.inf
+
+
+def truncated(distribution: Any, low: float, high: float) -> Any:
+    """The same distribution, whose values are drawn again until they lie in ``[low, high]``.
+
+    So the draws that lie there stay what they are.
+
+    Raises:
+        ConfigError: If fewer than one draw in a hundred would lie there, as far as that is known.
+    """
+    if type(distribution) is Normal:
+        low, high = max(low, distribution.low), min(high, distribution.high)
+        return replace(distribution, low=low, high=high)
+    return Truncated(distribution, low, high)
 
 
 def as_distribution(what: str, value: Any) -> Any:

@@ -129,6 +129,9 @@ class FMUEnv(Constructed):
     reset_options: ClassVar[tuple[str, ...]] = ("model_parameters",)
     """The keys that ``reset`` takes in its options."""
 
+    unphysical_keys: tuple[str, ...] = ()
+    """The keys of a task for which observations or actions are not in its units."""
+
     _way = "auto"
     _player: Any = None
     """Steps the environment if its hooks are compiled, see ``fmugym.single``; or None."""

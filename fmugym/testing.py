@@ -12,7 +12,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -271,13 +271,14 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 def _changed(env: FMUEnv, name: str, value: float) -> float | None:
-    """Return a value one percent away, within the limits of a Real; None for other types."""
+    """Return a value one percent away, in the range of a Real; None for other types."""
     variable = env.fmu.variable(name)
     if variable.kind != "real":
         return None
     nominal = abs(value) or abs(variable.nominal or 1.0)
     for candidate in (value + 0.01 * nominal, value - 0.01 * nominal):
-        if variable.minimum <= candidate <= variable.maximum:
+        with suppress(ConfigError):
+            env._interface.within(variable, candidate)
             return candidate
     return None
 

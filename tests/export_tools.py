@@ -47,6 +47,51 @@ def network_for(env, hidden=(16, 16), scaled=True, squashed=False, seed=0, activ
     return Network(tuple(layers), space, scaling, squashed)
 
 
+TIMED = {
+    "fmu": {"bundled": "House"},
+    "time_step": "15min",
+    "variables": {"T": {"name": "T_op", "unit": "degC", "min": 10, "max": 30}},
+    "data": {"price": {"values": [1, 3, 2, 5, 4], "step": "1h"}},
+    "expressions": {"late": {"expr": "sin(time / 7200)", "min": -1, "max": 1}},
+    "agent": {"actions": ["u"], "observations": ["T", "price", "late"], "normalize": True},
+    "reward": "-abs(T - 21)",
+}
+"""A task that depends on the time."""
+
+TIMES = {
+    "drawn": {"start_time": {"distribution": "uniform", "low": 0, "high": 86400}},
+    "listed": {"start_time": ["10h", "20h 45min", "01-15 06:30"]},
+    "after a warm-up": {"start_time": ["10h", "20h"], "warm_up": "45min"},
+    "constant": {"start_time": "90min", "warm_up": "45min"},
+    "clock": {"clock": ["10h", "20h 45min", "01-15 06:30"]},
+}
+"""When its episodes begin."""
+
+
+def largest_difference(env, network, logic, step, steps):
+    """The largest difference of inputs while the environment's own agent acts.
+
+    ``step`` takes the measurements, and returns the actions of the exported agent.
+    """
+    observation, worst = env._get_observation(), 0.0
+    for _ in range(steps):
+        actions = step([env.out[one.name] for one in logic.measurements])
+        action = network.action(np.ravel(observation))
+        is_discrete = isinstance(env.action_space, spaces.Discrete)
+        observation, _, terminated, *_ = env.step(int(action[0]) if is_discrete else action)
+        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+        worst = max(worst, np.abs(actions - np.array([inputs[v.name] for v in logic.inputs])).max())
+        if terminated:
+            break
+    return worst
+
+
+def drawn_in(env, logic):
+    """What the episode of an environment has drawn, as parameters of an exported agent."""
+    values = {**env.parameters, **env.variables}
+    return {one.name: values[one.name] for one in logic.parameters}
+
+
 def compiled(agent, folder, language="C99"):
     """Write and compile an agent; the object takes samples."""
     if sys.platform == "win32" or shutil.which(COMPILERS[language][0]) is None:

@@ -260,6 +260,7 @@ class TestSkeleton:
             ('start="293.15" nominal="20"', (273.15, 313.15)),
             ('start="-2" max="-1.9"', (-2.2, -1.9)),
             ('start="1e5" min="0"', (0.0, 1.1e5)),
+            ('start="1e5" min="0" max="0"', (9e4, 1.1e5)),
         ],
     )
     def test_guessed_limits_are_near_the_start_value(self, skeleton, make_fmu, attributes, bounds):

@@ -62,13 +62,13 @@ class TestRecord:
     def test_a_report_compares_controllers(self, tmp_path, capsys):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.html"
-        who = "--action", "0", "--action", "1"
+        who = "--action", "-10", "--action", "10"
         code, out, _ = run(capsys, "record", CART_POLE, *who, "--output", path)
         assert code == 0
-        assert [line.split(":")[0] for line in out.splitlines()] == ["action 0", "action 1"]
+        assert [line.split(":")[0] for line in out.splitlines()] == ["action -10", "action 10"]
         page = path.read_text(encoding="utf-8")
         assert page.count("<figure>") == 2
-        assert "<h2>action 0</h2>" in page
+        assert "<h2>action 10</h2>" in page
 
     def test_parquet(self, tmp_path, capsys):
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
@@ -104,7 +104,7 @@ class TestRecord:
             (["--output", "a.csv", "--action", "0", "--action", "1"], "one run, got 2"),
             (["--output", "a.csv", "--variables", "phy"], "'phi'"),
             (["--output", "a.csv", "--every", "0.03"], "0.02"),
-            (["--output", __file__.replace(".py", ".csv"), "--action", "9"], "'9'"),
+            (["--output", __file__.replace(".py", ".csv"), "--action", "19"], "'19'"),
         ],
     )
     def test_mistakes(self, arguments, fact, tmp_path, capsys, monkeypatch):
@@ -213,6 +213,18 @@ class TestBench:
             assert 0 < one["fmu_share"] <= 1
             assert one["hooks"] == "compiled"
         assert report["time_step"] == 0.02
+
+    def test_parameters_are_drawn_as_resets_draw_them(self, caplog):
+        pendulum = {
+            "fmu": {"bundled": "Pendulum"},
+            "parameters": {"m": {"distribution": "uniform", "low": 0.05, "high": 0.1}},
+            "agent": {"actions": ["tau"], "observations": ["q"]},
+            "reward": "-abs(q)",
+            "time_step": 0.05,
+        }
+        *_, report = speed.bench(lambda: fmugym.load(pendulum), [4], 0.05)
+        assert all(0 < one.fmu_share <= 1 for one in report.speeds)
+        assert caplog.text == ""  # a pendulum without a mass would be an error
 
     def test_a_table_with_words_of_caution(self, capsys):
         code, out, _ = run(capsys, "bench", CART_POLE, "--envs", "4", "--seconds", "0.02")

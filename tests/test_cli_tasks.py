@@ -123,6 +123,10 @@ DEFECTS = {
         ("warning", "inputs", "tau2"),
     ),
     "fault": ({"reward": "1 / (step - 3)"}, ("error", "run", "step 3")),
+    "unknown to a controller": (
+        {"agent": {"actions": ["tau"], "observations": ["q", "l"]}},
+        ("warning", "export", "'l', which is no output"),
+    ),
 }
 
 
@@ -143,6 +147,8 @@ class TestValidate:
         report = validate(lambda: fmugym.load(TASK))
         assert report.verdict == "ok"
         assert report.hooks == "compiled"
+        (export,) = [one.text for one in report.findings if one.check == "export"]
+        assert "can be exported; it measures q" in export
         assert 0 < report.costs["step"] < 1
         assert 0 < report.costs["reset"] < 1
         assert 0 < report.costs["restore"] < 1

@@ -51,11 +51,11 @@ def test_a_full_disk_is_told_with_the_folder(tmp_path, capsys, monkeypatch):
 
 class TestEvaluate:
     def test_controllers_play_the_same_episodes(self, capsys):
-        arguments = "--action", "0", "--action", "1", "--episodes", "4", "--json"
+        arguments = "--action", "-10", "--action", "10", "--episodes", "4", "--json"
         code, out, _ = run(capsys, "evaluate", CART_POLE, *arguments)
         scores = json.loads(out)["scores"]
         assert code == 0
-        assert [score["name"] for score in scores] == ["random", "action 0", "action 1"]
+        assert [score["name"] for score in scores] == ["random", "action -10", "action 10"]
         env = fmugym.load(CART_POLE)
         lengths = []
         for seed in range(1_000_000, 1_000_004):
@@ -87,7 +87,7 @@ class TestEvaluate:
         ("arguments", "fact"),
         [
             (["--agent", "/nowhere"], "'/nowhere'"),
-            (["--action", "7"], "'7'"),
+            (["--action", "17"], "'17'"),
             (["--episodes", "0"], "--episodes"),
             (["--scenario", "peak"], "peak"),
         ],

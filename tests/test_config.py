@@ -235,7 +235,10 @@ class TestRefused:
             ({"monitor_names": "stepss"}, "did you mean 'steps'"),
             ({"model_parameters": {"gian": 1}}, "did you mean 'gain'"),
             ({"bounds": {"sun": (0, 1)}}, "'sun'; did you mean 'sum'"),
-            ({"bounds": {"gain": (0, 1)}}, "unknown input or output in 'bounds' 'gain'"),
+            (
+                {"bounds": {"seven": (0, 1)}},
+                "unknown input, output or parameter in 'bounds' 'seven'",
+            ),
             ({"model_input_names": "mix"}, "'mix' cannot be an input: it is a continuous output"),
             ({"model_input_names": "gain"}, "'gain' cannot be an input: it is a fixed parameter"),
             ({"model_input_names": "seven"}, "'seven' cannot be an input: it is a constant"),

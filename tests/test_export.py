@@ -8,9 +8,13 @@ import pytest
 from export_tools import (
     COMPILERS,
     FUNCTIONS,
+    TIMED,
+    TIMES,
     arguments_of,
     built,
     compiled,
+    drawn_in,
+    largest_difference,
     network_for,
     plant_of,
 )
@@ -141,6 +145,20 @@ class TestClosedLoop:
         assert steps == 192
         assert measured <= 1e-4
         assert written <= 1e-5
+        env.close()
+
+    @pytest.mark.parametrize("times", TIMES)
+    def test_from_several_start_times(self, times, tmp_path):
+        env = fmugym.load(TIMED | TIMES[times])
+        network = network_for(env, scaled=False)
+        controller = compiled(agent_of(env, network), tmp_path)
+        logic, began = controller.agent.logic, set()
+        for seed in range(6):
+            env.reset(seed=seed)
+            began.add(env.time + env.variables.get("clock", 0.0))
+            controller.begin(**drawn_in(env, logic))
+            assert largest_difference(env, network, logic, controller.step, 60) <= 1e-5
+        assert (len(began) > 1) == (times != "constant")
         env.close()
 
     def test_a_second_episode_begins_as_the_first_one(self, tmp_path):

@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import itertools
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import fmpy
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import network_for, plant_of
+from export_tools import TIMED, TIMES, drawn_in, largest_difference, network_for, plant_of
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
@@ -133,6 +134,19 @@ class TestDescription:
         assert other.read_bytes() == path.read_bytes()
 
 
+def sampling(controller, logic):
+    """A function that takes a sample with an FMU: from measurements to actions."""
+    measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
+    times = itertools.count(0.0, logic.time_step)
+
+    def step(values):
+        controller.set(dict(zip(measured, values, strict=True)))
+        controller.step(next(times), logic.time_step)
+        return controller.get(written)
+
+    return step
+
+
 class TestClosedLoop:
     """The environment with its agent, and two FMUs in FMPy."""
 
@@ -166,6 +180,21 @@ class TestClosedLoop:
                     break
         assert count > 5
         assert worst <= 1e-5
+        env.close()
+
+    @pytest.mark.parametrize("times", ["drawn", "after a warm-up"])
+    def test_from_several_start_times(self, times, version, tmp_path):
+        env = fmugym.load(TIMED | TIMES[times])
+        network = network_for(env, scaled=False)
+        agent = agent_of(env, network, name="agent")
+        path = write_fmu(agent, tmp_path / "agent.fmu", fmi_version=version)
+        for seed in range(3):
+            env.reset(seed=seed)
+            with controller_of(path, tmp_path) as controller:
+                assert controller.variables["start_time"].unit == "s"
+                controller.begin(**drawn_in(env, agent.logic))
+                step = sampling(controller, agent.logic)
+                assert largest_difference(env, network, agent.logic, step, 60) <= 1e-5
         env.close()
 
     def test_in_the_simulation_of_fmpy(self, house, tmp_path):

@@ -5,9 +5,18 @@ import json
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import FUNCTIONS, arguments_of, network_for
+from export_tools import (
+    FUNCTIONS,
+    TIMED,
+    TIMES,
+    arguments_of,
+    drawn_in,
+    largest_difference,
+    network_for,
+)
 from test_export import TASKS, Filtered, heating
 
+import fmugym
 from fmugym import ConfigError
 from fmugym.export import Activation, Layer, Network, agent_of, write_onnx
 from fmugym.export.onnx_nodes import Nodes
@@ -45,24 +54,13 @@ class Runner:
         return actions
 
 
-def difference(env, network, path, steps, **parameters):
+def difference(env, network, agent, path, steps):
     """The largest difference of inputs while the environment's own agent acts."""
-    runner, worst = Runner(path), 0.0
-    for name, value in parameters.items():
+    runner = Runner(write_onnx(agent, path))
+    for name, value in drawn_in(env, agent.logic).items():
         runner.memory[name][:] = value
-    names = [one["name"] for one in runner.facts["measurements"]]
-    written = [one["name"] for one in runner.facts["actions"]]
-    observation = env._get_observation()
-    for _ in range(steps):
-        (actions,) = runner.step([[env.out[name] for name in names]])
-        action = network.action(np.ravel(observation))
-        is_discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
-        observation, _, terminated, *_ = env.step(int(action[0]) if is_discrete else action)
-        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
-        worst = max(worst, np.abs(actions - [inputs[name] for name in written]).max())
-        if terminated:
-            break
-    return worst
+    step = lambda measured: runner.step([measured])[0]  # noqa: E731
+    return largest_difference(env, network, agent.logic, step, steps)
 
 
 class TestEpisodes:
@@ -70,20 +68,29 @@ class TestEpisodes:
     def test_of_registered_tasks(self, env_id, tmp_path):
         env = made(env_id)
         network = network_for(env)
-        path = write_onnx(agent_of(env, network, all_inputs=True), tmp_path / "agent.onnx")
         env.reset(seed=4)
-        known = {name: env.variables[name] for name in env.variables if name == "clock"}
-        assert difference(env, network, path, 200, **known) <= 1e-5
+        agent = agent_of(env, network, all_inputs=True)
+        assert difference(env, network, agent, tmp_path / "agent.onnx", 200) <= 1e-5
         env.close()
 
     @pytest.mark.parametrize("task", TASKS)
     def test_of_what_a_task_file_declares(self, task, tmp_path):
         env = heating(task)
         network = network_for(env, scaled=False)
-        path = write_onnx(agent_of(env, network), tmp_path / "agent.onnx")
         env.reset(seed=1)
-        known = {"T_set": env.variables["T_set"]} if task == "set point" else {}
-        assert difference(env, network, path, 192, **known) <= 1e-5
+        assert (
+            difference(env, network, agent_of(env, network), tmp_path / "agent.onnx", 192) <= 1e-5
+        )
+        env.close()
+
+    @pytest.mark.parametrize("times", TIMES)
+    def test_from_several_start_times(self, times, tmp_path):
+        env = fmugym.load(TIMED | TIMES[times])
+        network = network_for(env, scaled=False)
+        for seed in range(3):
+            env.reset(seed=seed)
+            path = tmp_path / f"{seed}.onnx"
+            assert difference(env, network, agent_of(env, network), path, 60) <= 1e-5
         env.close()
 
     def test_of_data_that_are_given(self, tmp_path):
@@ -215,9 +222,8 @@ class TestModel:
         first, *rest = network_for(env, squashed=squashed).layers
         layers = Layer(first.weights, first.bias, (activation,)), *rest
         network = Network(layers, env.action_space, squashed=squashed)
-        path = write_onnx(agent_of(env, network), tmp_path / "agent.onnx")
         env.reset(seed=0)
-        assert difference(env, network, path, 50) <= 1e-5
+        assert difference(env, network, agent_of(env, network), tmp_path / "agent.onnx", 50) <= 1e-5
         env.close()
 
     def test_nothing_is_overwritten(self, tmp_path):

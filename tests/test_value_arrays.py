@@ -374,7 +374,7 @@ def mixer(tmp_path_factory):
         ({"model_output_names": ["yy"]}, "yy.*'y'"),
         ({"model_output_names": ["y", "y[2]"]}, r"y\[2\].*twice"),
         ({"bounds": {"u[2]": (0, 1)}}, r"u\[2\]"),
-        ({"bounds": {"A": (0, 1)}}, "'A'"),
+        ({"bounds": {"AA": (0, 1)}}, "'AA'"),
         ({"samplings": {"y[9]": "mean"}}, r"y\[9\]"),
         ({"model_parameters": {"A": [1, 2, 3]}}, r"'A'.*\(2, 2\).*\(3,\)"),
         ({"model_parameters": {"A": [[1, 2], [3]]}}, r"'A'.*\(2, 2\).*different"),

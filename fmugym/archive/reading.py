@@ -67,9 +67,7 @@ def read_model_description(
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
         raise FMULoadError(f"{name}: {error}") from None
-    except ordinary(
-        Exception
-    ) as error:  # FMPy leaks a dozen types of exceptions for malformed files
+    except ordinary(Exception) as error:  # FMPy leaks a dozen types for malformed files
         raise FMULoadError(
             f"{name}: {_XML} cannot be understood: {type(error).__name__}: {reason(error)}"
         ) from error

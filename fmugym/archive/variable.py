@@ -39,6 +39,8 @@ _KINDS = {
 _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 16, 32, 64)}
 
 
+_NO_LIMIT: Final = 1e30
+
 MOST_ELEMENTS: Final = 100_000
 """The most elements of an array whose elements have names."""
 
@@ -182,6 +184,17 @@ class Variable:
         """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
         is_output = self.ticking == "triggered" and self.causality != "input"
         return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Minimum and maximum that mean something; infinite where they do not.
+
+        Some exporters write the largest number, or the same one twice, where there is none.
+        """
+        low, high = self.minimum, self.maximum
+        if low >= high:
+            return -math.inf, math.inf
+        return (low if low > -_NO_LIMIT else -math.inf), (high if high < _NO_LIMIT else math.inf)
 
     @property
     def start_number(self) -> float:

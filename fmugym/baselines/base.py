@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,14 @@ from gymnasium import spaces
 from fmugym.checks import KnownArguments, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Controller", "FloatArray", "Numbers", "Signal", "check_numbers"]
+__all__ = [
+    "Controller",
+    "FloatArray",
+    "Numbers",
+    "Signal",
+    "check_numbers",
+    "require_physical",
+]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -28,12 +35,15 @@ class Controller(KnownArguments, ABC):
     """A controller of one environment, or of the N environments of a vector environment.
 
     Attributes:
+        is_physical: Whether it reads and writes values in the units of the task, as all do that
+            do not say otherwise.
         space: The action space of one environment.
         names: The names of the observation's elements.
         time_step: The length of a step in s.
         count: The number of environments.
     """
 
+    is_physical: ClassVar[bool] = True
     space: spaces.Space[Any]
     names: tuple[str, ...]
     time_step: float
@@ -51,9 +61,11 @@ class Controller(KnownArguments, ABC):
             The controller itself.
 
         Raises:
-            ConfigError: If the names are not known, or something that the controller needs is not
-                there.
+            ConfigError: If the names are not known, something that the controller needs is not
+                there, or the environment is of a task that is not in its physical form.
         """
+        if self.is_physical:
+            require_physical(env)
         self._is_vector = hasattr(env, "single_action_space")
         self.count = env.num_envs if self._is_vector else 1
         self.space = env.single_action_space if self._is_vector else env.action_space
@@ -168,6 +180,25 @@ def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:
     if isinstance(value, np.ndarray) and value.ndim == 1:
         return np.array([check_number(f"each {what}", one, **limits) for one in value.tolist()])
     return check_number(what, value, **limits)
+
+
+def require_physical(env: Any) -> None:
+    """Refuse an environment whose observations or actions are not in the units of its task.
+
+    Args:
+        env: A single or a vector environment of this package, or a wrapper of one.
+
+    Raises:
+        ConfigError: If a key of the task gives them another form. The text has the cure.
+    """
+    keys = _attribute(env, "unphysical_keys")
+    if keys:
+        name = _attribute(env, "task").name
+        raise ConfigError(
+            f"{', '.join(map(repr, keys))} of {name} give observations or actions a form for "
+            "agents, but controllers read and write values in the units of the task: make the "
+            f"environment with fmugym.load({name!r}, physical=True), or of Task.physical()"
+        )
 
 
 def _attribute(env: Any, name: str) -> Any:

@@ -48,6 +48,8 @@ class Random(Controller):
         seed: Of the samples; the same seed gives the same actions after each ``bind``.
     """
 
+    is_physical = False
+
     def __init__(self, seed: int = 0) -> None:
         self.seed = check_seed(seed)
 

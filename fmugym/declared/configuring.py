@@ -12,7 +12,6 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.naming import CLOCK, Naming
 from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_begin, read_scenarios
-from fmugym.declared.variables import Record, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.pool.spec import whole_number_of_steps
 
@@ -128,11 +127,7 @@ def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
 
 
 def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
-    """The limits that the base class needs in order to make spaces."""
-    records = [declared.records[name] for name in (*declared.written, *naming.outputs)]
-    return {r.fmu_name: (r.low, r.high) for r in records if _has_own_limits(r)}
-
-
-def _has_own_limits(record: Record) -> bool:
-    given = record.entry.value or {}
-    return is_plain(record) and ("min" in given or "max" in given)
+    """The limits that the task gives of what it writes, observes and lets episodes start with."""
+    names = (*declared.written, *naming.outputs, *declared.parameters)
+    ranges = {r.fmu_name: r.own_range for r in (declared.records[name] for name in names)}
+    return {name: limits for name, limits in ranges.items() if limits is not None}

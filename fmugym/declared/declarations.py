@@ -58,6 +58,8 @@ class Declarations:
     Attributes:
         root: The table of all keys.
         records: The variables.
+        is_physical: Whether observations and actions are in the units of the task; see
+            ``Task.physical``.
         parameters: Parameters and start values by alias: the record, and a value or distribution in
             the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
@@ -75,6 +77,7 @@ class Declarations:
 
     root: Entry
     records: Records
+    is_physical: bool = False
     parameters: dict[str, tuple[Record, Any]] = field(init=False)
     memory: dict[str, Memory] = field(init=False)
     derived: dict[str, Derived] = field(init=False)
@@ -91,13 +94,15 @@ class Declarations:
     warm_up: WarmUpTable = field(init=False)
 
     @classmethod
-    def read(cls, root: Entry, description: ModelDescription) -> Declarations:
+    def read(
+        cls, root: Entry, description: ModelDescription, is_physical: bool = False
+    ) -> Declarations:
         """Read all sections.
 
         Raises:
             ConfigError: If one has a mistake, or does not fit the FMU. The text says where.
         """
-        declared = cls(root, Records(root, description))
+        declared = cls(root, Records(root, description), is_physical)
         _check_names(root)
         declared.memory = {e.name: read_memory(e) for e in section_of(root, "memory")}
         declared.derived = {e.name: read_derived(e) for e in section_of(root, "expressions")}
@@ -203,15 +208,30 @@ class Declarations:
     def rescales(self) -> bool:
         """Whether actions go from -1 to 1."""
         entry = self.root.child("agent").child("rescale")
-        return entry.value is not None and entry.flag()
+        return entry.value is not None and entry.flag() and not self.is_physical
 
     @property
     def normalization(self) -> str | None:
         """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
         entry = self.root.child("agent").child("normalize")
         if isinstance(entry.value, str):
-            return entry.check(check_option, NORMALIZATIONS)
-        return "limits" if entry.value is not None and entry.flag() else None
+            kind: str | None = entry.check(check_option, NORMALIZATIONS)
+        else:
+            kind = "limits" if entry.value is not None and entry.flag() else None
+        return None if self.is_physical else kind
+
+    @property
+    def unphysical_keys(self) -> tuple[str, ...]:
+        """The keys for which observations or actions are not in the units of the task."""
+        if self.is_physical:
+            return ()
+        given = {
+            "normalize": self.normalization is not None,
+            "rescale": self.rescales,
+            "levels": any(record.levels for record in self.actions),
+            "delta": any(record.delta for record in self.actions),
+        }
+        return tuple(key for key, is_given in given.items() if is_given)
 
     def nominal_of(self, name: str) -> float | None:
         """The usual size of something that the agent observes; None if it is not known.

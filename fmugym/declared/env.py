@@ -16,7 +16,7 @@ __all__ = ["TaskEnv"]
 
 
 _ARGUMENTS: Final = (
-    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "scenario"),
+    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
 )
 
 
@@ -33,10 +33,14 @@ class TaskEnv(FMUEnv):
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
         hooks: As for ``FMUEnv``.
+        master: Of a system: ``"gauss_seidel"`` or ``"jacobi"``, in the place of what its SSP
+            archive or the task says.
 
     Attributes:
         task: The task.
         cost_limits: What the costs of an episode may add up to, by name, as the task says.
+        unphysical_keys: The keys of the task for which observations or actions are not in its
+            units; none in its physical form, which controllers need, see ``Task.physical``.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
@@ -53,16 +57,18 @@ class TaskEnv(FMUEnv):
         backend: Any = None,
         isolation: str | None = None,
         hooks: str = "auto",
+        master: str | None = None,
         **unknown: Never,
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self.task = Task.of(config)
-        source = fmu_of(self.task)
+        source = fmu_of(self.task, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, describe(self.task, source), needs_reward)
         self._quantities_of_task = plan.quantities
         self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
+        self.unphysical_keys = plan.unphysical_keys
         if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(
                 f"{type(self).__name__} has a _get_inputs of its own, so that the file cannot say "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from fmugym.checks import check_flag
 from fmugym.declared.env import TaskEnv
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
@@ -13,14 +14,23 @@ from fmugym.errors import ArgumentError, shown
 __all__ = ["load"]
 
 
-def load(config: Any = None, *, scenario: str | None = None, **arguments: Any) -> FMUEnv:
+def load(
+    config: Any = None,
+    *,
+    scenario: str | None = None,
+    physical: bool = False,
+    **arguments: Any,
+) -> FMUEnv:
     """Make the environment that a task file declares.
 
     Args:
         config: The path of a TOML file, a dict with the same keys, or a ``Task``. See
             ``docs/task-file.md``.
         scenario: The name of a scenario of the task, in which the episodes then take place.
-        arguments: Arguments of the environment, such as ``render_mode``; see ``TaskEnv``.
+        physical: Whether observations and actions are in the units of the task, as controllers
+            need them, whatever it says for agents; see ``Task.physical``.
+        arguments: Arguments of the environment, such as ``render_mode`` and ``master``; see
+            ``TaskEnv``.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
@@ -32,6 +42,8 @@ def load(config: Any = None, *, scenario: str | None = None, **arguments: Any) -
     task = Task.of(config)
     if scenario is not None:
         task = task.in_scenario(scenario)
+    if check_flag("physical", physical):
+        task = task.physical()
     if task.root.child("class").value is None:
         if task.root.child("arguments").value is not None:
             raise task.root.child("arguments").error("'arguments' are for a task with a 'class'")

@@ -318,8 +318,10 @@ class Naming:
         """
         declared = self._declared
         place, is_one = declared.actions.index(record), len(declared.actions) == 1
-        if not record.levels:
+        if declared.is_physical or not record.levels:
             element = f"float64(env.{attribute}[{place}])"
+            if record.levels:
+                return self._nearest_level(record, element)
             return self._rescaled(record, element) if declared.rescales else element
         self.constants[f"levels_{place}"] = np.array(record.levels)
         element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
@@ -334,13 +336,20 @@ class Naming:
         if record.device.delay:
             chosen = self._late(record)
         if record.delta:
-            chosen = f"fn_clip(({now} + {chosen}), {record.low!r}, {record.high!r})"
+            chosen = self._changed(record, chosen, now)
         device, channel = record.device, _CHANNELS_OF_ACTUATORS + self._place_of(record)
         chosen = device.distorted(chosen, "env.step_count", channel)
         chosen = device.following(chosen, now, "env.step_count", channel, self._time_step)
         if record.is_switched:
             chosen = f"where({self.blocked_code(record, chosen)}, {now}, {chosen})"
         return chosen
+
+    def _changed(self, record: Record, chosen: str, now: str) -> str:
+        """Code for an input after a change; in the physical form, towards the chosen value."""
+        value = f"({now} + {chosen})"
+        if self._declared.is_physical:
+            value = f"fn_clip({chosen}, ({now} - {record.delta!r}), ({now} + {record.delta!r}))"
+        return f"fn_clip({value}, {record.low!r}, {record.high!r})"
 
     def _place_of(self, record: Record) -> int:
         return self._declared.actions.index(record)
@@ -370,7 +379,7 @@ class Naming:
 
     def start_code(self, record: Record) -> str:
         """Code for what counts as chosen before the first action; no change for changes."""
-        if record.delta:
+        if record.delta and not self._declared.is_physical:
             return "(env.step_count * 0.0)"
         return self._start_of_input(record)
 
@@ -413,6 +422,14 @@ class Naming:
             return f"({record.delta!r} * {element})"
         middle, half = (record.low + record.high) / 2, (record.high - record.low) / 2
         return f"({middle!r} + {half!r} * {element})"
+
+    def _nearest_level(self, record: Record, element: str) -> str:
+        """Code for the level that is nearest to a value, the lower one of two."""
+        levels = np.sort(record.levels)
+        table = f"levels_{self._place_of(record)}"
+        self.constants[table] = levels
+        middles = ((levels[1:] + levels[:-1]) / 2).tolist()
+        return f"take({table}, {' + '.join(f'({element} > {m!r}) * 1' for m in middles)})"
 
     def kept(self, name: str) -> tuple[str, str] | None:
         """Code for what a history adds to a name's values in each step.

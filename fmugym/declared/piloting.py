@@ -50,6 +50,7 @@ class Pilot(NamedTuple):
         present: A function that returns the value that is written now, for an action that is a
             change; otherwise None.
         rescales: Whether actions go from -1 to 1.
+        is_physical: Whether actions are values in the unit of the task.
     """
 
     record: Record
@@ -60,6 +61,7 @@ class Pilot(NamedTuple):
     clock: Hook
     present: Hook | None
     rescales: bool
+    is_physical: bool
 
     def bind(self, count: int, time_step: float) -> None:
         """Prepare for the warm-up of some environments.
@@ -67,10 +69,7 @@ class Pilot(NamedTuple):
         Raises:
             ConfigError: If the controller does not fit the action.
         """
-        record = self.record
-        low, high = (record.low, record.high)
-        if record.levels:
-            low, high = min(record.levels), max(record.levels)
+        low, high = self.record.range
         space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
         self.controller.bind(_Many(count, space, time_step), self.names)
 
@@ -90,9 +89,13 @@ class Pilot(NamedTuple):
             The action, and what the controller remembers then.
         """
         value, state = self._decided(env, state)
+        if self.is_physical:
+            return value, tuple(state)
         if self.record.levels:
-            distances = [np.abs(level - value) for level in self.record.levels]
-            return np.argmin(np.array(distances), axis=0), tuple(state)
+            levels = self.record.levels
+            order = np.argsort(levels)  # so that the lower one of two levels counts as nearer
+            distances = [np.abs(levels[place] - value) for place in order]
+            return np.take(order, np.argmin(np.array(distances), axis=0)), tuple(state)
         if self.present is not None:
             value = np.clip(value - self.present(env), -self.record.delta, self.record.delta)
         return self._rescaled(value), tuple(state)
@@ -129,6 +132,8 @@ def _rounded(value: Any) -> Any:
 
 class _Many:
     """Some environments with one action, as controllers look at them."""
+
+    unphysical_keys = ()
 
     def __init__(self, count: int, space: spaces.Box, time_step: float) -> None:
         self.num_envs, self.single_action_space, self.time_step = count, space, time_step
@@ -292,6 +297,7 @@ class WarmUpMaker:
             self._function(self._naming.clock_code()),
             present,
             self._declared.rescales,
+            self._declared.is_physical,
         )
 
     def _signal_code(self, name: str) -> str:

@@ -72,6 +72,7 @@ class Plan:
             blocked, shape (levels,); None if the actions have no levels.
         warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
         cost_limits: What the costs of an episode may add up to, by name.
+        unphysical_keys: The keys for which observations or actions are not in the task's units.
 
     Raises:
         ConfigError: If the task does not fit the FMU, or contradicts itself. The text says where.
@@ -81,7 +82,7 @@ class Plan:
         self, task: Task, description: ModelDescription, needs_reward: bool = True
     ) -> None:
         self._task, self._root = task, task.root
-        self._declared = declared = Declarations.read(task.root, description)
+        self._declared = declared = Declarations.read(task.root, description, task.is_physical)
         if needs_reward and not declared.rewards:
             raise task.root.error('the task has no reward; say one, for example: reward = "1"')
         self._time_step = time_step_of(task.root, description)
@@ -98,6 +99,7 @@ class Plan:
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
         self.warm_up = self._make_warm_up() if self._warm_steps else None
         self.action_masks = self._action_masks()
+        self.unphysical_keys = declared.unphysical_keys
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 
@@ -222,8 +224,10 @@ class Plan:
         rescales = self._declared.rescales
         if are_inputs and not self._declared.inputs and not rescales:
             return None
+        if self._declared.is_physical:
+            return _box([record.range for record in records])
         if not records[0].levels:
-            limits = [(-r.delta, r.delta) if r.delta else (r.low, r.high) for r in records]
+            limits = [(-r.delta, r.delta) if r.delta else r.range for r in records]
             return _box([(-1.0, 1.0)] * len(records) if rescales else limits)
         counts = [len(record.levels) for record in records]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)

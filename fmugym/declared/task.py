@@ -7,7 +7,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -53,10 +53,12 @@ class Task:
         document: What it declares: dicts, lists, texts and numbers. Only a task that was made of a
             dict may hold other objects.
         sources: The files that it was read from, the file itself first, or the dict.
+        is_physical: Whether it is in its physical form; no file says so. See ``physical``.
     """
 
     document: Mapping[str, Any]
     sources: tuple[Source, ...] = field(compare=False, repr=False)
+    is_physical: bool = False
 
     @classmethod
     def of(cls, config: Any) -> Task:
@@ -126,6 +128,15 @@ class Task:
         """The table of all keys, with the places in the files."""
         return Entry(self.document, (), self.sources)
 
+    def physical(self) -> Task:
+        """Return the task as controllers play it: they read and write values in its units.
+
+        Observations are not normalized. An action is a value from the lowest to the highest one,
+        whatever ``rescale`` says. With ``delta``, the input follows it by so much in each step.
+        With ``levels``, it becomes the nearest level, the lower one of two.
+        """
+        return replace(self, is_physical=True)
+
     def in_scenario(self, name: str) -> Task:
         """Return the task in one of its scenarios: its beginning and its length are given.
 
@@ -142,7 +153,7 @@ class Task:
         if "start_time" in self.document and "clock" not in self.document:
             times["start_time"] = scenario.start_after(period_of(self.root.child("warm_up")))
             del times["clock"]
-        return Task({**self.document, **times}, self.sources)
+        return replace(self, document={**self.document, **times})
 
     @property
     def name(self) -> str:

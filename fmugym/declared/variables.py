@@ -18,6 +18,7 @@ from fmugym.declared.values import number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.spec import SAMPLINGS
+from fmugym.task.ranges import within
 from fmugym.task.roles import input_variable, output_variable
 from fmugym.task.starting import checked, spread
 
@@ -89,6 +90,11 @@ class Record:
         return self.min_on > 0 or self.min_off > 0
 
     @property
+    def range(self) -> tuple[float, float]:
+        """The lowest and the highest value of an action."""
+        return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
+
+    @property
     def fmu_name(self) -> str:
         """The name in the FMU.
 
@@ -101,6 +107,15 @@ class Record:
                 f'{self.alias} = {{ name = "..." }}'
             )
         return self.variable.name
+
+    @property
+    def own_range(self) -> tuple[float, float] | None:
+        """The limits in the unit of the FMU; None if the task gives none of them."""
+        given = self.entry.value or {}
+        if "min" not in given and "max" not in given:
+            return None
+        low, high = sorted(map(self.conversion.inverse, (self.low, self.high)))
+        return low, high
 
     @property
     def is_bounded(self) -> bool:
@@ -337,22 +352,24 @@ def start_value(record: Record, entry: Entry) -> Any:
     if variable is None or not variable.settable_at_start:
         raise entry.error(f"{name!r} cannot be set at the start of an episode")
     if variable.shape:
-        return _array_start(variable, entry)
+        return _array_start(variable, entry, record.own_range)
     if isinstance(entry.value, str) and (variable.items or variable.kind == "string"):
         value: Any = entry.value
     else:
         value = number_or_distribution(entry)
     with entry.placing():
         value = _in_unit_of_fmu(record.conversion, value)
-        return value if variable.kind == "string" else checked(variable, value)
+        if variable.kind == "string":
+            return value
+        return within(variable, checked(variable, value), record.own_range)
 
 
-def _array_start(variable: Variable, entry: Entry) -> Any:
+def _array_start(variable: Variable, entry: Entry, limits: tuple[float, float] | None) -> Any:
     """The value of an array: nested lists, or one value for all elements, in the FMU's unit."""
     with entry.placing():
         parts = spread(variable.name, variable.elements, entry.value)
         for element, part in zip(variable.elements, parts, strict=True):
-            checked(element, part)
+            within(element, checked(element, part), limits)
     return entry.value
 
 

@@ -114,9 +114,7 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
     """
     from fmugym.baselines import Hysteresis
 
-    low, high = (
-        (min(record.levels), max(record.levels)) if record.levels else (record.low, record.high)
-    )
+    low, high = record.range
     if len(controlled) == 1:
         (of, setpoint), *_ = controlled
         with entry.placing():

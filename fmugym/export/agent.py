@@ -11,7 +11,6 @@ from fmugym.archive.description import Unit
 from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.export.devices import without_imperfections
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
 from fmugym.export.policies import network_of_model
@@ -94,8 +93,7 @@ def agent_of(
     if name in _TAKEN:
         raise ConfigError(f"the name {name!r} is that of a file of C; choose another one")
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
-    with without_imperfections(env) as ideal:
-        logic = logic_of(ideal, all_inputs=all_inputs, external=external)
+    logic = logic_of(env, all_inputs=all_inputs, external=external)
     return Agent(name, logic, network, _notes(env, model), env.fmu.description.units)
 
 

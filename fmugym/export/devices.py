@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Any, Final
 
-from fmugym.declared import Task, TaskEnv
+from fmugym.declared import TaskEnv
 from fmugym.declared.devices import DEVICE_KEYS
 from fmugym.env import FMUEnv
 
@@ -34,12 +35,13 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
     if document is None or document == env.task.document:  # type: ignore[attr-defined]  # a TaskEnv
         yield env
         return
-    task: Any = Task(document, env.task.sources)  # type: ignore[attr-defined]  # as above
+    task: Any = replace(env.task, document=document)  # type: ignore[attr-defined]  # as above
     other: Any = object.__new__(type(env))
     TaskEnv.__init__(other, task)
     for name, value in vars(env).items():  # those that the class's own constructor has set
         if not name.startswith("_"):
             vars(other).setdefault(name, value)
+    other._warm_up_steps = env._warm_up_steps  # the first sample is taken when the warm-up is over
     with closing(other):
         yield other
 

@@ -18,6 +18,7 @@ from gymnasium import spaces
 from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.export.devices import without_imperfections
 from fmugym.export.external import found_in
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
@@ -65,7 +66,7 @@ class Parameter:
         field: The number of the ``Kept`` that holds it.
         element: Its place there.
         start: The value if nothing else is set.
-        variable: The plant's variable; None for an episode variable.
+        variable: The plant's variable, or ``START_TIME``; None for an episode variable.
     """
 
     name: str
@@ -117,7 +118,8 @@ def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str]
     """Trace what a task does between measurements and observation, and from action to inputs.
 
     Args:
-        env: The environment. It is not stepped.
+        env: The environment. It is not stepped. What its sensors and actuators do is left out; see
+            ``without_imperfections``.
         all_inputs: Whether the controller also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the controller is given as measurements, forecasts of
@@ -127,6 +129,11 @@ def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str]
         ConfigError: If a hook does what cannot be translated, or reads what a controller does not
             have. The text names the hook or the value.
     """
+    with without_imperfections(env) as ideal:
+        return _logic_of_ideal(ideal, all_inputs, external)
+
+
+def _logic_of_ideal(env: FMUEnv, all_inputs: bool, external: Collection[str]) -> Logic:
     if env._own.step or env._own.reset:
         name = "step" if env._own.step else "reset"
         raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
@@ -344,9 +351,10 @@ class _Assembly:
 
     def _add_parameter(self, name: str) -> None:
         if name not in self._fields:
-            value = np.ravel(self._episode.parameters[name])
+            own = self._episode.parameters[name]
+            value, variable = np.ravel(own), self._env._interface.parameter(name, own)
             self._add(name, np.dtype(np.float64), value.tolist(), ())
-            self._note_parameters(name, value, self._env.fmu.variable(name))
+            self._note_parameters(name, value, variable)
 
     def _note_parameters(
         self, name: str, values: npt.NDArray[Any], variable: Variable | None

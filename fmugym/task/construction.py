@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache
-from math import floor, nan
+from math import floor, isfinite, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, cast
 from weakref import WeakSet
@@ -18,7 +18,7 @@ from gymnasium import spaces
 
 from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
-from fmugym.distributions import as_distribution, highest_of
+from fmugym.distributions import as_distribution, support_of
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.pool import Pool, PoolSpec
 from fmugym.signals import ordinary
@@ -320,9 +320,10 @@ def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
     limit = sys.maxsize if config.max_episode_steps is None else config.max_episode_steps
     if config.stop_time is None:
         return limit
-    start = highest_of(config.start_time) if config.draws_start_time else spec.start_time
+    drawn = config.draws_start_time
+    start = support_of(config.start_time)[1] if drawn else spec.start_time
     span = (config.stop_time - start) / spec.time_step
-    if span > limit:
+    if span > limit or not isfinite(start):
         return limit
     steps = floor(span + 1e-9) - warm_up_steps
     if steps < 1:
@@ -330,7 +331,7 @@ def _step_limit(config: EnvConfig, spec: PoolSpec, warm_up_steps: int) -> int:
             f"stop_time = {config.stop_time} s leaves no time for a step of {spec.time_step} s "
             f"after start_time = {start} s and the warm-up"
         )
-    return limit if config.draws_start_time else min(limit, steps)
+    return limit if drawn else min(limit, steps)
 
 
 class _StopTime:

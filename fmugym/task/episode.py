@@ -197,9 +197,12 @@ class EpisodePlan:
 
     def starts(self) -> Starts:
         """Draw two episodes for the trial of resets, from a separate random stream."""
-        rng = np.random.default_rng(0)
-        columns = [self.draw(rng).start_values[:, 0].tolist() for _ in range(2)]
-        return Starts(self.model_variables, tuple(zip(*columns, strict=True)))
+        values = self.draw_starts(np.random.default_rng(0), 2)
+        return Starts(self.model_variables, tuple(map(tuple, values.tolist())))
+
+    def draw_starts(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Draw the parameters of some episodes, in the order of the plan, shape (P, count)."""
+        return np.hstack([self.draw(rng).start_values.copy() for _ in range(count)])
 
     def draw(self, rng: np.random.Generator) -> Episode:
         """Draw one episode.

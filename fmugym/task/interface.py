@@ -20,6 +20,7 @@ from fmugym.pool.spec import (
     PoolSpec,
     whole_number_of_steps,
 )
+from fmugym.task.ranges import within
 from fmugym.task.roles import check_input, check_output, check_readable
 from fmugym.task.starting import (
     check_rest_is_known,
@@ -119,8 +120,12 @@ class Interface:
         values = {name: checked(START_TIME, value) for name, value in own.items()}
         rest = {name: value for name, value in given.items() if name not in own}
         for variable, value in start_values(self.description, rest):
-            values[variable.name] = value
+            values[variable.name] = self.within(variable, value)
         return values
+
+    def within(self, variable: Variable, value: Any) -> Any:
+        """Check that a start value lies in its range; see ``fmugym.task.ranges``."""
+        return within(variable, value, self.limits.get(variable.name))
 
     def bounds(self, variable: Variable) -> tuple[float, float]:
         """The limits of a variable: the config's, or else the FMU's.
@@ -262,18 +267,28 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     outputs = outputs_named(description, config.model_output_names)
     read = readable_named(description, config.model_output_names + config.monitor_names)
     monitors = read[len(outputs) :]
-    bounded = inputs + outputs
+    limits = _limits(config, description, inputs + outputs)
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     check_rest_is_known(inputs)
     return Interface(
         inputs=inputs,
         outputs=outputs,
         monitors=monitors,
-        parameters={v.name: value for v, value in given} | drawn,
+        parameters={v.name: within(v, own, limits.get(v.name)) for v, own in given} | drawn,
         config=config,
         description=description,
-        limits=_by_scalar(description, config.bounds, bounded, "input or output in 'bounds'"),
+        limits=limits,
     )
+
+
+def _limits(
+    config: EnvConfig, description: ModelDescription, bounded: Sequence[Variable]
+) -> dict[str, tuple[float, float]]:
+    """The config's limits of inputs, outputs and what can be given a start value."""
+    named = [v for name in config.bounds for v in _known_scalars(description, name)]
+    allowed = [*bounded, *(variable for variable in named if variable.settable_at_start)]
+    kind = "input, output or parameter in 'bounds'"
+    return _by_scalar(description, config.bounds, allowed, kind)
 
 
 def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:

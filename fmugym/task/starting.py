@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import check_number, integer_of, parts_of_array
-from fmugym.distributions import as_distribution, is_distribution
+from fmugym.distributions import Choice, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.roles import require_not_driven, require_numeric
 
@@ -172,8 +172,11 @@ def _require_text(name: str, value: Any) -> None:
 
 
 def checked(variable: Variable, value: Any) -> Any:
-    """Check a start value; distributions are checked when they are drawn."""
+    """Check a start value; other distributions than choices are checked when they are drawn."""
     if is_distribution(value):
+        if isinstance(value, Choice) and variable.kind != "string":
+            for one in value.values:
+                checked_value(variable, one)
         return value
     return str.__str__(value) if variable.kind == "string" else checked_value(variable, value)
 

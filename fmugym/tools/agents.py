@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import json
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,11 +18,11 @@ from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.signals import ordinary
-from fmugym.tools.simulation import Policy
+from fmugym.tools.simulation import Player, Policy
 
 __all__ = [
     "FACTS",
-    "agent_policy",
+    "agent_player",
     "algorithm_of",
     "imported_for_training",
     "load_agent",
@@ -80,20 +81,20 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
     (folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
 
 
-def agent_policy(folder: Path) -> Callable[[FMUEnv], Policy]:
+def agent_player(folder: Path) -> Player:
     """Load the agent that ``train`` has written to a folder.
 
     Only load agents from sources that you trust: the files hold pickles, which can run code.
 
     Returns:
-        A function that makes the policy for an environment. It raises ``ConfigError`` if the agent
-        was trained for other observations or actions.
+        The player. It makes no policy but raises ``ConfigError`` for an environment with other
+        observations or actions than the agent was trained for.
 
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
     model, normalization = load_agent(folder)
-    return lambda env: _checked_policy(folder, model, normalization, env)
+    return Player(partial(_checked_policy, folder, model, normalization), is_physical=False)
 
 
 def load_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:

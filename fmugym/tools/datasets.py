@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.logs import PlantLog, play_log
@@ -17,6 +19,7 @@ from fmugym.tools.options import (
     add_command,
     add_episodes,
     add_json,
+    add_master,
     add_players,
     check_numbers,
     only_player,
@@ -24,10 +27,12 @@ from fmugym.tools.options import (
     say_json,
 )
 from fmugym.tools.progress import progress
-from fmugym.tools.simulation import simulate
+from fmugym.tools.simulation import Player, simulate
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_dataset"]
+
+MakeEnv = Callable[[], FMUEnv]
 
 
 def add_dataset(commands: Commands) -> None:
@@ -36,6 +41,7 @@ def add_dataset(commands: Commands) -> None:
     command = add_command(commands, "dataset", _dataset, text)
     command.add_argument("name", metavar="NAME", help="of the dataset, such as house/pi-v0")
     command.add_argument("--task", metavar="TASK", help=HELP_OF_TASK)
+    add_master(command)
     sources = command.add_mutually_exclusive_group()
     sources.add_argument(
         "--log", action="append", metavar="FILE", help="a CSV file of a plant; more than once"
@@ -76,25 +82,31 @@ def _dataset(arguments: argparse.Namespace) -> None:
         return
     if arguments.task is None:
         raise ConfigError("a new dataset needs --task; --output FOLDER reads an existing one")
-    recordings = _recordings(arguments)
+    is_played = not (arguments.recording or arguments.log)
+    player = only_player(arguments) if is_played else None
+    make_env: MakeEnv = maker_of(arguments.task, arguments.scenario, arguments.master)
+    if player is not None:
+        make_env = partial(player.make_env, make_env)
+    recordings = _recordings(arguments, make_env, player)
     about = {"author": arguments.author, "description": arguments.description}
-    with closing(maker_of(arguments.task, arguments.scenario)()) as env:
+    with closing(make_env()) as env:
         datasets.write_dataset(arguments.name, recordings, env, **about)
     _show(arguments, recordings, f"dataset {arguments.name}")
 
 
-def _recordings(arguments: argparse.Namespace) -> list[Recording]:
-    """The episodes that the arguments name."""
-    if arguments.recording:
-        return [Recording.load(path) for path in arguments.recording]
+def _recordings(
+    arguments: argparse.Namespace, make_env: MakeEnv, player: Player | None
+) -> list[Recording]:
+    """The episodes that the arguments name; those of a player if there is one."""
+    if player is not None:
+        return _played(arguments, make_env, player)
     if arguments.log:
-        return _logged(arguments)
-    return _played(arguments)
+        return _logged(arguments, make_env)
+    return [Recording.load(path) for path in arguments.recording]
 
 
-def _logged(arguments: argparse.Namespace) -> list[Recording]:
+def _logged(arguments: argparse.Namespace, make_env: MakeEnv) -> list[Recording]:
     columns = dict(map(_renaming, arguments.column))
-    make_env = maker_of(arguments.task, arguments.scenario)
     found: list[Recording] = []
     for path in arguments.log:
         log = PlantLog.read(path)
@@ -110,14 +122,10 @@ def _renaming(text: str) -> tuple[str, str]:
     return column, variable
 
 
-def _played(arguments: argparse.Namespace) -> list[Recording]:
+def _played(arguments: argparse.Namespace, make_env: MakeEnv, player: Player) -> list[Recording]:
     check_numbers(arguments, "episodes", "steps")
-    make_policy = only_player(arguments)
-    with (
-        closing(maker_of(arguments.task, arguments.scenario)()) as env,
-        progress(None, "dataset") as advance,
-    ):
-        recorder, policy = Recorder(env), make_policy(env)
+    with closing(make_env()) as env, progress(None, "dataset") as advance:
+        recorder, policy = Recorder(env), player.make_policy(env)
         found: list[Recording] = []
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):
             simulate(recorder, policy, seed, arguments.steps, advance)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from statistics import stdev
@@ -16,7 +17,7 @@ from fmugym.env import FMUEnv
 from fmugym.extras import imported
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import Advance, no_progress
-from fmugym.tools.simulation import Policy, Summary, simulate
+from fmugym.tools.simulation import Player, Summary, simulate
 
 __all__ = ["Score", "confidence", "each_score", "evaluate", "plot_scores", "table"]
 
@@ -112,19 +113,19 @@ def _student(freedom: int) -> float:
 
 
 def evaluate(
-    make_env: Callable[[], FMUEnv],
-    policies: Mapping[str, Callable[[FMUEnv], Policy]],
+    make_env: Callable[..., FMUEnv],
+    players: Mapping[str, Player],
     seeds: Iterable[int],
     most_steps: int,
     scenario: str | None = None,
     advance: Advance = no_progress,
     wrap: Wrap = lambda env: env,
 ) -> list[Score]:
-    """Let controllers play the same episodes.
+    """Let players play the same episodes.
 
     Args:
-        make_env: A function that makes the environment.
-        policies: By name, functions that make a policy for an environment.
+        make_env: A function that makes the environment; see ``Player.make_env``.
+        players: Who acts, by name.
         seeds: The seeds of the episodes.
         most_steps: The steps after which an episode is stopped.
         scenario: The scenario that the environment plays, for the scores.
@@ -132,14 +133,14 @@ def evaluate(
         wrap: Puts wrappers around the environment, such as a recorder.
 
     Returns:
-        A score for each controller, in their order.
+        A score for each player, in their order.
     """
-    return list(each_score(make_env, policies, seeds, most_steps, scenario, advance, wrap))
+    return list(each_score(make_env, players, seeds, most_steps, scenario, advance, wrap))
 
 
 def each_score(
-    make_env: Callable[[], FMUEnv],
-    policies: Mapping[str, Callable[[FMUEnv], Policy]],
+    make_env: Callable[..., FMUEnv],
+    players: Mapping[str, Player],
     seeds: Iterable[int],
     most_steps: int,
     scenario: str | None = None,
@@ -147,12 +148,15 @@ def each_score(
     wrap: Wrap = lambda env: env,
 ) -> Iterator[Score]:
     """Yield each score of ``evaluate`` as soon as it is known."""
-    seeds, env = list(seeds), make_env()
-    played: Any = env
-    try:
-        played = wrap(env)
-        for name, make_policy in policies.items():
-            policy, begin = make_policy(env), perf_counter()
+    seeds = list(seeds)
+    with ExitStack() as stack:
+        envs: dict[bool, Any] = {}  # by whether they are in the physical form
+        for name, player in players.items():
+            if player.is_physical not in envs:
+                env = stack.enter_context(closing(player.make_env(make_env)))
+                envs[player.is_physical] = stack.enter_context(closing(wrap(env)))
+            played = envs[player.is_physical]
+            policy, begin = player.make_policy(played.unwrapped), perf_counter()
             episodes: list[Summary] = []
             each = (simulate(played, policy, seed, most_steps, advance) for seed in seeds)
             try:
@@ -162,8 +166,6 @@ def each_score(
                     yield _score(name, episodes, perf_counter() - begin, scenario)
                 raise
             yield _score(name, episodes, perf_counter() - begin, scenario)
-    finally:
-        played.close()
 
 
 def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | None) -> Score:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -77,7 +78,9 @@ def _tune(arguments: argparse.Namespace) -> None:
 
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
     """Search, and keep the best of each round."""
-    make_env = maker_of(arguments.task, arguments.scenario)
+    make_env = partial(
+        maker_of(arguments.task, arguments.scenario, arguments.master), physical=True
+    )
     with progress(arguments.rounds, "tune", "rounds") as advance:
 
         def noted(best: Tuning) -> None:

@@ -139,8 +139,9 @@ def _plan_of(arguments: argparse.Namespace) -> Plan:
     options = argparse.Namespace(**given)
     check_numbers(options, "steps", "envs", "episodes")
     own = arguments_of(arguments.arguments) or before.get("arguments", {})
-    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
-    held_out = {name: maker_of(arguments.task, name) for name in names}
+    names, master = scenarios_of(arguments.task), arguments.master
+    make_env = maker_of(arguments.task, master=master)
+    held_out = {name: maker_of(arguments.task, name, master) for name in names}
     return Plan(
         make_env,
         held_out or {"held-out seeds": make_env},

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
-from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.tools.agents import agent_policy
+from fmugym.systems.plan import MASTERS
+from fmugym.tools.agents import agent_player
 from fmugym.tools.overview import plain
-from fmugym.tools.simulation import Policy, action_of, policy_of
+from fmugym.tools.simulation import Player, action_of, policy_of
 
 __all__ = [
     "HELP_OF_TASK",
@@ -25,6 +25,7 @@ __all__ = [
     "add_command",
     "add_episodes",
     "add_json",
+    "add_master",
     "add_players",
     "add_task",
     "check_numbers",
@@ -71,6 +72,13 @@ def add_json(command: argparse.ArgumentParser) -> None:
 def add_task(command: argparse.ArgumentParser, also: str = "") -> None:
     """Add the argument for the task."""
     command.add_argument("task", metavar="TASK", help=HELP_OF_TASK + also)
+    add_master(command)
+
+
+def add_master(command: argparse.ArgumentParser) -> None:
+    """Add the option for how systems run."""
+    text = "how a system exchanges values, in the place of what its SSP archive or task says"
+    command.add_argument("--master", choices=MASTERS, help=text)
 
 
 def add_episodes(
@@ -96,9 +104,7 @@ def add_players(command: argparse.ArgumentParser) -> None:
     )
 
 
-def players_of(
-    arguments: argparse.Namespace, *, random: bool = False
-) -> dict[str, Callable[[FMUEnv], Policy]]:
+def players_of(arguments: argparse.Namespace, *, random: bool = False) -> dict[str, Player]:
     """Make those who act, by name, of the options of ``add_players``.
 
     Args:
@@ -110,14 +116,17 @@ def players_of(
     """
     given = arguments.action + arguments.controller + arguments.agent
     actions = ["random", *arguments.action] if random or not given else arguments.action
-    players: dict[str, Callable[[FMUEnv], Policy]] = {}
+    players: dict[str, Player] = {}
     for text in actions:
-        players[text if text == "random" else f"action {text}"] = partial(action_of, text=text)
-    players |= {text: partial(policy_of, text=text) for text in arguments.controller}
-    return players | {str(folder): agent_policy(folder) for folder in arguments.agent}
+        is_random, make_policy = text == "random", partial(action_of, text=text)
+        name = text if is_random else f"action {text}"
+        players[name] = Player(make_policy, is_physical=not is_random)
+    for text in arguments.controller:
+        players[text] = Player(partial(policy_of, text=text), is_physical=True)
+    return players | {str(folder): agent_player(folder) for folder in arguments.agent}
 
 
-def only_player(arguments: argparse.Namespace) -> Callable[[FMUEnv], Policy]:
+def only_player(arguments: argparse.Namespace) -> Player:
     """The one who acts, where there can be only one.
 
     Raises:

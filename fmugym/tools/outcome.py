@@ -10,7 +10,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.pictures import svg_of
-from fmugym.tools.agents import FACTS, agent_policy
+from fmugym.tools.agents import FACTS, agent_player
 from fmugym.tools.diary import CURVE, REPORT, Diary, curve_of, draw_curve
 from fmugym.tools.records import About
 from fmugym.tools.simulation import simulate
@@ -68,8 +68,9 @@ def _write_report(plan: Plan, diary: Diary, title: str, charts: Mapping[str, str
 
 
 def _played(plan: Plan, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:
-    env = make_env()
+    player = agent_player(plan.folder)
+    env = player.make_env(make_env)
     with closing(RecordSeries(env, diary.variables, every=diary.every)) as recorder:
-        policy = agent_policy(plan.folder)(env)
+        policy = player.make_policy(env)
         simulate(recorder, policy, HELD_OUT_SEED, plan.most_steps)
         return recorder.series

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from fmugym.tools.options import (
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import progress
 from fmugym.tools.records import Recording, require_format, require_picture, title_of
-from fmugym.tools.simulation import Policy, Summary, simulate
+from fmugym.tools.simulation import Player, Summary, simulate
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -50,7 +49,10 @@ def add_simulate(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
-    make_policy = only_player(arguments)
+    player, make_env = (
+        only_player(arguments),
+        maker_of(arguments.task, arguments.scenario, arguments.master),
+    )
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     summaries: list[Summary] = []
 
@@ -59,8 +61,8 @@ def _simulate(arguments: argparse.Namespace) -> None:
             say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
 
     with shown_in_any_case(show), ExitStack() as stack:
-        env: Any = stack.enter_context(closing(maker_of(arguments.task, arguments.scenario)()))
-        policy = make_policy(env)
+        env: Any = stack.enter_context(closing(player.make_env(make_env)))
+        policy = player.make_policy(env)
         if arguments.output is not None:
             env = stack.enter_context(closing(RecordSeries(env, path=arguments.output)))
         total = _steps_of(env.unwrapped, arguments)
@@ -117,8 +119,8 @@ def _record(arguments: argparse.Namespace) -> None:
 
     try:
         with shown_in_any_case(show):
-            for name, make_policy in players.items():
-                _record_one(arguments, recording, name, make_policy, summaries[name])
+            for name, player in players.items():
+                _record_one(arguments, recording, name, player, summaries[name])
     except FMUGymError:
         recording.finish(arguments.seed)
         raise
@@ -128,15 +130,17 @@ def _record_one(
     arguments: argparse.Namespace,
     recording: Recording,
     name: str,
-    make_policy: Callable[[FMUEnv], Policy],
+    player: Player,
     summaries: list[Summary],
 ) -> None:
     """Record the episodes of one who acts."""
     with (
-        closing(maker_of(arguments.task, arguments.scenario)()) as env,
+        closing(
+            player.make_env(maker_of(arguments.task, arguments.scenario, arguments.master))
+        ) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
-        policy = make_policy(env)
+        policy = player.make_policy(env)
         recorder = recording.begin(name, env, arguments.variables, arguments.every)
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):
             summaries.append(simulate(recorder, policy, seed, arguments.steps, advance))
@@ -171,7 +175,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         for scenario in _scenarios(arguments):
-            make_env = maker_of(arguments.task, scenario)
+            make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario
             with progress(None, label) as advance:
                 played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
@@ -216,7 +220,8 @@ def add_bench(commands: Commands) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     report: Report | None = None
     with shown_in_any_case(lambda: _show_speeds(report, arguments)):
-        make, sizes = maker_of(arguments.task), arguments.envs or [8, 64, 1024]
+        make = maker_of(arguments.task, master=arguments.master)
+        sizes = arguments.envs or [8, 64, 1024]
         for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
             pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
 

@@ -10,13 +10,14 @@ import gymnasium
 import numpy as np
 
 from fmugym.baselines import controller_of
+from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.tools.progress import Advance, no_progress
 
-__all__ = ["Policy", "Summary", "action_of", "policy_of", "simulate"]
+__all__ = ["Player", "Policy", "Summary", "action_of", "policy_of", "simulate"]
 
 
 def _begin() -> None:
@@ -34,6 +35,28 @@ class Policy:
 
     act: Callable[[Any], Any]
     begin: Callable[[], None] = _begin
+
+
+@dataclass(frozen=True)
+class Player:
+    """One who acts.
+
+    Attributes:
+        make_policy: Makes the policy for an environment.
+        is_physical: Whether the environment must be in the physical form of its task, as for all
+            who read and write values in units of the task; see ``Task.physical``.
+    """
+
+    make_policy: Callable[[FMUEnv], Policy]
+    is_physical: bool
+
+    def make_env(self, make_env: Callable[..., FMUEnv]) -> FMUEnv:
+        """Make an environment in the form that the player needs.
+
+        Args:
+            make_env: As ``maker_of`` returns it. Only for a physical player it gets an argument.
+        """
+        return make_env(physical=True) if self.is_physical else make_env()
 
 
 @dataclass(frozen=True)
@@ -79,11 +102,13 @@ def action_of(env: FMUEnv, text: str) -> Policy:
         text: ``"random"``, or the numbers of one action, which is repeated: ``"0.5,-1"``.
 
     Raises:
-        ConfigError: If it names no action.
+        ConfigError: If it names no action, or numbers are for an environment that is not in its
+            physical form.
     """
     space = env.action_space
     if text == "random":
         return Policy(lambda observation: space.sample())
+    require_physical(env)
     try:
         numbers = [number_of("action", float(part)) for part in text.split(",")]
         array = np.array(numbers).reshape(space.shape or ())

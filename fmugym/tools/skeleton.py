@@ -23,8 +23,6 @@ from fmugym.tools.overview import plain, start_value
 
 __all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
 
-_NO_LIMIT: Final = 1e30
-
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
 
@@ -280,7 +278,7 @@ def _name_line(variable: Variable) -> str:
 
 def needs_bounds(variable: Variable) -> bool:
     """Whether the FMU leaves a limit of an input open, or its limits contradict each other."""
-    low, high = _limits(variable)
+    low, high = variable.limits
     return variable.kind in {"real", "integer"} and not (math.isfinite(low) and math.isfinite(high))
 
 
@@ -294,7 +292,7 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
 
     A model often fails far away from its start value.
     """
-    low, high = _limits(variable)
+    low, high = variable.limits
     down, up = _reach(variable)
     start = _start(variable)
     if not math.isfinite(low):
@@ -302,14 +300,6 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
     if not math.isfinite(high):
         high = max(start, low) + up
     return low, high
-
-
-def _limits(variable: Variable) -> tuple[float, float]:
-    """Those of the FMU that mean something: some exporters write the largest number for none."""
-    low, high = variable.minimum, variable.maximum
-    if low > high:
-        return -math.inf, math.inf
-    return (low if low > -_NO_LIMIT else -math.inf), (high if high < _NO_LIMIT else math.inf)
 
 
 def _start(variable: Variable) -> float:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from time import perf_counter
 from typing import Any, Final
 
+import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from fmugym.checks import number_of
@@ -170,13 +171,13 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     """
     pool = env._open_pool("a measurement")
     variables = tuple(env._plan.model_variables)
-    values = env._plan.constants[:, None].repeat(pool.num_instances, axis=1)
+    rng = np.random.default_rng(0)
     limit = min(env._step_limit, 1000)
     best = float("inf")
     end = perf_counter() + seconds / 2
     try:
         while perf_counter() < end:
-            pool.reset(variables, values)
+            pool.reset(variables, env._plan.draw_starts(rng, pool.num_instances))
             begin = perf_counter()
             for _ in range(limit):
                 pool.step(None)

@@ -10,25 +10,32 @@ from typing import Any, Final
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.systems import fmu_of
+from fmugym.errors import ConfigError
 from fmugym.systems import FMUSystem
 from fmugym.tools.overview import overview, plain, tables
 
 __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"]
 
 
-def find_model(path: Path) -> FMU | FMUSystem:
+def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
     """Find what a file is or names: an FMU, an SSP archive, or a task file with one of both.
+
+    Args:
+        path: The file.
+        master: Of a system, in the place of what the file says.
 
     Raises:
         ConfigError: If the task file or the system has a mistake.
         FMULoadError: If the archive or an FMU cannot be read.
     """
     if path.suffix.lower() == ".ssp":
-        return FMUSystem.read(path)
-    if path.suffix.lower() != ".toml":
-        return FMU(path)
-    source = fmu_of(Task.read(path))
-    return source if isinstance(source, FMUSystem) else find_model(source)
+        return FMUSystem.read(path, master=master)
+    if path.suffix.lower() == ".toml":
+        source = fmu_of(Task.read(path), master)
+        return source if isinstance(source, FMUSystem) else FMU(source)
+    if master is not None:
+        raise ConfigError(f"a master is for systems; {path.name} is a single FMU")
+    return FMU(path)
 
 
 def open_model(path: Path) -> FMU:

@@ -23,32 +23,43 @@ __all__ = ["maker_of", "scenarios_of"]
 _MODELS: Final = {".fmu", ".ssp"}
 
 
-def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
+def maker_of(
+    target: str, scenario: str | None = None, master: str | None = None
+) -> Callable[..., FMUEnv]:
     """Find what a text names.
 
     Args:
         target: The path of a task file, an FMU or an SSP archive, a registered id, or
             ``"module:Class"``. For an FMU or archive it is the task that ``fmugym new`` proposes.
         scenario: A scenario of the task file; None for any episodes.
+        master: Of a system, in the place of what its archive or task says.
 
     Returns:
-        A function that makes the environment. It takes arguments of the environment.
+        A function that makes the environment. It takes arguments of the environment, and
+        ``physical=True`` for the physical form of a task; an id and a class that takes no task
+        have one form only, which ``require_physical`` of the controllers may refuse.
 
     Raises:
         ConfigError: If there is no such thing, or the task has a mistake.
         FMULoadError: If the FMU cannot be read.
     """
     path = Path(target)
+    own: dict[str, Any] = {} if master is None else {"master": master}
     if path.suffix.lower() in _MODELS:
-        return partial(load, Task.from_dict(tomllib.loads(Proposal(open_model(path)).text())))
+        task = Task.from_dict(tomllib.loads(Proposal(open_model(path)).text()))
+        return partial(load, task, **own)
     if path.suffix.lower() == ".toml" or path.is_file():
-        return partial(load, Task.read(path), scenario=scenario)
+        return partial(load, Task.read(path), scenario=scenario, **own)
     module, separator, name = target.partition(":")
     if separator and name.isidentifier() and "/" not in module:
         if scenario is not None:
             raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
+        if master is not None:
+            raise ConfigError(f"{shown(target)} is no task file and chooses its own master")
         return partial(load, Task.from_dict({"class": target}))
-    return partial(_registered, target, {} if scenario is None else {"scenario": scenario})
+    if scenario is not None:
+        own["scenario"] = scenario
+    return partial(_registered, target, own)
 
 
 def _nearest(target: str) -> str:
@@ -77,7 +88,9 @@ def _scenarios(task: Task | None) -> list[str]:
     return [] if task is None else list(task.document.get("scenarios", {}))
 
 
-def _registered(env_id: str, arguments: dict[str, Any], **more: Any) -> FMUEnv:
+def _registered(
+    env_id: str, arguments: dict[str, Any], physical: bool = False, **more: Any
+) -> FMUEnv:
     try:
         made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:

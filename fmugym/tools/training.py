@@ -25,6 +25,7 @@ from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_ch
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
 from fmugym.tools.evaluation import Score, Wrap, evaluate
 from fmugym.tools.progress import Advance, no_progress
+from fmugym.tools.simulation import Player
 from fmugym.tools.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
@@ -357,11 +358,12 @@ class _Training:
         is_new = steps != self._progress["last"]
         self._progress |= {"last": steps, "updates": self._model._n_updates}
         make_policy = partial(policy_with, self._model, self._normalization())
+        player = Player(make_policy, is_physical=False)
         seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
         self.scores = []
         for name, make_env in plan.held_out.items():
             self.scores += evaluate(
-                make_env, {name: make_policy}, seeds, plan.most_steps, wrap=self._wrap(name)
+                make_env, {name: player}, seeds, plan.most_steps, wrap=self._wrap(name)
             )
         mean = sum(score.mean for score in self.scores) / len(self.scores)
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")

@@ -18,6 +18,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
+from fmugym.export.logic import logic_of
 from fmugym.systems.fmu import SystemFMU
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, advise
@@ -194,6 +195,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_reward(first)
     yield from _of_observations(env, first)
     yield _of_length(env)
+    yield _of_export(env)
 
 
 def _of_faults(first: _Episode) -> Finding:
@@ -426,6 +428,17 @@ def _of_length(env: FMUEnv) -> Finding:
         "an episode has no limit of steps",
         "give episode_length, unless every episode terminates",
     )
+
+
+def _of_export(env: FMUEnv) -> Finding:
+    """Tell before the training whether its agent can leave Python."""
+    try:
+        measured = [variable.name for variable in logic_of(env).measurements]
+    except FMUGymError as error:
+        cure = "an agent acts in Python all the same; docs/deploy.md says what can be exported"
+        return Finding("warning", "export", str(error), cure)
+    names = ", ".join(measured) or "nothing"
+    return Finding("ok", "export", f"an agent can be exported; it measures {names}")
 
 
 def _hooks(make_env: Callable[[], FMUEnv]) -> str:

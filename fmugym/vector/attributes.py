@@ -72,11 +72,14 @@ class Attributes:
         scalars = self._prototype.fmu.description.scalars(name)
         rows = [spread(name, scalars, value) for value in values]
         columns = {
-            variable.name: checked_column(variable, [row[place] for row in rows])
+            variable: checked_column(variable, [row[place] for row in rows])
             for place, variable in enumerate(scalars)
         }
-        for scalar, numbers in columns.items():
-            self._engine.set_parameter(scalar, numbers)
+        for variable, column in columns.items():
+            for value in column.tolist():
+                self._prototype._interface.within(variable, value)
+        for variable, column in columns.items():
+            self._engine.set_parameter(variable.name, column)
 
     def set_attribute(self, name: str, values: Mapping[int, Any]) -> None:
         """Set an attribute of some environments.

@@ -1,0 +1,84 @@
+"""The ranges of start values: those that the config gives, or else those of the FMU."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any, Final
+
+from fmugym.archive.variable import Variable
+from fmugym.distributions import is_distribution, support_of, truncated
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["within"]
+
+_Range = tuple[float, float]
+
+_OF_FMU: Final = (
+    "the FMU's min and max (another range: 'bounds', or 'min' and 'max' in a task file)"
+)
+_GIVEN: Final = "the range that the task gives"
+
+logger = logging.getLogger(__name__)
+_told: Final[set[str]] = set()
+
+
+def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
+    """Check that a start value lies in its range, and truncate an unbounded distribution there.
+
+    The log tells once in a process what is truncated.
+
+    Args:
+        variable: A scalar or an element of an array.
+        value: A checked number or text, or a distribution.
+        limits: Those of the config, which take the place of the FMU's; None if it gives none.
+
+    Returns:
+        The value, or a distribution that only draws values in the range.
+
+    Raises:
+        ConfigError: If the number or a bounded distribution exceeds the range, or an unbounded one
+            hardly ever draws a value in it.
+    """
+    if variable.kind not in {"real", "integer"}:
+        return value
+    low, high = _range_of(variable) if limits is None else limits
+    ends = support_of(value) if is_distribution(value) else (value, value)
+    if all(_lies_in(low, end, high) for end in ends):
+        return value
+    unit = f" {variable.unit}" if variable.unit else ""
+    text = f"{low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
+    if all(map(math.isfinite, ends)):
+        found = shown(value) if ends[0] == ends[1] else f"{ends[0]} to {ends[1]} of {shown(value)}"
+        raise _outside(variable, text, found)
+    try:
+        own = truncated(value, low, high)
+    except ConfigError as error:
+        raise _outside(variable, text, error) from None
+    _tell_once(f"{variable.name!r} is drawn again until it lies between {text}")
+    return own
+
+
+def _range_of(variable: Variable) -> _Range:
+    """The FMU's limits; none if they exclude its own start value, which they then cannot mean."""
+    low, high = variable.limits
+    try:
+        start = low if variable.start is None else variable.start_number
+    except ConfigError:  # no number
+        start = low
+    return (low, high) if _lies_in(low, start, high) else (-math.inf, math.inf)
+
+
+def _lies_in(low: float, value: float, high: float) -> bool:
+    """Conversions between units may round a value that is at a limit."""
+    return low <= value <= high or math.isclose(value, low) or math.isclose(value, high)
+
+
+def _outside(variable: Variable, wanted: str, found: object) -> ConfigError:
+    return ConfigError(f"{variable.name!r} must lie between {wanted}; got {found}")
+
+
+def _tell_once(text: str) -> None:
+    if text not in _told:
+        _told.add(text)
+        logger.warning(text)
