@@ -42,6 +42,7 @@ SLOW_MODULES = {
     "test_pendulum_sim_to_lab",
     "test_reference_models",
     "test_snapshot_machine",
+    "test_shared_data",
     "test_soak",
     "test_stand_in",
     "test_pettingzoo",

@@ -55,7 +55,7 @@ def add_train(commands: Commands) -> None:
     )
     command.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="a new one")
     command.add_argument("--algorithm", help="PPO (default), A2C, SAC, TD3, DQN ...")
-    command.add_argument("--steps", type=int, help="default 100000")
+    command.add_argument("--steps", type=int, help="of all environments, at most; default 100000")
     command.add_argument("--envs", type=int, help="that step together; default 8")
     command.add_argument("--seed", type=int, help="default 0")
     command.add_argument("--episodes", type=int, help="of an evaluation; default 5")

@@ -220,7 +220,7 @@ def add_bench(commands: Commands) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     report: Report | None = None
     with shown_in_any_case(lambda: _show_speeds(report, arguments)):
-        make = maker_of(arguments.task, master=arguments.master)
+        make = maker_of(arguments.task, master=arguments.master, takes_fmu=True)
         sizes = arguments.envs or [8, 64, 1024]
         for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
             pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
