@@ -2,24 +2,80 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import os
+import stat
 import sys
+import tempfile
+from itertools import accumulate
 from pathlib import Path
+from typing import Final
 
-__all__ = ["cache_folder"]
+from fmugym.signals import Ignoring
+
+__all__ = ["cache_folder", "is_own", "lasting_folder"]
+
+logger = logging.getLogger(__name__)
+
+_OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
 
 
-def cache_folder() -> Path:
+def cache_folder(*names: str) -> Path:
     """Return ``FMUGYM_CACHE_DIR``, or else ``fmugym`` in the system's folder for caches.
 
     The system's folder is ``XDG_CACHE_HOME`` or ``~/.cache``; on macOS ``~/Library/Caches``; on
-    Windows ``LOCALAPPDATA``.
+    Windows ``LOCALAPPDATA``. A folder that is missing is made.
+
+    Args:
+        names: Of a folder in it.
 
     Raises:
-        RuntimeError: If the user has no home folder.
+        OSError: If there can be none, or others may write to it.
     """
     given = os.environ.get("FMUGYM_CACHE_DIR")
-    return Path(given).expanduser() if given else _system_folder() / "fmugym"
+    try:
+        root = Path(given).expanduser() if given else _system_folder() / "fmugym"
+    except RuntimeError as error:  # the user has no home folder
+        raise FileNotFoundError(str(error)) from None
+    return _private(root, names)
+
+
+def lasting_folder(*names: str) -> Path:
+    """As ``cache_folder``; where there can be none, in the user's own one for temporary files.
+
+    Raises:
+        OSError: If there can be none there either.
+    """
+    with Ignoring(OSError):
+        return cache_folder(*names)
+    return _private(Path(tempfile.gettempdir(), f"fmugym-{_user()}"), names)
+
+
+def is_own(path: Path) -> bool:
+    """Whether a file or folder, or a link to it, belongs to the user of this process."""
+    return sys.platform == "win32" or path.lstat().st_uid == _user()
+
+
+def _user() -> int:
+    return 0 if sys.platform == "win32" else os.geteuid()
+
+
+def _private(root: Path, names: tuple[str, ...]) -> Path:
+    """Make a folder and those in it, each for this user alone."""
+    for folder in accumulate(names, Path.joinpath, initial=root):
+        folder.mkdir(0o700, parents=True, exist_ok=True)
+        others = sys.platform != "win32" and folder.stat().st_mode & _OTHERS
+        if others or not (is_own(folder) and is_own(folder.resolve())):
+            _warn(text := f"{folder} is not used because others than its user may write there")
+            raise PermissionError(text)
+    return folder
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Once is enough."""
+    logger.warning(text)
 
 
 def _system_folder() -> Path:

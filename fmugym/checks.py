@@ -6,12 +6,13 @@ methods fail. It returns the value in its plain Python type, or raises ``ConfigE
 
 from __future__ import annotations
 
+import errno
 import inspect
 import math
 import operator
 import os
+import stat
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from numbers import Real
 from pathlib import Path
 from typing import Any, Final, Self
@@ -19,6 +20,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.errors import ArgumentError, ConfigError, shown, unknown_argument, unknown_name
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "LARGEST_COUNT",
@@ -40,6 +42,7 @@ __all__ = [
     "integer_of",
     "number_of",
     "parts_of_array",
+    "require_regular",
 ]
 
 LARGEST_COUNT: Final = 2**31 - 1
@@ -121,7 +124,7 @@ def number_of(what: str, value: Any, *, may_be_boolean: bool = False) -> float:
     if type(value) is float:
         return value
     if _is_real(value) and (may_be_boolean or not _is_boolean(value)):
-        with suppress(Exception):  # the number is too large, or the object's own method fails
+        with Ignoring(Exception):  # the number is too large, or the object's own method fails
             return float(value)
     raise ConfigError(f"{what} must be a number, got {shown(value)}")
 
@@ -207,7 +210,7 @@ def integer_of(value: Any) -> int | None:
         return None
     try:
         return int(operator.index(value))
-    except Exception:  # a TypeError; or the object's own method fails
+    except ordinary(Exception):  # a TypeError; or the object's own method fails
         return None
 
 
@@ -229,7 +232,7 @@ def has_method(value: object, name: str) -> bool:
     """Whether a value has a method of this name; one that answers no question has none."""
     try:
         return callable(getattr(value, name, None))
-    except Exception:  # the object's own method fails
+    except ordinary(Exception):  # the object's own method fails
         return False
 
 
@@ -275,9 +278,19 @@ def check_dict(what: str, value: Any) -> dict[Any, Any]:
         ConfigError: If it is none.
     """
     if issubclass(type(value), Mapping):
-        with suppress(Exception):  # a mapping of the caller's whose methods fail
+        with Ignoring(Exception):  # a mapping of the caller's whose methods fail
             return dict(value)
     raise ConfigError(f"{what} must be a dict, got {shown(value)}")
+
+
+def require_regular(path: Path) -> None:
+    """Refuse pipes and devices, which may never end.
+
+    Raises:
+        OSError: If the path is none of a regular file.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file")
 
 
 def check_path(what: str, value: Any) -> Path:
@@ -288,7 +301,7 @@ def check_path(what: str, value: Any) -> Path:
     """
     try:
         return Path(os.fsdecode(value)).expanduser()
-    except Exception:  # a TypeError; or nobody has this home, or the object's own method fails
+    except ordinary(Exception):  # nobody has this home, or the object's method fails
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
 
 

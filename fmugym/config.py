@@ -34,6 +34,7 @@ from fmugym.pool.spec import (
     SOLVERS,
     ResetMethod,
 )
+from fmugym.signals import ordinary
 
 __all__ = ["EnvConfig"]
 
@@ -337,7 +338,7 @@ def _names(key: str, value: Any) -> tuple[str, ...]:
 def _listed(value: Any) -> list[Any] | None:
     try:
         return list(value) if isinstance(value, Sequence) else None
-    except Exception:  # a sequence of the caller's that fails
+    except ordinary(Exception):  # a sequence of the caller's that fails
         return None
 
 
@@ -356,7 +357,7 @@ def _variable_array(what: str, value: Any) -> npt.NDArray[Any]:
     """
     try:
         array: npt.NDArray[Any] = np.array(value, np.float64)
-    except Exception:  # lists that make no array, distributions, or objects that are no numbers
+    except ordinary(Exception):  # no array, distributions, or objects that are no numbers
         array = _drawn_array(what, value)
     is_float = array.dtype != object
     if not array.size or (is_float and not np.isfinite(array).all()):
@@ -402,7 +403,7 @@ def _archive_limits(limits: Any) -> ArchiveLimits:
 def _bounds(name: str, limits: Any) -> tuple[float, float]:
     try:
         low, high = (number_of("limit", one, may_be_boolean=True) for one in limits)
-    except Exception:  # no pair of numbers, or an object whose own methods fail
+    except ordinary(Exception):  # no pair of numbers, or an object whose own methods fail
         low = high = math.nan
     if not low < high:
         raise ConfigError(

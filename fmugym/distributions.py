@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -27,6 +26,7 @@ from fmugym.checks import (
     number_of,
 )
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "Choice",
@@ -236,7 +236,7 @@ class Truncated:
         below = math.nextafter(self.low, -math.inf)
         try:
             return float(self.distribution.cdf(self.high) - self.distribution.cdf(below))
-        except Exception:  # no distribution of scipy.stats: it is not known
+        except ordinary(Exception):  # no distribution of scipy.stats: it is not known
             return 1.0
 
     def sample(self, rng: np.random.Generator) -> float:
@@ -280,7 +280,7 @@ def support_of(distribution: Any) -> tuple[float, float]:
         return min(values), max(values)
     if isinstance(distribution, Uniform | LogUniform | Normal):
         return float(distribution.low), float(distribution.high)
-    with suppress(Exception):  # no distribution of scipy.stats, or not of single numbers
+    with Ignoring(Exception):  # no distribution of scipy.stats, or not of single numbers
         low, high = map(float, distribution.support())
         return low, high
     return -math.inf, math.inf
@@ -357,7 +357,7 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
         return value
     try:
         drawn = value.sample(rng) if has_method(value, "sample") else value.rvs(random_state=rng)
-    except Exception as error:
+    except ordinary(Exception) as error:
         raise ConfigError(f"{shown(value)} cannot be drawn from: {shown(error)}") from error
     if isinstance(drawn, str):
         return drawn
@@ -391,7 +391,7 @@ def _items(values: Any) -> list[Any]:
         return []
     try:
         return list(values)
-    except Exception:  # an iterable of the caller's that fails
+    except ordinary(Exception):  # an iterable of the caller's that fails
         return []
 
 

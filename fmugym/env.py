@@ -510,16 +510,23 @@ class FMUEnv(Constructed):
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]
     ) -> Result:
         """End the episode because of a number that is not finite, in the state before the step."""
-        if isfinite(reward):
-            reason = f"the observation is {shown(observation)} at t = {self.time:g} s"
-        else:
-            reason = f"_reward_policy returned {reward} at t = {self.time:g} s"
+        reason = self._not_finite(reward, observation)
         self._values, variables = before
         self.state = self.previous_state
         self.variables.update(variables or {})
         self._open_pool("step").note_fault(0)
         self._halt()
         return self._fault(reason)
+
+    def _not_finite(self, reward: float, observation: Any) -> str:
+        """Say what is not finite, before the step is undone."""
+        fine = isfinite(reward)
+        what = f"the observation is {shown(observation)}" if fine else self._explain(reward)
+        return f"{what} at t = {self.time:g} s"
+
+    def _explain(self, reward: float) -> str:
+        """Say where a reward that is not finite comes from."""
+        return f"_reward_policy returned {reward}"
 
     def _fault(self, reason: str) -> Result:
         self._ended = True

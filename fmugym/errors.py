@@ -23,6 +23,8 @@ import difflib
 from collections.abc import Iterable, Sequence
 from typing import Final
 
+from fmugym.signals import ordinary
+
 __all__ = [
     "ArgumentError",
     "ConfigError",
@@ -128,7 +130,7 @@ def shown(value: object) -> str:
     """
     try:
         text = repr(value)
-    except Exception:  # an error is being reported already
+    except ordinary(Exception):  # an error is being reported already
         text = f"<{type(value).__name__} without a repr>"
     if "\n" in text:  # an array
         text = " ".join(text.split())

@@ -28,7 +28,7 @@ from gymnasium import spaces
 
 from fmugym.archive.units import conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number
+from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown, unknown_name
@@ -36,6 +36,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
 from fmugym.series.store import TEXT
+from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
 __all__ = ["PlantLog", "play_log"]
@@ -124,9 +125,10 @@ class PlantLog:
 
 def _cells(path: Path) -> tuple[list[str], list[list[str]]]:
     try:
+        require_regular(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             names, *rows = [row for row in csv.reader(file) if row]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except ordinary(OSError, UnicodeDecodeError, csv.Error) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
     except ValueError:
         raise ConfigError(f"{shown(str(path))} is empty") from None

@@ -16,6 +16,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -26,12 +27,13 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium.spaces.utils import flatten, unflatten
+from gymnasium.spaces.utils import flatdim, flatten, unflatten
 from gymnasium.utils.seeding import np_random
 
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
+from fmugym.signals import ordinary
 from fmugym.task.generators import row_of, state_of
 from fmugym.task.snapshot import require_scope
 
@@ -49,6 +51,9 @@ __all__ = [
 ]
 
 _VERSION: Final = 1
+
+_MOST_BYTES: Final = 2**30
+"""A file without its compression; a hundred million steps of a small task have no more."""
 
 
 def surroundings() -> dict[str, str]:
@@ -79,6 +84,9 @@ class Recording:
         rewards: Shape (steps,).
         terminated: Shape (steps,).
         truncated: Shape (steps,).
+
+    Raises:
+        ConfigError: If the arrays are not of as many steps, or hold no numbers.
     """
 
     scope: dict[str, str]
@@ -92,6 +100,17 @@ class Recording:
     rewards: npt.NDArray[np.float64]
     terminated: npt.NDArray[np.bool_]
     truncated: npt.NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        steps = np.size(self.rewards)
+        for name, (kinds, dimensions) in _ARRAYS.items():
+            array, rows = getattr(self, name), steps + (name == "observations")
+            shape, most = np.shape(array), dimensions or np.ndim(array)
+            if shape[:1] != (rows,) or len(shape) > most or array.dtype.kind not in kinds:
+                raise ConfigError(
+                    f"the {name} of {steps} steps are an array of {array.dtype} of shape {shape}, "
+                    f"expected {rows} rows"
+                )
 
     def __len__(self) -> int:
         return len(self.rewards)
@@ -109,17 +128,15 @@ class Recording:
         """Read a recording.
 
         Raises:
-            ConfigError: If the file is none, or of another version of the format.
+            ConfigError: If the file is none, of another version of the format, or damaged.
         """
         try:
             with np.load(path, allow_pickle=False) as file:
+                _require_small(file.zip)
                 header = json.loads(file["header"].tobytes())
                 arrays = {name: file[name] for name in _ARRAYS}
-            if header.pop("version") != _VERSION:
-                raise ValueError("it is of another version of the format")
-            header["stream"] = tuple(header["stream"])
-            return cls(**{name: header[name] for name in FACTS}, **arrays)
-        except Exception as error:  # a damaged file may raise anything
+            return cls(**_facts(header), **arrays)
+        except ordinary(Exception) as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"{shown(str(path))} is no recording of an episode: {error}"
             ) from None
@@ -128,7 +145,46 @@ class Recording:
 FACTS: Final = ("scope", "surroundings", "seed", "stream", "options", "drawn")
 """What a recording holds besides arrays."""
 
-_ARRAYS: Final = ("actions", "observations", "rewards", "terminated", "truncated")
+_ARRAYS: Final = {
+    **dict.fromkeys(("actions", "observations"), ("biuf", None)),
+    "rewards": ("f", 1),
+    **dict.fromkeys(("terminated", "truncated"), ("b", 1)),
+}
+"""The kinds of numbers in each array, and how many dimensions it has; None for any."""
+
+
+def _require_small(archive: zipfile.ZipFile) -> None:
+    size = sum(entry.file_size for entry in archive.infolist())
+    if size > _MOST_BYTES:
+        raise ValueError(
+            f"unpacked, it has {size / 2**30:.3g} GB; at most {_MOST_BYTES / 2**30:g} GB are read"
+        )
+
+
+def _facts(header: dict[str, Any]) -> dict[str, Any]:
+    """What a header says; raises whatever its damage leads to."""
+    if header["version"] != _VERSION:
+        raise ValueError("it is of another version of the format")
+    stream, seed = tuple(map(int, header["stream"])), header["seed"]
+    _generator_of(stream)
+    json.loads(header["options"])
+    return {
+        **{name: header[name] for name in FACTS},
+        **{name: _texts(header[name]) for name in ("scope", "surroundings")},
+        "seed": None if seed is None else int(seed),
+        "stream": stream,
+        "drawn": {name: float(value) for name, value in header["drawn"].items()},
+    }
+
+
+def _generator_of(stream: tuple[int, ...]) -> np.random.Generator:
+    generator = np.random.Generator(np.random.PCG64())
+    generator.bit_generator.state = state_of(list(stream))
+    return generator
+
+
+def _texts(texts: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(text) for name, text in texts.items()}
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -239,9 +295,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     require_scope(recording.scope, inner._scope, "recording")
     then = recording.surroundings
     others = {n: (then.get(n, ""), now[n]) for n in now if then.get(n) != now[n]}
-    generator = np.random.Generator(np.random.PCG64())
-    generator.bit_generator.state = state_of(list(recording.stream))
-    inner.np_random = generator
+    inner.np_random = _generator_of(recording.stream)
     observation, info = env.reset(options=json.loads(recording.options))
     drawn = {name: float(value) for name, value in info["drawn"].items()}
     found = _difference_of_starts(
@@ -319,8 +373,15 @@ def flat_element(space: gymnasium.Space[Any], value: Any) -> npt.NDArray[Any]:
 
 
 def element_from(space: gymnasium.Space[Any], values: npt.NDArray[Any]) -> Any:
-    """The element of a space that ``flat_element`` has made an array of."""
-    composed = isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple)
-    if composed:
-        return unflatten(space, values)
-    return values[()] if values.ndim == 0 else values
+    """The element of a space that ``flat_element`` has made an array of.
+
+    Raises:
+        ConfigError: If the array is too short or too long for a space of several parts.
+    """
+    if not isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+        return values[()] if values.ndim == 0 else values
+    if values.shape != (flatdim(space),):
+        raise ConfigError(
+            f"{values.shape} is no shape of a flat element of {space}, expected ({flatdim(space)},)"
+        )
+    return unflatten(space, values)

@@ -11,7 +11,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -19,12 +18,13 @@ from typing import Any, Final
 import gymnasium
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
-from fmugym.caching import cache_folder
+from fmugym.caching import lasting_folder
 from fmugym.checks import check_text
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
+from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.libraries import make_vector_env
 
 try:
@@ -102,7 +102,7 @@ class _Files:
         """
         try:
             data = Path(path).expanduser().read_bytes()
-        except OSError as error:
+        except ordinary(OSError) as error:
             raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
         place = f"{hashlib.sha256(data).hexdigest()[:16]}/{Path(path).name}"
         self.contents[place] = data
@@ -121,18 +121,12 @@ class _Files:
         Returns:
             Their folder.
         """
-        root = _folder()
+        root = lasting_folder("ray")
         for place, data in self.contents.items():
             file = root / place
             if not file.exists():
                 _write(file, data)
         return root
-
-
-def _folder() -> Path:
-    with suppress(RuntimeError):
-        return cache_folder() / "ray"
-    return Path(tempfile.gettempdir()) / "fmugym-ray"
 
 
 def _write(file: Path, data: bytes) -> None:
@@ -216,6 +210,6 @@ def _processors() -> int:
     """How many processors Ray has given to this runner; 1 where Ray says nothing."""
     if not ray.is_initialized():
         return 1
-    with suppress(Exception):  # the driver has no resources of its own
+    with Ignoring(Exception):  # the driver has no resources of its own
         return max(1, int(ray.get_runtime_context().get_assigned_resources().get("CPU", 1)))
     return 1

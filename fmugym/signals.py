@@ -1,37 +1,78 @@
-"""Exceptions that come from signal handlers, which nobody may take for those of a user's hooks."""
+"""Exceptions of signal handlers, which nobody may take for those of a user's objects."""
 
 from __future__ import annotations
 
-import signal
-from types import CodeType
-from typing import Any
+import inspect
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from traceback import walk_stack, walk_tb
+from types import FrameType
+from typing import TypeVar
 
-__all__ = ["is_of_signal_handler", "let_through"]
+__all__ = ["Ignoring", "ordinary"]
 
-
-def is_of_signal_handler(error: BaseException | None) -> bool:
-    """Whether a signal handler has raised an exception, or one that it was made of."""
-    codes = {_code_of(signal.getsignal(number)) for number in signal.valid_signals()} - {None}
-    while error is not None:
-        place = error.__traceback__
-        while place is not None:
-            if place.tb_frame.f_code in codes:
-                return True
-            place = place.tb_next
-        error = error.__cause__ or error.__context__
-    return False
+E = TypeVar("E", bound=Exception)
 
 
-def let_through(error: BaseException) -> None:
-    """Raise an exception again if a signal handler has raised it."""
-    if is_of_signal_handler(error):
-        raise error
+def ordinary(*kinds: type[E]) -> tuple[type[E], ...]:
+    """What an ``except`` clause may catch: nothing if a signal handler has raised the exception.
+
+    ::
+
+        try:
+            array = np.asarray(value)
+        except ordinary(Exception) as error:  # the user's own __array__ may raise anything
+            raise ConfigError(...) from None
+
+    Args:
+        kinds: What to catch otherwise.
+
+    Returns:
+        The kinds; nothing if a handler has raised the present exception, or one that it was made
+        of.
+    """
+    error = sys.exception()
+    return () if error is not None and _is_of_handler(error) else kinds
 
 
-def _code_of(handler: Any) -> CodeType | None:
-    """The code of a function, a method or an object that can be called."""
-    function = getattr(handler, "__func__", handler)
-    if not hasattr(function, "__code__"):
-        function = vars(type(handler)).get("__call__")
-    code = getattr(function, "__code__", None)
-    return code if isinstance(code, CodeType) else None
+class Ignoring:
+    """As ``contextlib.suppress``, but lets through what a signal handler has raised.
+
+    Args:
+        kinds: What to ignore otherwise.
+    """
+
+    def __init__(self, *kinds: type[Exception]) -> None:
+        self._kinds = kinds
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, place: object) -> bool:
+        return isinstance(error, self._kinds) and not _is_of_handler(error)
+
+
+def _is_of_handler(error: BaseException) -> bool:
+    left = [frame for origin in _origins(error) for frame, _ in walk_tb(origin.__traceback__)]
+    return any(map(_is_handler, left))
+
+
+def _origins(error: BaseException) -> Iterator[BaseException]:
+    """An exception and those that it was made of, without those that callers are handling."""
+    stack = error.__traceback__ and walk_stack(error.__traceback__.tb_frame)
+    callers = [frame for frame, _ in stack or ()][1:]
+    origin: BaseException | None = error
+    while origin and not (origin.__traceback__ and origin.__traceback__.tb_frame in callers):
+        yield origin
+        origin = origin.__cause__ or origin.__context__
+
+
+def _is_handler(frame: FrameType) -> bool:
+    """Python calls a handler with the number of the signal and the frame that it interrupts."""
+    names, rest, _, values = inspect.getargvalues(frame)
+    given = [values.get(name) for name in names] + list(values.get(rest, ()) if rest else ())
+    return any(
+        isinstance(number, int) and isinstance(place, FrameType) and place is frame.f_back
+        for number, place in pairwise(given)
+    )

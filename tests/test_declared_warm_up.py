@@ -10,7 +10,6 @@ from fmugym import FMUVectorEnv
 from fmugym.baselines import controller_of
 from fmugym.errors import SimulationError, TaskError
 from fmugym.task import warm_up as warm_ups
-from fmugym.trial import known
 
 THERMOSTAT = "hysteresis of=T setpoint=T_set band=0.5"
 PID = "pid of=T setpoint=T_set kp=0.3 ti=14400 td=60 offset=0.1"
@@ -255,7 +254,7 @@ class TestCache:
     @pytest.fixture(autouse=True)
     def empty(self, monkeypatch, tmp_path):
         monkeypatch.setattr(warm_ups, "_memory", warm_ups._Memory())
-        monkeypatch.setattr(known, "cache_folder", lambda: tmp_path)
+        monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
 
     def task(self, **keys):
         task = house(**keys) | {"parameters": {"T_m_0": 291.0}}

@@ -10,7 +10,8 @@ import fmugym
 PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
-    {"errors", "caching", "lazy", "signals", "_native"},
+    {"signals", "_native"},
+    {"errors", "caching", "lazy"},
     {"checks", "extras", "figures", "wine"},
     {"archive", "distributions", "rendering"},
     {"systems"},

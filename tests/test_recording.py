@@ -1,5 +1,7 @@
 """Recordings of episodes, and replays that are equal or name the first difference."""
 
+import json
+import zipfile
 from dataclasses import replace
 
 import gymnasium
@@ -117,6 +119,14 @@ def test_other_surroundings_are_told():
     assert f"numpy was '1.0', is '{np.__version__}'" in str(report)
 
 
+@pytest.fixture
+def recorded(tmp_path):
+    """The file of an episode of eight steps."""
+    with Track() as env:
+        record(env, seed=0).recording.save(tmp_path / "episode.npz")
+    return tmp_path / "episode.npz"
+
+
 class TestRefusals:
     def test_of_another_config(self):
         with Track() as env, Track(time_step=0.01) as other:
@@ -152,3 +162,63 @@ class TestRefusals:
         monkeypatch.undo()
         with pytest.raises(ConfigError, match="another version"):
             Recording.load(tmp_path / "episode.npz")
+
+    def test_of_more_than_memory_should_hold(self, recorded):
+        with zipfile.ZipFile(recorded, "a") as archive:
+            archive.writestr("more.npy", b"")
+            archive.getinfo("more.npy").file_size = 4 * 2**30
+        with pytest.raises(ConfigError, match="4 GB"):
+            Recording.load(recorded)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("rewards", np.zeros(7)),
+            ("rewards", np.zeros((8, 1))),
+            ("rewards", np.float64(1.0)),
+            ("observations", np.zeros((8, 3))),
+            ("actions", np.array(["a"] * 8)),
+            ("terminated", np.zeros(8)),
+        ],
+    )
+    def test_of_arrays_that_do_not_match(self, recorded, name, value):
+        with np.load(recorded) as file:
+            np.savez(recorded, **dict(file) | {name: value})
+        with pytest.raises(ConfigError, match=r"recording.*expected \d rows"):
+            Recording.load(recorded)
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("stream", [1, 2]),
+            ("stream", [-1, 2, 3, 4, 0, 0]),
+            ("stream", 5),
+            ("scope", "all"),
+            ("drawn", {"m": "heavy"}),
+            ("drawn", [1.0]),
+            ("seed", "five"),
+            ("options", "{"),
+            ("surroundings", None),
+        ],
+    )
+    def test_of_facts_that_are_none(self, recorded, name, value):
+        with np.load(recorded) as file:
+            header = json.loads(file["header"].tobytes()) | {name: value}
+            text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+            np.savez(recorded, **dict(file) | {"header": text})
+        with pytest.raises(ConfigError, match="no recording"):
+            Recording.load(recorded)
+
+    def test_of_a_header_that_is_no_dict(self, recorded):
+        with np.load(recorded) as file:
+            np.savez(recorded, **dict(file) | {"header": np.frombuffer(b"[1]", np.uint8)})
+        with pytest.raises(ConfigError, match="no recording"):
+            Recording.load(recorded)
+
+    @pytest.mark.parametrize("make", [Track, CartPoleEnv, Named], ids=lambda cls: cls.__name__)
+    @pytest.mark.parametrize("shape", [(8, 2), (8, 0)])
+    def test_of_actions_of_another_shape(self, make, shape):
+        with make() as env:
+            recording = replace(record(env, seed=0).recording, actions=np.zeros(shape))
+            with pytest.raises(ConfigError, match=r"action|flat element"):
+                fmugym.replay(recording, env)

@@ -9,6 +9,7 @@ import sys
 import foreign_tank
 import gymnasium
 import numpy as np
+import odd_values
 import pytest
 from demanding_tools import DemandingEnv, make_fmu
 from fmu_tools import PlainEnv, probe_config
@@ -587,3 +588,29 @@ def test_states_of_the_fmu_are_reused(make_env):
     assert len({snapshot.bundle.data for snapshot in snapshots}) == 1
     envs.close()
     assert isinstance(snapshots[0], Snapshot)
+
+
+class TestDamage:
+    @pytest.mark.parametrize(
+        "which",
+        [None, True, [[0, 1]], np.zeros((2, 2), int), np.uint64(2**63), odd_values.Unspeakable()],
+        ids=["None", "True", "nested", "matrix", "large", "object"],
+    )
+    def test_an_odd_index_is_refused(self, which):
+        envs = fmugym.FMUVectorEnv(Track, 3)
+        envs.reset(seed=0)
+        snapshot = envs.save_state()
+        envs.close()
+        with pytest.raises(ConfigError, match="of a snapshot of 3"):
+            snapshot[which]
+
+    def test_a_changed_byte_is_found(self):
+        with Track() as env:
+            env.reset(seed=0)
+            pickled = pickle.dumps(env.save_state())
+        begin = pickled.index(b"fmugym.pool.bundle")
+        for place in range(begin, begin + 300, 7):
+            damaged = bytearray(pickled)
+            damaged[place] ^= 1
+            with pytest.raises(SimulationError, match="damaged"):
+                pickle.loads(damaged)

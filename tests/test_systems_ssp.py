@@ -3,8 +3,10 @@
 import copy
 import logging
 import random
+import time
 import zipfile
 from contextlib import closing
+from itertools import pairwise
 from types import MappingProxyType
 
 import model_tools
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 import system_tools
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
+from fmu_tools import PlainEnv
 from lxml import etree
 
 import fmugym
@@ -24,8 +27,11 @@ from fmugym import (
     FMUSystem,
     bundled_fmu,
 )
+from fmugym.archive.structure import Feedthrough
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
+from fmugym.systems.order import order_of
+from fmugym.systems.plan import Link, Loop
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
 
@@ -765,3 +771,42 @@ def bundled_input_unit():
     from fmugym import FMU
 
     return FMU(HOUSE).variable("T_out").unit
+
+
+class TestLarge:
+    """Systems of many components."""
+
+    @staticmethod
+    def chain(count):
+        """Components in a chain; each gets the same temperature, and a parameter from outside."""
+        inner = [component(f"c{i}", HOUSE_PORTS) for i in range(count)]
+        wires = [connection("T", f"c{i}.T_out") for i in range(count)]
+        wires += [connection(f"c{i}.Q_em", f"c{i + 1}.Q_int") for i in range(count - 1)]
+        starts = {f"c{i}.T_m_0": real(290.0) for i in range(count)}
+        return system("root", {"T": "input degC"}, inner, wires, bindings(values(starts)))
+
+    @staticmethod
+    def seconds_to_order(count):
+        """The time of the processor for a chain, in which all act at once on the next."""
+        names = [f"c{i}" for i in range(count)]
+        links = [Link(a, "y", b, "u") for a, b in pairwise(names)]
+        through = Feedthrough({"y": frozenset("u")}, {"y": frozenset("u")}, True)
+        begin = time.process_time()
+        order_of(names, links, dict.fromkeys(names, through), Loop())
+        return time.process_time() - begin
+
+    def test_the_order_takes_as_long_for_each_component(self):
+        seconds = [min(self.seconds_to_order(count) for _ in "123") for count in (500, 5000)]
+        assert seconds[1] < 30 * seconds[0]
+
+    def test_a_file_is_read_once(self, pack):
+        fmu = FMUSystem.read(pack(self.chain(20))).as_fmu(probe_timeout=None)
+        assert len({id(part) for part in fmu.description.parts}) == 1
+
+    @pytest.mark.parametrize("backend", ["python", None])
+    def test_three_hundred_components_play(self, pack, backend):
+        names = {"model_input_names": "T", "model_output_names": "c299.T_air"}
+        config = names | {"bounds": {"T": (0, 30)}, "time_step": 60.0}
+        with PlainEnv(pack(self.chain(300)), config, backend=backend) as env:
+            env.reset(seed=0)
+            assert env.step(env.action_space.sample())[0] == pytest.approx(290.0, abs=5.0)

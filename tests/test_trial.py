@@ -15,10 +15,10 @@ from fmu_tools import PlainEnv, edited_fmu, library_name, write_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
+from fmugym.caching import cache_folder
 from fmugym.pool import PoolSpec
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.trial import attempt, trial
-from fmugym.trial.cache import cache_folder
 from fmugym.trial.known import known_verdict
 from fmugym.trial.opening import make_pool
 

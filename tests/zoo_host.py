@@ -15,9 +15,9 @@ from pathlib import Path
 
 import zoo_tools
 
+from fmugym.caching import cache_folder
 from fmugym.pool import has_native_pool
 from fmugym.pool.process.last_words import describe_exit
-from fmugym.trial.cache import cache_folder
 
 
 def main(folder, *modes):

@@ -20,6 +20,7 @@ from fmugym.archive.description import (
 )
 from fmugym.archive.variable import CLOCK_KINDS, MOST_FRACTIONS, UNKNOWN, Interval, Variable
 from fmugym.errors import FMULoadError, reason
+from fmugym.signals import ordinary
 
 __all__ = ["convert"]
 
@@ -411,5 +412,5 @@ def _unused_times(source: Any, attributes: tuple[str, ...]) -> tuple[str, ...]:
 def _broken_rules(source: Any) -> tuple[str, ...]:
     try:
         return tuple(validate_model_description(source))
-    except Exception as error:  # the validation itself stumbles over some invalid files
+    except ordinary(Exception) as error:  # the validation itself stumbles over some invalid files
         return (f"the model description could not be validated: {reason(error)}",)

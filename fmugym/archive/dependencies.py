@@ -12,6 +12,7 @@ from typing import NamedTuple
 from fmugym.archive.elf import opened
 from fmugym.archive.loader import ask
 from fmugym.errors import FMULoadError
+from fmugym.signals import ordinary
 
 __all__ = ["libraries_of", "load_globally", "missing_libraries", "stray_libraries"]
 
@@ -123,5 +124,5 @@ def load_globally(path: str) -> None:
     """
     try:
         ctypes.CDLL(path, mode=getattr(os, "RTLD_GLOBAL", ctypes.DEFAULT_MODE))
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"the library {path!r} cannot be loaded: {error}") from None

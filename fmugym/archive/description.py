@@ -16,6 +16,7 @@ import fmpy
 from fmugym.archive.variable import Variable
 from fmugym.checks import integer_of
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = [
     "BASE_UNITS",
@@ -278,7 +279,7 @@ class ModelDescription:
         """
         try:
             return self.variables[name]
-        except Exception:  # a KeyError; or something that is no key at all
+        except ordinary(Exception):  # a KeyError; or something that is no key at all
             known = list(self.variables)
         array, index = self._array_and_index(name)
         if array is None:

@@ -30,6 +30,7 @@ from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.archive.variable import Variable
 from fmugym.checks import KnownArguments, check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
+from fmugym.signals import ordinary
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU"]
@@ -352,7 +353,7 @@ def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:
     """A bare name is left to the system's loader."""
     try:
         paths = [] if isinstance(libraries, str) else [_file_name(one) for one in libraries]
-    except Exception:  # a TypeError; or an object whose own methods fail
+    except ordinary(Exception):  # a TypeError; or an object whose own methods fail
         paths = []
     if not paths and not (isinstance(libraries, list | tuple) and len(libraries) == 0):
         raise ConfigError(f"preload must be a list of paths, got {shown(libraries)}")

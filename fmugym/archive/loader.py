@@ -6,13 +6,14 @@ that are missing. It imports nothing but the standard library, so that it starts
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
+
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["ask", "ask_in_a_child"]
 
@@ -36,7 +37,7 @@ def _missing(name: str) -> list[str]:
         return [] if os.path.isfile(name) else [name]
     try:
         ctypes.CDLL(name)
-    except OSError as error:
+    except ordinary(OSError) as error:
         missing, _, reason = str(error).partition(": ")
         return [missing if reason.startswith("cannot open shared object file") else name]
     return []
@@ -49,7 +50,7 @@ def ask_in_a_child(names: Sequence[str]) -> list[str]:
     """
     if not names:
         return []
-    with contextlib.suppress(OSError, ValueError, subprocess.SubprocessError):
+    with Ignoring(OSError, ValueError, subprocess.SubprocessError):
         done = subprocess.run(
             [sys.executable, "-I", "-S", __file__],
             input=json.dumps(list(names)).encode(),

@@ -18,6 +18,7 @@ from fmugym.archive.conversion import convert
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip, over_limit
 from fmugym.errors import FMULoadError, reason
+from fmugym.signals import ordinary
 
 __all__ = ["parse_xml", "read_model_description", "read_root", "read_xml"]
 
@@ -66,7 +67,7 @@ def read_model_description(
         return convert(_parse_with_fmpy(content), root, interface)
     except FMULoadError as error:
         raise FMULoadError(f"{name}: {error}") from None
-    except Exception as error:  # FMPy leaks a dozen types of exceptions for malformed files
+    except ordinary(Exception) as error:  # FMPy leaks a dozen types for malformed files
         raise FMULoadError(
             f"{name}: {_XML} cannot be understood: {type(error).__name__}: {reason(error)}"
         ) from error

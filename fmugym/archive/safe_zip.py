@@ -26,6 +26,7 @@ from typing import BinaryIO, Final, cast
 
 from fmugym.checks import KnownArguments, check_count
 from fmugym.errors import FMULoadError, nearest_name, reason
+from fmugym.signals import ordinary
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
 
@@ -115,7 +116,7 @@ class SafeZip:
                 raise FMULoadError(f"there is no FMU at {path}{_what_is_there(path)}")
             self._version = _version_of(path)
             entries = _read_directory(path, limits)
-        except _ZIP_ERRORS as error:
+        except ordinary(*_ZIP_ERRORS) as error:
             raise FMULoadError(
                 f"{path.name} is not an FMU (a zip archive): {reason(error)}"
             ) from None
@@ -293,9 +294,9 @@ class SafeZip:
                 )
             with zipfile.ZipFile(self.path) as archive:
                 yield archive
-        except OSError as error:
+        except ordinary(OSError) as error:
             raise FMULoadError(f"{self.path.name} cannot be unpacked: {reason(error)}") from None
-        except _ZIP_ERRORS as error:
+        except ordinary(*_ZIP_ERRORS) as error:
             raise FMULoadError(
                 f"{self.path.name} is damaged: {reason(error)}; copy or export the FMU again"
             ) from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import functools
 import os
 import re
@@ -14,7 +13,9 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+from fmugym.caching import is_own
 from fmugym.errors import FMULoadError
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest", "sweep"]
 
@@ -37,7 +38,7 @@ def folder_name() -> Path:
     try:
         sweep()
         return Path(tempfile.gettempdir(), name)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
 
@@ -49,9 +50,9 @@ def make_folder(folder: Path) -> None:
     """
     try:
         folder.mkdir(0o700)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         _made_in[folder] = os.getcwd()
 
 
@@ -80,7 +81,7 @@ def _remove(folder: Path) -> None:
 
 
 def _leave(folder: Path, directory: str) -> None:
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         if Path.cwd().is_relative_to(folder.resolve()):
             os.chdir(directory)
 
@@ -96,11 +97,13 @@ def remove_rest() -> None:
 
 @functools.cache
 def sweep() -> None:
-    """Remove the folders that killed processes have left; done once in a process."""
+    """Remove the folders that killed processes of this user have left; once in a process."""
     for folder in Path(tempfile.gettempdir()).glob("fmugym-*"):
         name = _NAME.fullmatch(folder.name)
         if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
-            shutil.rmtree(folder, ignore_errors=True)
+            with Ignoring(OSError):  # another process has removed it
+                if is_own(folder):
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 @functools.cache
@@ -108,7 +111,7 @@ def _namespace() -> int:
     """Identify the numbering of processes: containers that share a folder may number them alike."""
     try:
         return os.stat("/proc/self/ns/pid").st_ino
-    except OSError:
+    except ordinary(OSError):
         return 0
 
 
@@ -117,7 +120,7 @@ def _is_alive(pid: int) -> bool:
         return True
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # the number may be anybody's invention
         return False
     except PermissionError:
         return True

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import ordinary
 
 __all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
 
@@ -160,13 +161,20 @@ def _pint() -> tuple[Any, Any]:
     return pint, pint.UnitRegistry(on_redefinition="ignore")
 
 
+_EXPONENT: Final = re.compile(r"\*\*\s*(\(\s*)?[-+]?\d{1,3}([./]\d{1,3})?(?(1)\s*\))(?!\s*\*\*)")
+_HARMLESS: Final = re.compile(r"(?!.*\*\*)(\b[^\W\d]\w*\b|\b1\b|\W){0,200}")
+"""Names and ones, besides exponents: pint would compute powers of numbers, of any size."""
+
+
 def _parsed(name: str) -> Any:
     """A unit in the way of writing of Modelica and FMI, where ``.`` multiplies: ``W/(m2.K)``."""
     text = re.sub(r"(?<=[A-Za-z%])(-?\d+)", r"**(\1)", name.replace(".", "*"))
     text = re.sub(r"(?<=[\w)])\^", "**", text).replace("%", "percent")
     try:
+        if not _HARMLESS.fullmatch(_EXPONENT.sub(" ", text)):
+            raise ValueError(text)
         return _pint()[1].Unit(text)
-    except Exception as error:  # pint passes on errors of the parsers that it uses
+    except ordinary(Exception) as error:  # pint passes on errors of the parsers that it uses
         raise ConfigError(
             f"{shown(name)} is no unit that is known; write units as FMI ('W/(m2.K)') or Pint does"
         ) from error

@@ -75,8 +75,10 @@ class TaskEnv(FMUEnv):
                 "what happens in the warm-up"
             )
         self._observation_names, self._masks = plan.observation_names, plan.action_masks
+        own = _own_hooks(type(self))
+        own |= {"_explain"} if "_reward_policy" in own else set()
         for name, function in plan.hooks.items():
-            if name not in _own_hooks(type(self)):
+            if name not in own:
                 setattr(self, name, MethodType(function, self))
         with self.task.root.placing():
             super().__init__(

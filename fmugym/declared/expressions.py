@@ -30,6 +30,7 @@ __all__ = ["CONSTANTS", "Code", "Expression", "Names", "code_of_number", "functi
 _LONGEST: Final = 2000
 _MOST_NODES: Final = 500
 _DEEPEST: Final = 40
+_LONGEST_CODE: Final = 200_000
 
 _BINARY: Final[Mapping[type[ast.operator], str]] = {
     ast.Add: "({} + {})",
@@ -178,7 +179,10 @@ class Expression:
             ConfigError: If a name is unknown, or the expression has something that is not in the
                 grammar. The text tells the column.
         """
-        return _Writer(self.text, names).write(self.tree)
+        try:
+            return _Writer(self.text, names).write(self.tree)
+        except RecursionError:
+            raise ConfigError("expressions read each other in too long a row") from None
 
     def constant(self) -> float:
         """The value of an expression without names.
@@ -381,6 +385,11 @@ def _as_float(value: float) -> float:
 def _folded(template: str, operands: list[Code], is_flag: bool = False) -> Code:
     """Combine operands; what consists of constants is computed at once."""
     text = template.format(*(operand.text for operand in operands))
+    if len(text) > _LONGEST_CODE:
+        raise ConfigError(
+            f"the expression is too long: with the expressions that it reads, its code has more "
+            f"than {_LONGEST_CODE} characters"
+        )
     if any(operand.value is None for operand in operands):
         return Code(text, is_flag)
     with np.errstate(all="ignore"):
@@ -397,8 +406,16 @@ def function_of(text: str, constants: Mapping[str, Any], file: str) -> Callable[
         text: Code that was made of expressions.
         constants: Values that the code reads by name, such as tables.
         file: A name for the code in tracebacks.
+
+    Raises:
+        ConfigError: If the code is too large for Python.
     """
-    code = compile(f"lambda env: {text}", f"<{file}>", "eval")
+    try:
+        code = compile(f"lambda env: {text}", f"<{file}>", "eval")
+    except (SyntaxError, MemoryError, RecursionError):  # limits of Python's own
+        raise ConfigError(
+            f"{file}: expressions read each other in too long a row, or have too many terms"
+        ) from None
     function: Callable[[Any], Any] = eval(code, {**_NAMESPACE, **constants})
     if not _MAY_WARN.search(text):
         return function

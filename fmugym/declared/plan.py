@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
+from fmugym.declared.blaming import explanation
 from fmugym.declared.configuring import (
     bounds_of,
     clock_of,
@@ -52,7 +53,7 @@ WORST: Final = "worst reward"
 _LONG_AGO: Final = 1e9
 """Steps since an action was switched, at the beginning of an episode."""
 
-Hook = Callable[[Any], Any]
+Hook = Callable[..., Any]
 
 
 class Plan:
@@ -315,7 +316,9 @@ class Plan:
         if "truncated" in declared.flags:
             hooks["_is_truncated"] = self._condition("truncated", Moment.JUDGED)
         if declared.rewards:
-            hooks["_reward_policy"] = self._function(_sum(self._terms(declared.rewards)))
+            terms = self._terms(declared.rewards)
+            hooks["_reward_policy"] = self._function(_sum(terms))
+            hooks["_explain"] = explanation(declared.rewards, terms, self._naming, self._function)
             hooks["_fault_reward"] = self._fault_reward()
         if declared.costs or declared.has_reward_terms or declared.kpis:
             hooks["_get_info"] = self._function(self._info())

@@ -16,13 +16,14 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_integer, check_option, check_path
+from fmugym.checks import check_integer, check_option, check_path, require_regular
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.extras import imported
+from fmugym.signals import ordinary
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
@@ -232,6 +233,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
     """The tables of a file by name. Environments of one task read it once."""
     path = check_path("file", file.text())
     try:
+        require_regular(path)
         status = path.stat()
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_text
@@ -240,7 +242,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
         near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
         missing = unknown_name("file", path.name, near)
         raise file.error(f"{missing} (looked in {shown(str(path.parent))})") from None
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
 

@@ -17,6 +17,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, shown, unknown_name
+from fmugym.signals import ordinary
 from fmugym.systems import Component, Connection, FMUSystem
 from fmugym.task.starting import structural_values
 
@@ -216,7 +217,7 @@ def _status(entry: Entry, path: Path) -> Any:
     """The state of a file that must exist."""
     try:
         return path.stat()
-    except (OSError, ValueError):  # there is none, or no file could have such a name
+    except ordinary(OSError, ValueError):  # there is none, or no file could have such a name
         near = sorted(file.name for file in path.parent.glob(f"*{path.suffix or '.fmu'}"))
         folder = shown(str(path.parent))
         raise entry.error(f"{unknown_name('FMU', path.name, near)} (looked in {folder})") from None

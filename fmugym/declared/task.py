@@ -13,13 +13,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_path, integer_of
+from fmugym.checks import check_mapping, check_path, integer_of, require_regular
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = ["KEYS", "VERSION", "Task"]
 
@@ -207,6 +208,7 @@ def _root(source: Source) -> Entry:
 
 def _read(path: Path) -> Source:
     try:
+        require_regular(path)
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is no TOML file: {_advice(path)}") from None
@@ -214,7 +216,7 @@ def _read(path: Path) -> Source:
         near = sorted(file.name for file in path.parent.glob("*.toml"))
         error = unknown_name("task file", path.name, near)
         raise ConfigError(f"{error} (looked in {shown(str(path.parent))})") from None
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     try:
         document = tomllib.loads(text)

@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import functools
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -23,6 +24,21 @@ from fmugym.systems.layout import Route, array_key
 from fmugym.systems.plan import Evaluation
 
 __all__ = ["Initialization"]
+
+
+_FRAMES: Final = 20
+"""Calls of Python by which a component is initialized inside of another, and some more."""
+
+
+@contextmanager
+def _nesting(parts: int) -> Iterator[None]:
+    """Let Python call itself as deep as so many components need."""
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(limit + _FRAMES * parts)
+    try:
+        yield
+    finally:
+        sys.setrecursionlimit(limit)
 
 
 class Initialization:
@@ -82,7 +98,8 @@ class Initialization:
         for index in self._restoring:
             with self._restoring_part(index):
                 self._reset_part(index)
-        self._begin_from(0, span, values)
+        with _nesting(len(self._parts.all)):
+            self._begin_from(0, span, values)
         self._parts.refresh()
 
     # Some components return to the kept start. The others begin with the inputs that are kept.
@@ -95,7 +112,7 @@ class Initialization:
     @property
     def others(self) -> list[int]:
         """The components that do not return to the kept start, by their numbers."""
-        restoring = self._restoring
+        restoring = set(self._restoring)
         return [index for index in range(len(self._parts.all)) if index not in restoring]
 
     def _begin_again(self, span: Span, values: list[Any]) -> bool:
@@ -145,10 +162,9 @@ class Initialization:
 
     def _set_links(self, index: int) -> None:
         part = self._parts.all[index]
-        for route in self._layout.routes:
-            if route.target_part == index:
-                first = route.target - part.layout.first_input
-                self._write_target(route, part.inputs.values[first : first + route.count].tolist())
+        for route in (self._layout.routes[i] for i in self._layout.routes_into(index)):
+            first = route.target - part.layout.first_input
+            self._write_target(route, part.inputs.values[first : first + route.count].tolist())
 
     def _keep_states(self) -> bool:
         """Save the states of those that restore; False if one cannot."""

@@ -27,6 +27,7 @@ from fmugym.fmi.solver import Solving
 from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Phase, Status, sane
 from fmugym.fmi.updates import Updates
+from fmugym.signals import ordinary
 
 __all__ = ["Instance", "SavedState"]
 
@@ -97,7 +98,7 @@ class Instance(ABC):
     def _try_to_instantiate(self) -> str:
         try:
             self._instantiate(self._log, self.hears_all)
-        except Exception as error:
+        except ordinary(Exception) as error:
             return f" ({error})"
         return ""
 

@@ -26,6 +26,7 @@ from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import Hearing
 from fmugym.fmi.ramps import RAMPED_CLASSES
 from fmugym.fmi.solver import Solving
+from fmugym.signals import ordinary
 
 __all__ = ["Library"]
 
@@ -129,7 +130,7 @@ class _Native:
             working_directory = _working_directory(self.fmu)
             try:
                 self.slave.__init__(**arguments)
-            except Exception as error:
+            except ordinary(Exception) as error:
                 raise FMULoadError(f"{self.fmu.path.name} cannot be loaded: {error}") from None
             finally:
                 os.chdir(working_directory)  # FMPy leaves it changed after a failed load
@@ -147,7 +148,7 @@ class _Native:
 def _working_directory(fmu: LoadableFMU) -> str:
     try:
         return os.getcwd()
-    except OSError as error:
+    except ordinary(OSError) as error:
         name = fmu.path.name
         raise FMULoadError(
             f"{name} cannot be loaded from this working directory: {error}"

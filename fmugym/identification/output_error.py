@@ -24,6 +24,7 @@ from fmugym.identification.results import Comparison
 from fmugym.identification.statistics import confidence_intervals, normal_distributions
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray
+from fmugym.signals import ordinary
 
 __all__ = ["FitResult", "fit_parameters"]
 
@@ -213,7 +214,7 @@ def _opened(fmu: Any) -> FMU:
     if not isinstance(fmu, FMU | StandsForFMU):
         try:
             fmu = check_text("fmu", os.fspath(fmu))
-        except Exception:  # a path may be any object
+        except ordinary(Exception):  # a path may be any object
             raise ConfigError(f"fmu must be a path or an FMU, not {shown(fmu)}") from None
     return FMU.of(fmu)
 

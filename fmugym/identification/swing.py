@@ -20,6 +20,7 @@ from fmugym.identification.statistics import (
 )
 from fmugym.identification.trajectory import float_array, is_repeat
 from fmugym.pool.base import FloatArray
+from fmugym.signals import ordinary
 
 __all__ = ["SwingFit", "fit_swing"]
 
@@ -208,7 +209,7 @@ def _rows(what: str, signals: Any) -> list[FloatArray]:
     try:
         several = len(signals) > 0 and all(np.ndim(row) == 1 for row in signals)
         rows = list(signals) if several else [signals]
-    except Exception:  # objects may do anything when numpy looks at them
+    except ordinary(Exception):  # objects may do anything when numpy looks at them
         raise ConfigError(f"{what} must be an array or a list, not {shown(signals)}") from None
     arrays = [float_array(what, row) for row in rows]
     for array in arrays:

@@ -26,6 +26,7 @@ from fmugym.lab.presets import Options
 from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
 from fmugym.pool import Pool, PoolSpec
+from fmugym.signals import ordinary
 from fmugym.task.starting import checked_value, start_variable
 from fmugym.trial.opening import make_pool
 
@@ -195,7 +196,7 @@ class Cell:
         for each in self._disturbances:
             try:
                 torque = each.apply(self.time, self.position, self.velocity, torque)
-            except Exception as error:  # a disturbance may be the user's own class
+            except ordinary(Exception) as error:  # a disturbance may be the user's own class
                 self.fault = f"a disturbance failed: {shown(error)}"
         return torque
 

@@ -12,6 +12,7 @@ from fmugym.lab.disturbance import Disturbance
 from fmugym.lab.errors import LabError
 from fmugym.lab.requests import Request
 from fmugym.lab.service import Service
+from fmugym.signals import ordinary
 
 __all__ = ["Client"]
 
@@ -217,6 +218,6 @@ def _start_position(position: Sequence[float] | float | None, state: Any) -> Any
         entries = list(state) if len(state) <= 4 else state
         half = len(entries) // 2
         has_velocities = len(entries) in (2, 4) and not any(entries[half:])
-    except Exception:  # objects may do anything when they are looked at
+    except ordinary(Exception):  # objects may do anything when they are looked at
         raise LabError(f"initial_state must be a list of numbers, not {shown(state)}") from None
     return entries[:half] if has_velocities else entries

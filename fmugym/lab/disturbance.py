@@ -15,6 +15,7 @@ from typing import Any, Final, Protocol
 
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = [
     "PRESETS",
@@ -208,7 +209,7 @@ def _vector(what: str, entries: Any) -> tuple[float, ...]:
         if isinstance(entries, str | bytes) or len(entries) > _MOST:
             raise TypeError
         values = tuple(entries)
-    except Exception:
+    except ordinary(Exception):
         raise ConfigError(f"{what} must be a list of numbers, not {shown(entries)}") from None
     return tuple(check_number(what, entry, -_LARGEST, _LARGEST) for entry in values)
 
@@ -245,7 +246,7 @@ def resolve(
             _check(disturbance, joints)
     except ConfigError:
         raise
-    except Exception as error:  # objects may do anything when they are looked at
+    except ordinary(Exception) as error:  # objects may do anything when they are looked at
         raise ConfigError(
             f"disturbances must be a preset, a disturbance or a list: {shown(disturbances)} "
             f"({type(error).__name__})"

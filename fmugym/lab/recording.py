@@ -16,6 +16,7 @@ import numpy.typing as npt
 from fmugym.extras import installation
 from fmugym.lab.errors import LabError
 from fmugym.lab.pictures import CellPicture
+from fmugym.signals import ordinary
 
 __all__ = ["FRAME_RATE", "Moment", "Recording", "check_can_record", "write_video"]
 
@@ -98,7 +99,7 @@ def write_video(recording: Recording, picture: CellPicture, folder: Path, name: 
     if importlib.util.find_spec(_FFMPEG):
         try:
             return _write_mp4(_frames(recording, picture), folder / f"{name}.mp4")
-        except (OSError, RuntimeError) as error:  # for example no FFmpeg for this platform
+        except ordinary(OSError, RuntimeError) as error:  # for example no FFmpeg for this platform
             logger.warning("no MP4 can be written (%s); writing a GIF", error)
     return _write_gif(_frames(recording, picture), folder / f"{name}.gif")
 

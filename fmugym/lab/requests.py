@@ -17,6 +17,7 @@ from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance, resolve
 from fmugym.lab.errors import LabError, as_lab_error
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
+from fmugym.signals import ordinary
 
 __all__ = ["Request", "cell_types_of", "check_range", "entries_of", "gains_of", "text_of"]
 
@@ -112,7 +113,7 @@ def cell_types_of(value: Any) -> list[CellType]:
     """
     try:
         kinds = list(value) if 0 < len(value) <= 1000 else []
-    except Exception:
+    except ordinary(Exception):
         kinds = []
     if not kinds or not all(isinstance(kind, CellType) for kind in kinds):
         raise LabError(f"a gym needs a list of cell types, not {shown(value)}")
@@ -158,7 +159,7 @@ def entries_of(value: Any, joints: int, name: str) -> list[float | None]:
         return [value]
     try:
         entries = np.ravel(np.array(value, dtype=object)).tolist()
-    except Exception:  # objects may do anything when numpy looks at them
+    except ordinary(Exception):  # objects may do anything when numpy looks at them
         raise LabError(f"{name} must be a number for each joint, not {shown(value)}") from None
     if len(entries) != joints:
         raise LabError(f"{name} has {len(entries)} entries, but the cell has {joints} joints")
@@ -183,7 +184,7 @@ def _finite(entry: Any, name: str) -> float:
         if isinstance(entry, str | bytes | bytearray):
             raise TypeError
         result = float(entry)
-    except Exception:
+    except ordinary(Exception):
         raise LabError(f"{name} must be a number for each joint, not {shown(entry)}") from None
     if not math.isfinite(result):
         raise LabError(f"{name} must be finite, not {shown(entry)}")

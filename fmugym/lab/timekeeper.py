@@ -9,6 +9,7 @@ from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
 from fmugym.lab.errors import LabError, as_lab_error
 from fmugym.pool.backend.clock import Clock
+from fmugym.signals import ordinary
 
 __all__ = ["Timekeeper"]
 
@@ -46,7 +47,7 @@ class Timekeeper:
         """
         try:
             now = self._clock.time()
-        except Exception as error:
+        except ordinary(Exception) as error:
             raise _failure(error) from error
         if type(now) is float and math.isfinite(now):  # the full check takes a while
             return now
@@ -61,7 +62,7 @@ class Timekeeper:
         """
         try:
             self._clock.sleep(max(0.0, seconds))
-        except Exception as error:
+        except ordinary(Exception) as error:
             raise _failure(error) from error
 
     def wait(self, seconds: float) -> None:

@@ -15,6 +15,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.lab.errors import LabError
 from fmugym.lab.pictures import CellPicture
 from fmugym.lab.recording import Recording, check_can_record, write_video
+from fmugym.signals import ordinary
 
 __all__ = ["VideoFolder"]
 
@@ -77,7 +78,7 @@ class VideoFolder:
 def _named_failure(path: Path | None) -> Iterator[None]:
     try:
         yield
-    except (OSError, ValueError) as error:  # ValueError: a character that paths cannot have
+    except ordinary(OSError, ValueError) as error:  # ValueError: a character that paths cannot have
         where = "the temporary folder" if path is None else shown(str(path))
         raise LabError(f"no video can be written to {where}: {shown(str(error))}") from error
 

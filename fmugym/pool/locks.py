@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from fmugym.signals import Ignoring
+
 if sys.platform == "win32":
     import msvcrt
 else:
@@ -41,7 +43,7 @@ def try_lock(handle: int) -> bool:
 
 def release(handle: int) -> None:
     """Unlock a file, also for forks of this process that still have it open, and close it."""
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         if sys.platform == "win32":
             os.lseek(handle, _BEYOND, os.SEEK_SET)
             msvcrt.locking(handle, msvcrt.LK_UNLCK, 1)

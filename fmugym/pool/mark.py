@@ -11,7 +11,6 @@ There are marks on Linux only, and only if the C extension was built.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import sys
@@ -25,6 +24,7 @@ from typing import Any, Final
 from fmugym.errors import printable
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.process.last_words import describe_exit
+from fmugym.signals import Ignoring, ordinary
 
 if sys.platform != "win32":
     import fcntl
@@ -80,7 +80,6 @@ class Mark:
             raise OSError("crashes are only noted on Linux, by the C extension")
         from fmugym import _native
 
-        folder.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=folder, prefix="new-")
         try:
             os.write(handle, bytes(_SIZE))  # a full disk must show here, not in the handler
@@ -89,7 +88,7 @@ class Mark:
             path = folder / f"{key}-{os.path.basename(name)}"
             os.replace(name, path)
         except BaseException:
-            with contextlib.suppress(OSError):
+            with Ignoring(OSError):
                 os.unlink(name)
             raise
         finally:
@@ -101,14 +100,14 @@ class Mark:
         """Make a mark where that is possible; say at DEBUG why it is not."""
         try:
             return cls(folder, key)
-        except OSError as error:
+        except ordinary(OSError) as error:
             logger.debug("a crash would not be noted: %s", error)
             return None
 
 
 def _remove(path: Path, owner: int) -> None:
     if os.getpid() == owner:  # not in a fork, which runs finalizers too
-        with contextlib.suppress(OSError):
+        with Ignoring(OSError):
             path.unlink()
 
 
@@ -143,14 +142,14 @@ class Remains:
     def remove(self) -> None:
         """Remove the files."""
         for path in self._paths:
-            with contextlib.suppress(OSError):
+            with Ignoring(OSError):
                 path.unlink()
 
 
 def remains_of(folder: Path, key: str) -> Remains:
     """Find the marks that ended processes have left for an FMU."""
     paths, crashes = [], []
-    with contextlib.suppress(OSError):
+    with Ignoring(OSError):
         for path in sorted(folder.glob(f"{key}-*")):
             for content in _content_of_ended(path):
                 paths.append(path)
@@ -160,7 +159,7 @@ def remains_of(folder: Path, key: str) -> Remains:
 
 def _content_of_ended(path: Path) -> Iterator[bytes]:
     """Read a file if no living process holds its lock."""
-    with contextlib.suppress(OSError), path.open("rb") as file:
+    with Ignoring(OSError), path.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # shared: others may be reading it, too
         yield file.read(_TEXT.stop)
 

@@ -62,6 +62,7 @@ from fmugym.pool.settings import (
 from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.pool.systems import system_settings
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge
+from fmugym.signals import ordinary
 
 __all__ = ["NativePool", "prepare"]
 
@@ -194,7 +195,7 @@ class NativePool(SavingPool):
                 callback=Receiver(log, description, self._first_index),
                 listener=self._listener,
             )
-        except OSError as error:
+        except ordinary(OSError) as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
 
     def _hosts(self, private_libraries: bool) -> Hosts:

@@ -23,6 +23,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.locks import exclusively
 from fmugym.pool.spec import PoolSpec
+from fmugym.signals import ordinary
 
 __all__ = ["Pacer", "last_initialization", "pace_file"]
 
@@ -50,7 +51,7 @@ def last_initialization(spec: PoolSpec) -> TimeArray:
     try:
         with exclusively(_mutex(spec)):
             return _opened(path)[:1]
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(
             f"config key 'max_initializations_per_second' needs the file {path}: {error}"
         ) from None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.errors import FMULoadError
+from fmugym.signals import ordinary
 
 __all__ = ["copy_libraries"]
 
@@ -33,7 +34,7 @@ def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
             copy = folder / "private" / str(index)
             shutil.copytree(folder / library.parent, copy)
             paths.append(copy / library.name)
-    except (OSError, shutil.Error) as error:
+    except ordinary(OSError, shutil.Error) as error:
         raise FMULoadError(
             f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
             f"failed: {error}; use fewer instances, or one process for each"

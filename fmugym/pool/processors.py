@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
+from fmugym.signals import ordinary
+
 __all__ = ["available_processors", "processor_quota"]
 
 
@@ -80,5 +82,5 @@ def _ratio(quota: str, period: str) -> float:
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
-    except OSError:
+    except ordinary(OSError):
         return ""

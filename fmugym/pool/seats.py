@@ -22,6 +22,7 @@ from typing import Final
 from fmugym.errors import ConfigError, LicenceError, printable
 from fmugym.pool.locks import exclusively, is_locked, release, try_lock
 from fmugym.pool.spec import PoolSpec
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["Claim", "Seats", "taking"]
 
@@ -44,7 +45,7 @@ class _Holder:
             with path.open(encoding="utf-8") as file:
                 data = json.loads(file.read(_LARGEST))
             return cls(int(data["process"]), str(data["program"]), int(data["seats"]), data["for"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except ordinary(OSError, ValueError, KeyError, TypeError):
             return cls(0, "", 1, "")
 
     def __str__(self) -> str:
@@ -92,7 +93,7 @@ if hasattr(os, "register_at_fork"):
 
 def _leave(path: Path, handle: int) -> None:
     release(handle)
-    with contextlib.suppress(OSError):  # somebody else may have removed it just now
+    with Ignoring(OSError):  # somebody else may have removed it just now
         path.unlink()
 
 
@@ -141,7 +142,7 @@ class Seats:
             with exclusively(Path(f"{self.place}.lock")):
                 taken = sum(holder.seats for holder in self._holders())
                 return self._claim(count, purpose) if taken + count <= self.most else None
-        except OSError as error:
+        except ordinary(OSError) as error:
             raise ConfigError(
                 f"{self.name}: config key 'max_instances' needs files in {self.place.parent}: "
                 f"{error}"
@@ -163,7 +164,7 @@ class Seats:
             if is_locked(path):
                 holders.append(holder)
             else:
-                with contextlib.suppress(OSError):
+                with Ignoring(OSError):
                     path.unlink()
         return holders
 

@@ -8,7 +8,6 @@ the FMU's own bytes. A file that is damaged, too large, or no regular file is no
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import logging
 import os
@@ -26,6 +25,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.attendant import AttendedPool, Attending, InitialState, Reset
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.spec import PoolSpec
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["MOST_BYTES", "InitialStates", "StateFiles", "essence"]
 
@@ -70,7 +70,7 @@ class StateFiles:
                     return None
                 state = self._parse(file.read(_LARGEST))
             os.utime(path)
-        except OSError:
+        except ordinary(OSError):
             return None
         return state
 
@@ -93,7 +93,7 @@ class StateFiles:
             self._prefix.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             _write(self.path(key), _MAGIC + hashlib.sha256(body).digest() + body)
             _remove_old(self._prefix.parent)
-        except OSError as error:
+        except ordinary(OSError) as error:
             logger.debug("no initial state is kept: %s", error)
 
 
@@ -105,7 +105,7 @@ def _write(path: Path, content: bytes) -> None:
             file.write(content)
         os.replace(name, path)
     except BaseException:
-        with contextlib.suppress(OSError):
+        with Ignoring(OSError):
             os.unlink(name)
         raise
 
@@ -114,14 +114,14 @@ def _remove_old(folder: Path) -> None:
     """Remove the states that were not used for longest until the others are few enough."""
     files = []
     for path in folder.iterdir():
-        with contextlib.suppress(OSError):  # another process has removed it
+        with Ignoring(OSError):  # another process has removed it
             status = path.lstat()
             files.append((status.st_mtime_ns, status.st_size, path))
     total = 0
     for _, size, path in sorted(files, reverse=True):
         total += size
         if total > MOST_BYTES:
-            with contextlib.suppress(OSError):
+            with Ignoring(OSError):
                 path.unlink()
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from fmugym.pool.extension import has_native_pool
+from fmugym.signals import ordinary
 
 if has_native_pool():
     from fmugym import _native
@@ -45,7 +46,7 @@ def _resolved(ufunc: Any, types: tuple[np.dtype[Any], ...]) -> Any:
     try:
         found, capsule = ufunc._resolve_dtypes_and_context(types)
         ufunc._get_strided_loop(capsule)
-    except Exception as error:  # the two methods are experimental
+    except ordinary(Exception) as error:  # the two methods are experimental
         raise LoopError(f"numpy hands out no loop of {ufunc.__name__}") from error
     if tuple(found) != types or not _native.is_free_loop(capsule):
         raise LoopError(f"numpy.{ufunc.__name__} needs the interpreter")

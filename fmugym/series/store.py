@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import math
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray
+from fmugym.signals import Ignoring, ordinary
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 
 __all__ = [
@@ -171,8 +171,8 @@ class CsvStore:
             self._writer.writerow([*cells, block.faults.get(number, "")])
         try:
             self._file.flush()
-        except OSError as error:  # a full disk: what is in the file stays
-            with contextlib.suppress(OSError):
+        except ordinary(OSError) as error:  # a full disk: what is in the file stays
+            with Ignoring(OSError):
                 self._file.close()
             error.filename = str(self._path)
             raise

@@ -16,7 +16,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.single.compare import require_equal
 from fmugym.single.left import HooksLeft, require_few
 from fmugym.single.trace import Kind, SingleTask, kind_of, trace_single
@@ -102,8 +102,7 @@ class Player:
             self._prepare(env, task)
             make_late(FMUEnv)
             self._task, self._known = task, len(vars(env))
-        except Exception as reason:  # hooks may raise anything
-            let_through(reason)
+        except ordinary(Exception) as reason:  # hooks may raise anything
             env._player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
             if self._required:
@@ -191,8 +190,7 @@ class Player:
         self.may_have_moved = False
         try:
             self._wanted[:] = self._left.inputs(env, action)
-        except Exception as error:  # hooks may raise anything
-            let_through(error)
+        except ordinary(Exception):  # hooks may raise anything
             self.may_have_moved = True
             return False
         self.may_have_moved = True

@@ -258,14 +258,16 @@ def _units(plan: SystemPlan, parts: Iterable[ModelDescription]) -> dict[str, Uni
     """All units; where two components disagree on a name, the first one wins."""
     units: dict[str, Unit] = {}
     for part in parts:
-        units = {**part.units, **units}
+        for name, unit in part.units.items():
+            units.setdefault(name, unit)
     return {**dict(plan.units), **units}
 
 
 def _variables(
     plan: SystemPlan, parts: Sequence[ModelDescription]
 ) -> tuple[dict[str, Variable], tuple[tuple[PartVariable, ...], ...]]:
-    driven = _driven(plan, parts)
+    numbers = _Numbers(plan)
+    driven = _driven(plan, parts, numbers)
     variables: dict[str, Variable] = {}
     ends: list[tuple[PartVariable, ...]] = []
     for index, (component, part) in enumerate(zip(plan.components, parts, strict=True)):
@@ -276,7 +278,8 @@ def _variables(
     elements = {one.name for v in variables.values() if v.shape for one in v.elements}
     for connector in plan.connectors:
         is_source = connector.causality != "output"
-        behind = [_behind(plan, parts, end, is_source) for end in connector.ends]
+        ends_in = [(numbers[end.component], end) for end in connector.ends]
+        behind = [_behind(plan, parts, part, end, is_source) for part, end in ends_in]
         variable = _connector_variable(connector, behind[0], len(ends))
         names = {connector.name, *(one.name for one in variable.elements)}
         for name in names & (variables.keys() | elements):
@@ -287,7 +290,20 @@ def _variables(
     return variables, tuple(ends)
 
 
-def _driven(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, set[str]]:
+class _Numbers(dict[str, int]):
+    """The numbers of components by name."""
+
+    def __init__(self, plan: SystemPlan) -> None:
+        super().__init__((one.name, number) for number, one in enumerate(plan.components))
+        self._plan = plan
+
+    def __missing__(self, name: str) -> int:
+        raise unknown_name(f"component of {self._plan.name}", name, self)
+
+
+def _driven(
+    plan: SystemPlan, parts: Sequence[ModelDescription], numbers: _Numbers
+) -> dict[str, set[str]]:
     """What links and connectors of the system set: it cannot be set by another name.
 
     Returns:
@@ -297,19 +313,11 @@ def _driven(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[str, se
     for connector in plan.connectors:
         if connector.causality != "output":
             ends += [(end.component, end.variable) for end in connector.ends]
-    names = [component.name for component in plan.components]
-    driven: dict[str, set[str]] = {name: set() for name in names}
+    driven: dict[str, set[str]] = {name: set() for name in numbers}
     for component, variable in ends:
-        part = parts[_number_of(plan, component)]
+        part = parts[numbers[component]]
         driven[component].update(one.name for one in part.variable(variable).elements)
     return driven
-
-
-def _number_of(plan: SystemPlan, component: str) -> int:
-    names = [one.name for one in plan.components]
-    if component not in names:
-        raise unknown_name(f"component of {plan.name}", component, names)
-    return names.index(component)
 
 
 def _usable(
@@ -368,10 +376,9 @@ def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -
 
 
 def _behind(
-    plan: SystemPlan, parts: Sequence[ModelDescription], end: End, is_target: bool
+    plan: SystemPlan, parts: Sequence[ModelDescription], part: int, end: End, is_target: bool
 ) -> PartVariable:
-    """The variable behind an end, which may be an array here."""
-    part = _number_of(plan, end.component)
+    """The variable of a component behind an end, which may be an array here."""
     starts = dict(plan.components[part].starts)
     found = parts[part].variable(end.variable)
     array = found if found.array is None else found.array

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -84,7 +85,7 @@ class SystemFMU(FMU):
         self.plan = plan
         if not plan.components:
             raise ConfigError(f"the system {plan.name!r} has no components")
-        self._opened = tuple(map(_open, plan.components))
+        self._opened = tuple(_opened(plan.components))
         description = describe_system(plan, [fmu.description for fmu in self._opened])
         Layout(description)  # which refuses names and roles that are wrong
         path = Path(plan.name) if plan.file is None else plan.file
@@ -181,6 +182,16 @@ class SystemFMU(FMU):
             raise
         self._folder = folder
         return folder
+
+
+def _opened(components: Iterable[Component]) -> Iterator[FMU]:
+    """The FMUs of components; a file is read once for all that use it in the same way."""
+    known: dict[Component, FMU] = {}
+    for component in components:
+        use = replace(component, name="", steps=1, starts=())
+        if use not in known:
+            known[use] = _open(component)
+        yield known[use]
 
 
 def _open(component: Component) -> FMU:

@@ -6,7 +6,7 @@ Both engines read this: ``fmugym.fmi.system`` directly, ``native/system.c`` by w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -165,9 +165,15 @@ class Layout:
         ins += [(e.part, e.variable) for v in inputs for e in self.ends_of(v)]
         outs: list[tuple[int, Variable]] = [self._source(link) for link in self.plan.links]
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
-        for index, part in enumerate(self.parts):
-            part.inputs = list(_different(_wholes(v for number, v in ins if number == index)))
-            part.outputs = list(_different(_wholes(v for number, v in outs if number == index)))
+        for part in self.parts:
+            part.inputs, part.outputs = [], []
+        for index, variable in ins:
+            self.parts[index].inputs.append(variable)
+        for index, variable in outs:
+            self.parts[index].outputs.append(variable)
+        for part in self.parts:
+            part.inputs = list(_different(_wholes(part.inputs)))
+            part.outputs = list(_different(_wholes(part.outputs)))
         self.number_of_inputs = self.number_of_outputs = 0
         for index, part in enumerate(self.parts):
             part.first_input, part.first_output = self.number_of_inputs, self.number_of_outputs
@@ -249,11 +255,19 @@ class Layout:
     def inner_routes(self, group: Group) -> tuple[int, ...]:
         """The routes within a group."""
         inside = set(self.parts_of(group))
-        return tuple(
-            index
-            for index, route in enumerate(self.routes)
-            if route.source_part in inside and route.target_part in inside
-        )
+        found = (index for part in inside for index in self.routes_into(part))
+        return tuple(sorted(i for i in found if self.routes[i].source_part in inside))
+
+    def routes_into(self, part: int) -> Sequence[int]:
+        """The routes that end at a component."""
+        return self._routes_by_target.get(part, ())
+
+    @cached_property
+    def _routes_by_target(self) -> dict[int, list[int]]:
+        found: dict[int, list[int]] = {}
+        for index, route in enumerate(self.routes):
+            found.setdefault(route.target_part, []).append(index)
+        return found
 
     def routes_of(self, evaluation: Evaluation) -> tuple[int, ...]:
         """The routes of an evaluation."""

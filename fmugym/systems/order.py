@@ -67,7 +67,8 @@ def order_of(
     loops, solved = (_linked_loops(graph, links) for graph in (in_step, solvable))
     teams = _teams(names, solved)
     order, late = _order_of_teams(names, teams, links, told)
-    groups = tuple(_group(team, solved, loop) for team in order)
+    looping = {link.source for one in solved for link in one}
+    groups = tuple(Group(team, None if looping.isdisjoint(team) else loop) for team in order)
     at_start = _chains(links, {name: one.at_start for name, one in told.items()})
     evaluable, unsolved_at_start = _cut(at_start, links, unable_at_start)
     evaluations = tuple(_evaluations(evaluable, loop))
@@ -139,7 +140,8 @@ def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, t
     for loop in loops:
         union = set().union(*(team[end] for link in loop for end in (link.source, link.target)))
         team.update(dict.fromkeys(union, union))
-    return {name: tuple(one for one in names if one in team[name]) for name in names}
+    places = {name: place for place, name in enumerate(names)}
+    return {name: tuple(sorted(team[name], key=places.__getitem__)) for name in names}
 
 
 def _order_of_teams(
@@ -155,9 +157,11 @@ def _order_of_teams(
     graph: dict[tuple[str, ...], list[tuple[str, ...]]] = {teams[name]: [] for name in names}
     for link in acting:
         graph[teams[link.target]].append(teams[link.source])
-    places = list(graph)
+    places = {team: place for place, team in enumerate(graph)}
     order = [
-        team for together in strong_components(graph) for team in sorted(together, key=places.index)
+        team
+        for together in strong_components(graph)
+        for team in sorted(together, key=places.__getitem__)
     ]
     rank = {team: place for place, team in enumerate(order)}
     late = (link for link in acting if rank[teams[link.source]] > rank[teams[link.target]])
@@ -168,12 +172,6 @@ def _acts(link: Link, told: Mapping[str, Feedthrough]) -> bool:
     """Whether the value of a link acts on an output of its target at once."""
     names = _told_names(link.input)
     return any(not inputs.isdisjoint(names) for inputs in told[link.target].in_step.values())
-
-
-def _group(team: tuple[str, ...], loops: Iterable[Sequence[Link]], loop: Loop) -> Group:
-    own = set(team)
-    in_loop = any(link.source in own for one in loops for link in one)
-    return Group(team, loop if in_loop else None)
 
 
 @dataclass
@@ -215,9 +213,10 @@ class _Search(Generic[Node]):
     def _leave(self, node: Node) -> None:
         if self.low[node] < self.index[node]:
             return
-        place = self.stack.index(node)
-        component = self.stack[place:]
-        del self.stack[place:]
+        component = [self.stack.pop()]
+        while component[-1] != node:
+            component.append(self.stack.pop())
+        component.reverse()
         self.on_stack.difference_update(component)
         self.found.append(component)
 

@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.task.spaces import to_input_types
 
 __all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "is_misfit", "no_action"]
@@ -59,8 +59,7 @@ def is_element(action: Any, elements: Collection[int]) -> bool:
         return action in elements
     try:
         return operator.index(action) in elements
-    except Exception as error:  # a TypeError, or whatever the object's method raises
-        let_through(error)
+    except ordinary(Exception):  # a TypeError, or whatever the object's method raises
         return False
 
 
@@ -74,8 +73,7 @@ def has_nan(action: Any) -> bool:
         return False
     try:
         return any(map(has_nan, action.values() if isinstance(action, Mapping) else action))
-    except Exception as error:  # a list that contains itself, or an object whose methods fail
-        let_through(error)
+    except ordinary(Exception):  # a list that contains itself, or an object whose methods fail
         return False
 
 
@@ -91,8 +89,7 @@ def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
             if space.contains(action):
                 return False
         is_numeric = np.asarray(action).dtype.kind in "biuf"
-    except Exception as failure:  # an object whose methods fail
-        let_through(failure)
+    except ordinary(Exception):  # an object whose methods fail
         return True
     return not is_numeric or isinstance(error, _OF_MISFITS)
 
@@ -126,8 +123,7 @@ def flat_inputs(
     try:
         raw = np.asarray(values)
         flat = raw.astype(np.float64, casting="unsafe" if raw.dtype == object else "same_kind")
-    except Exception as error:  # not numbers, too large, or objects whose methods fail
-        let_through(error)
+    except ordinary(Exception):  # not numbers, too large, or objects whose methods fail
         raise ConfigError(f"{source(values)} does not make numbers") from None
     flat = flat.ravel()
     if flat.size != len(variables):

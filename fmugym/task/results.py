@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, shown
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 
 __all__ = [
     "FLOAT32_LIMIT",
@@ -152,8 +152,7 @@ def _of_dict(parts: Mapping[str, Finiteness]) -> Finiteness:
     def is_finite(observation: Any) -> bool:
         try:
             fits = observation.keys() == parts.keys()
-        except Exception as error:  # not a mapping, or its methods fail
-            let_through(error)
+        except ordinary(Exception):  # not a mapping, or its methods fail
             fits = False
         if not fits:
             raise ConfigError(
@@ -208,8 +207,7 @@ def _numbers(observation: Any, kinds: str) -> np.ndarray[Any, Any]:
     given(observation, _OBSERVE)
     try:
         array = np.asarray(observation)
-    except Exception as error:  # ragged lists, or objects whose methods fail
-        let_through(error)
+    except ordinary(Exception):  # ragged lists, or objects whose methods fail
         array = np.asarray(None)
     if array.dtype.kind not in kinds:
         raise ConfigError(f"{_OBSERVE} returned {shown(observation)}, expected an array of numbers")

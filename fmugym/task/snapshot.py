@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
+from fmugym.signals import ordinary
 from fmugym.trial.candidate import Candidate, content_of
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ __all__ = [
     "taken",
 ]
 
-_VERSION: Final = 2
+_VERSION: Final = 3
 """Of pickles; it changes with their content."""
 
 _OPERATION: Final = {
@@ -100,10 +101,10 @@ class Snapshot:
     def _places(self, which: Any) -> IndexArray:
         try:
             places = np.atleast_1d(np.arange(len(self))[which])
-        except (IndexError, TypeError, ValueError):
-            raise ConfigError(
-                f"{shown(which)} are no environments of a snapshot of {len(self)}"
-            ) from None
+        except ordinary(Exception):  # numpy refuses it, or the caller's object fails
+            places = np.empty((0, 0))
+        if places.ndim > 1:
+            raise ConfigError(f"{shown(which)} are no environments of a snapshot of {len(self)}")
         return places.astype(np.int64)
 
     def __iter__(self) -> Iterator[Snapshot]:
@@ -129,7 +130,8 @@ class Snapshot:
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (_VERSION, self._scope, self._columns, self._bundle)
+        content = pickle.dumps((self._scope, self._columns, self._bundle))
+        return _unpickled, (_VERSION, content, hashlib.sha256(content).digest())
 
     # For the environments.
 
@@ -148,12 +150,15 @@ class Snapshot:
         return self._bundle
 
 
-def _unpickled(version: int, scope: Scope, columns: Columns, bundle: Bundle) -> Snapshot:
+def _unpickled(version: int, *parts: Any) -> Snapshot:
     if version != _VERSION:
         raise SimulationError(
             f"the snapshot was pickled in version {version} of the format, expected {_VERSION}"
         )
-    return Snapshot(scope, columns, bundle)
+    content, digest = parts
+    if hashlib.sha256(content).digest() != digest:
+        raise SimulationError("the snapshot is damaged: its pickle has changed")
+    return Snapshot(*pickle.loads(content))
 
 
 def checked_snapshot(snapshot: Any, length: int | None = None) -> Snapshot:

@@ -10,6 +10,7 @@ import numpy as np
 
 from fmugym.archive.texts import text_of, texts_of
 from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
+from fmugym.signals import ordinary
 
 __all__ = [
     "EpisodeVariables",
@@ -76,7 +77,7 @@ class NamedValues(Mapping[str, Any]):
     def __getitem__(self, name: str) -> Any:
         try:
             index = self._index[name]
-        except Exception:  # a KeyError, or an object that cannot be a key
+        except ordinary(Exception):  # a KeyError, or an object that cannot be a key
             return self._array(name)
         return self._get_values()[index]
 
@@ -205,7 +206,7 @@ class EpisodeVariables(dict[str, Any]):
         """Write several variables, as in a dict. If a name is unknown, nothing is written."""
         try:
             new = dict(*args, **kwargs)
-        except Exception:  # not a dict, or a dict whose methods fail
+        except ordinary(Exception):  # not a dict, or a dict whose methods fail
             raise ConfigError(f"{shown(args)} are no values by name") from None
         for name in new:
             if name not in self:

@@ -20,8 +20,8 @@ from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import imported
-from fmugym.search.agent import AGENT, Agent
-from fmugym.tools.simulation import Player, Policy, policy_of_controller
+from fmugym.signals import ordinary
+from fmugym.tools.simulation import Player, Policy
 
 __all__ = [
     "FACTS",
@@ -169,7 +169,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
         return kind.load(file, device="cpu"), _normalization_in(file.parent)
     except ConfigError:
         raise
-    except Exception as error:  # a damaged file may raise anything
+    except ordinary(Exception) as error:  # a damaged file may raise anything
         raise ConfigError(
             f"the agent in {shown(str(path))} cannot be read: {reason(error)}"
         ) from error
@@ -179,7 +179,7 @@ def _algorithm_in(folder: Path) -> str:
     try:
         facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
         return str(facts["algorithm"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
 
 

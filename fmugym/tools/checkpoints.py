@@ -20,6 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import ConfigError, FMUGymError, reason, shown
+from fmugym.signals import ordinary
 from fmugym.tools.agents import algorithm_of
 
 __all__ = ["CHECKPOINT", "latest_checkpoint", "load_checkpoint", "save_checkpoint"]
@@ -98,7 +99,7 @@ def latest_checkpoint(folder: Path) -> tuple[Path, int]:
     try:
         facts = json.loads((folder / CHECKPOINT).read_text(encoding="utf-8"))
         return folder / str(facts["folder"]), int(facts["steps"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
 
 
@@ -123,7 +124,7 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
         return _loaded(place, algorithm, venv)
     except FMUGymError:
         raise
-    except Exception as error:  # a damaged file may raise anything
+    except ordinary(Exception) as error:  # a damaged file may raise anything
         raise ConfigError(
             f"the checkpoint in {shown(str(folder))} cannot be resumed: {reason(error)}"
         ) from error

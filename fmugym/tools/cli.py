@@ -79,6 +79,7 @@ from importlib.metadata import version
 from typing import Any, Final, NoReturn
 
 from fmugym.errors import FMUGymError, unknown_name
+from fmugym.signals import ordinary
 from fmugym.tools.datasets import add_dataset
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
@@ -145,7 +146,7 @@ def _code_of(arguments: argparse.Namespace) -> int:
         return exit_code(error)
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         drop_output()
-    except (FMUGymError, OSError) as error:
+    except ordinary(FMUGymError, OSError) as error:
         note(_told(error), "error")
         return 1
     return 0

@@ -24,6 +24,7 @@ from fmugym.archive.description import INTERFACES
 from fmugym.archive.fmu import FMU
 from fmugym.archive.safe_zip import SafeZip
 from fmugym.errors import ConfigError, FMULoadError, reason
+from fmugym.signals import ordinary
 from fmugym.tools.compilers import find_compiler
 
 __all__ = ["compile_fmu"]
@@ -265,7 +266,7 @@ def _write(archive: SafeZip, output: Path, libraries: Mapping[str, bytes]) -> No
                 copy.writestr(place, content)
     except FileExistsError:
         raise ConfigError(f"{output} exists already") from None
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(f"{output} cannot be written: {reason(error)}") from None
     except BaseException:
         output.unlink(missing_ok=True)

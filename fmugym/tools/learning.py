@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
+from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
 from fmugym.tools.checkpoints import CHECKPOINT
 from fmugym.tools.diary import Diary
@@ -205,7 +206,7 @@ def _learn(arguments: argparse.Namespace) -> None:
             _tell_what_is_kept(plan.folder, CHECKPOINT)
             write_outcome(plan, title_of(arguments.task), tell)
             raise
-        except OSError as error:  # libraries that write a model do not say where
+        except ordinary(OSError) as error:  # libraries that write a model do not say where
             error.filename = error.filename or str(plan.folder)
             raise
     write_outcome(plan, title_of(arguments.task), tell)

@@ -21,6 +21,7 @@ from fmugym.archive.dependencies import libraries_of
 from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError
+from fmugym.signals import ordinary
 from fmugym.tools.compilers import find_compiler
 
 __all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
@@ -77,7 +78,7 @@ def build_stand_in(fmu: FMU, folder: Path) -> tuple[StandIn, ...]:
             raise ConfigError(f"{path} exists already")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise ConfigError(f"{folder} cannot hold libraries: {error}") from None
     return tuple(_build(fmu, path) for path in paths)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import io
 import os
@@ -11,6 +10,8 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any, BinaryIO
+
+from fmugym.signals import Ignoring
 
 __all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus", "named"]
 
@@ -28,7 +29,7 @@ def keep_output_from_fmus(*, shown: bool) -> BinaryIO | None:
     Returns:
         The file, which has no name, so that nothing is left of it after any end of the process.
     """
-    with contextlib.suppress(OSError, AttributeError, io.UnsupportedOperation):
+    with Ignoring(OSError, AttributeError, io.UnsupportedOperation):
         if (sys.stdout.fileno(), sys.stderr.fileno()) != (1, 2):
             return None
         sys.stdout = _apart(sys.stdout)
@@ -57,7 +58,7 @@ def _apart(stream: Any) -> Any:
 
 def named(printed: BinaryIO) -> Path | None:
     """Give what FMUs have printed a file with a name; None if they have printed nothing."""
-    with contextlib.suppress(OSError, AttributeError, TypeError):  # Windows has no such library
+    with Ignoring(OSError, AttributeError, TypeError):  # Windows has no such library
         ctypes.CDLL(None).fflush(None)
     if not printed.seek(0, os.SEEK_END):
         return None

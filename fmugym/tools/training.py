@@ -20,6 +20,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.signals import ordinary
 from fmugym.tools.agents import (
     FACTS,
     agent_player,
@@ -217,7 +218,7 @@ def facts_of(folder: Path) -> dict[str, Any]:
     try:
         facts: dict[str, Any] = json.loads((folder / TRAINING).read_text(encoding="utf-8"))
         return {"steps": facts["steps"], **facts}
-    except (OSError, ValueError, KeyError, TypeError):
+    except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
 
 

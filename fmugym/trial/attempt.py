@@ -24,6 +24,7 @@ from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.pool.progress import INITIALIZATION
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
+from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 
 __all__ = ["Outcome", "Request", "Stage", "patience", "run"]
@@ -131,7 +132,7 @@ def run(request: Request) -> Outcome:
         (folder / "request").write_bytes(pickle.dumps(request))
         try:
             end, last_lines = _watch(folder, request)
-        except OSError as error:
+        except ordinary(OSError) as error:
             end, last_lines = f"found no Python to start: {error}", []
         return Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
 
@@ -139,14 +140,14 @@ def run(request: Request) -> Outcome:
 def _stage(folder: Path) -> str | None:
     try:
         return (folder / "stage").read_text()
-    except OSError:
+    except ordinary(OSError):
         return None
 
 
 def _sample(folder: Path) -> bytes | None:
     try:
         return (folder / "sample").read_bytes()
-    except OSError:
+    except ordinary(OSError):
         return None
 
 
@@ -154,7 +155,7 @@ def _answer(folder: Path) -> dict[str, Any]:
     """Read the worker's answer so far."""
     try:
         return dict(json.loads((folder / "answer").read_text()))
-    except (OSError, ValueError, TypeError):
+    except ordinary(OSError, ValueError, TypeError):
         return {}
 
 
@@ -219,7 +220,7 @@ class _Watch:
         return f"did not come back from {self._call} within {limit:g} s (ten times probe_timeout)"
 
     def _notice_call(self) -> None:
-        with contextlib.suppress(OSError):
+        with Ignoring(OSError):
             change = self._file.stat().st_mtime_ns
             if change != self._change:
                 self._change, self._begin = change, time.monotonic()
@@ -253,7 +254,7 @@ def _memory_checker() -> str | None:
     """The library that lets glibc end a process that wrote beyond an allocated block."""
     try:
         maps = Path("/proc/self/maps").read_text()
-    except OSError:
+    except ordinary(OSError):
         return None
     found = re.search(r"(/\S*)/libc\.so\.6$", maps, re.MULTILINE)
     checker = Path(found[1]) / "libc_malloc_debug.so.0" if found else None

@@ -5,7 +5,6 @@ If the folder cannot be read or written, nothing is cached, and no error is rais
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import stat
@@ -14,8 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from fmugym.caching import cache_folder
+from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["cache_folder", "recall", "remember"]
+__all__ = ["recall", "remember"]
 
 logger = logging.getLogger(__name__)
 
@@ -39,17 +39,15 @@ def recall(key: str) -> str | None:
             if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
                 return None
             return file.read(_LARGEST).decode()
-    except (OSError, RuntimeError, ValueError):
+    except ordinary(OSError, ValueError):
         return None
 
 
 def remember(key: str, text: str) -> None:
     """Cache a text under a key, which is a file name."""
     try:
-        folder = cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
-        _replace(folder / key, text)
-    except (OSError, RuntimeError) as error:
+        _replace(cache_folder() / key, text)
+    except ordinary(OSError) as error:
         logger.debug("nothing is remembered: %s", error)
 
 
@@ -61,6 +59,6 @@ def _replace(path: Path, text: str) -> None:
             file.write(text)
         os.replace(name, path)
     except BaseException:
-        with contextlib.suppress(OSError):
+        with Ignoring(OSError):
             os.unlink(name)
         raise

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from fmugym.archive.fmu import FMU
+from fmugym.caching import cache_folder, lasting_folder
 from fmugym.errors import ConfigError
 from fmugym.pool.bundle import SaveMethod
-from fmugym.trial.cache import cache_folder, recall, remember
+from fmugym.signals import ordinary
+from fmugym.trial.cache import recall, remember
 from fmugym.trial.candidate import Candidate, content_key, content_of, verdict_key
 from fmugym.trial.verdict import Verdict
 
@@ -37,8 +37,8 @@ def known_verdict(fmu: FMU) -> Verdict | None:
 def state_files(fmu: FMU) -> str:
     """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
-        return str(cache_folder() / "states" / content_key(Candidate.of(fmu)))
-    except RuntimeError:  # there is no folder for caches
+        return str(cache_folder("states") / content_key(Candidate.of(fmu)))
+    except ordinary(OSError):  # there is no folder for caches
         return ""
 
 
@@ -46,9 +46,9 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
     """The folder and the key of an FMU's marks; see ``fmugym.pool.mark``.
 
     Raises:
-        RuntimeError: If there is no folder for caches.
+        OSError: If there is no folder for caches.
     """
-    return cache_folder() / "marks", content_key(candidate)
+    return cache_folder("marks"), content_key(candidate)
 
 
 def locks_of(candidate: Candidate) -> str:
@@ -62,17 +62,10 @@ def locks_of(candidate: Candidate) -> str:
     Raises:
         ConfigError: If there is no folder for them.
     """
-    name = f"fmugym-{getattr(os, 'getuid', int)()}"
     try:
-        folder = cache_folder() / "licences"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError):
-        folder = Path(tempfile.gettempdir()) / name / "licences"
-    try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        raise ConfigError(f"the limits of a licence need the folder {folder}: {error}") from None
-    return str(folder / content_of(candidate))
+        return str(lasting_folder("licences") / content_of(candidate))
+    except ordinary(OSError) as error:
+        raise ConfigError(f"the limits of a licence need a folder: {error}") from None
 
 
 def is_known_to_harm(candidate: Candidate) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 from collections.abc import Callable
@@ -33,6 +32,7 @@ from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
+from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     is_known_to_harm,
@@ -218,7 +218,7 @@ def _note_crash(
     candidate = Candidate.of(fmu)
     if not candidate.exempt and not verdict.isolate:
         log.info("%s: %s, so later environments run in worker processes", fmu.path.name, how)
-        with contextlib.suppress(OSError):  # the file of the FMU may be gone by now
+        with Ignoring(OSError):  # the file of the FMU may be gone by now
             note_harm(candidate, _tried(spec), starts, verdict, f"in training, {how}")
 
 
@@ -325,7 +325,7 @@ def _verdict(
 def _remains(candidate: Candidate) -> Remains:
     try:
         return remains_of(*marks_of(candidate))
-    except RuntimeError:  # there is no folder for caches
+    except ordinary(OSError):  # there is no folder for caches
         return Remains([], [])
 
 
@@ -350,7 +350,7 @@ def _mark(candidate: Candidate) -> Mark | None:
         return None
     try:
         return Mark.attempt(*marks_of(candidate))
-    except RuntimeError:
+    except ordinary(OSError):
         return None
 
 

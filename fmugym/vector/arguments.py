@@ -19,7 +19,7 @@ from fmugym.checks import (
 )
 from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
 from fmugym.pool.base import MaskArray
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 
 __all__ = [
     "ARGUMENTS",
@@ -76,7 +76,7 @@ def checked_num_envs(value: Any) -> int:
 def _bytes_of_memory() -> int:
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):  # Windows
+    except ordinary(AttributeError, ValueError, OSError):  # Windows
         return 2**40
 
 
@@ -185,8 +185,7 @@ def _elements(values: Any) -> list[Any] | None:
         return None
     try:
         return list(values)
-    except Exception as error:  # an array without a dimension, or the user's own __iter__
-        let_through(error)
+    except ordinary(Exception):  # an array without a dimension, or the user's own __iter__
         return None
 
 
@@ -220,8 +219,7 @@ def checked_mask(mask: Any, num_envs: int) -> MaskArray:
     try:
         array = np.array(mask)
         fits = array.shape == (num_envs,) and array.dtype == np.bool_ and bool(array.any())
-    except Exception as error:  # lists that make no array, and the user's own __array__
-        let_through(error)
+    except ordinary(Exception):  # lists that make no array, and the user's own __array__
         fits = False
     if not fits:
         raise ConfigError(

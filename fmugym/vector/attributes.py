@@ -9,6 +9,7 @@ import numpy as np
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.signals import ordinary
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import checked_name, require_settable
@@ -54,7 +55,7 @@ class Attributes:
             return [values] * count
         try:
             each = list(values)
-        except Exception:  # a list of the caller's whose methods fail
+        except ordinary(Exception):  # a list of the caller's whose methods fail
             raise ConfigError(f"{shown(values)} are no values of {shown(name)}") from None
         if len(each) != count:
             raise ConfigError(f"there are {len(each)} values of {shown(name)}, expected {count}")

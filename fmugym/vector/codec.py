@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 
 __all__ = ["coded", "gathered", "handed_out", "with_masks", "within"]
 
@@ -91,8 +91,7 @@ def _gathered_values(name: str, indices: list[int], own: list[Any], count: int) 
     for index, value in zip(indices, own, strict=True):
         try:
             values[index] = value
-        except Exception as error:  # users' infos may raise anything
-            let_through(error)
+        except ordinary(Exception):  # users' infos may raise anything
             raise _misfit(name, index, value) from None
     return values
 

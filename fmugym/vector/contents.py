@@ -6,7 +6,7 @@ import math
 import random
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import PurePath
 from types import CellType, FunctionType, MappingProxyType, MethodType, ModuleType
@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.signals import Ignoring, ordinary
 from fmugym.task.readings import READINGS
 from fmugym.vector.hooks.tables import functions_of, places_of
 
@@ -88,7 +89,7 @@ class Contents:
             if id(value) in seen:
                 continue
             seen.add(id(value))
-            with suppress(Exception):  # users' objects may fail in any way
+            with Ignoring(Exception):  # users' objects may fail in any way
                 kind = _kind_of(value)
                 if kind is None or _size_of(value) + len(self._kept) > largest:
                     continue
@@ -125,7 +126,7 @@ class Contents:
     def restore(self) -> None:
         """Undo all changes."""
         for one in filter(_has_changed, self._kept):
-            with suppress(Exception):  # as above
+            with Ignoring(Exception):  # as above
                 one.kind.restore(one.value, one.contents)
         for place, name, value in self._outside:
             if place[name] is not value:
@@ -191,7 +192,7 @@ def borrowed(env: FMUEnv, outside: bool = False) -> Iterator[Contents]:
 def _has_changed(kept: _Kept) -> bool:
     try:
         return differs(kept.contents, kept.kind.copy(kept.value))
-    except Exception:  # users' objects may fail in any way
+    except ordinary(Exception):  # users' objects may fail in any way
         return False
 
 
@@ -301,7 +302,7 @@ def differs(before: Any, after: Any) -> bool:
         return True
     try:
         return _differ(before, after)
-    except Exception:  # users' values may raise anything when compared
+    except ordinary(Exception):  # users' values may raise anything when compared
         return False
 
 

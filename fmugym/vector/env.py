@@ -16,6 +16,7 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 from fmugym.checks import check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray, Pool
+from fmugym.signals import ordinary
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.arguments import (
@@ -554,7 +555,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         construction: Any = type(self), self._arguments, self.spec
         try:
             return _unpickled, (pickle.dumps(CloudpickleWrapper(construction)),)
-        except Exception as error:  # the arguments are the user's
+        except ordinary(Exception) as error:  # the arguments are the user's
             raise ConfigError(
                 f"this {type(self).__name__} cannot be pickled: {error}. Give it a make_env that "
                 "can: a class, a function of a module, or a functools.partial of one of them"

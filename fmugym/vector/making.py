@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
@@ -11,6 +10,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import PoolSpec
+from fmugym.signals import Ignoring
 from fmugym.task.opening import deferred_pools, env_numbers
 
 __all__ = ["EnvMaker", "make_with_pool"]
@@ -56,7 +56,7 @@ class EnvMaker:
         with deferred_pools(self._fmus):
             env = self._make_env()
         if not isinstance(env, FMUEnv):
-            with contextlib.suppress(Exception):  # it is the user's
+            with Ignoring(Exception):  # it is the user's
                 env.close()
             raise ConfigError(
                 f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"

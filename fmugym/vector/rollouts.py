@@ -14,7 +14,7 @@ from fmugym.checks import check_mapping
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.task.starting import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
@@ -194,8 +194,7 @@ def _checked_array(space: Any, actions: Any) -> npt.NDArray[Any]:
         raise ConfigError(f"the actions of {space} make no array; give rollout a policy instead")
     try:
         array = np.asarray(actions)
-    except Exception as error:  # lists that make no array, and the user's own __array__
-        let_through(error)
+    except ordinary(Exception):  # lists that make no array, and the user's own __array__
         array = np.empty(0)
     if array.ndim < 2 or array.shape[2:] != space.shape or not array.size:
         raise ConfigError(

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array
 
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
-from fmugym.signals import is_of_signal_handler
+from fmugym.signals import ordinary
 
 __all__ = ["PoolStack", "Stack", "make_stack"]
 
@@ -97,8 +97,8 @@ class ArrayStack:
                     return array
             stacked: Any = concatenate(self._space, [observation], _empty(self._space, 1))
             return stacked[0]
-        except Exception as error:  # users' observations may raise anything
-            raise _misfit(error, observation, self._space) from None
+        except ordinary(Exception):  # users' observations may raise anything
+            raise _misfit(observation, self._space) from None
 
     def row(self, index: int) -> npt.NDArray[Any]:
         """A copy of the observation of one environment."""
@@ -136,8 +136,8 @@ class DictStack:
         for name, part in self._parts.items():
             try:
                 value = observation[name]
-            except Exception as error:  # users' observations may raise anything
-                raise _misfit(error, observation, self._space) from None
+            except ordinary(Exception):  # users' observations may raise anything
+                raise _misfit(observation, self._space) from None
             part.put(index, value)
 
     def row(self, index: int) -> dict[str, Any]:
@@ -181,8 +181,8 @@ class ItemStack:
         """
         try:
             return concatenate(self._space, self._items, _empty(self._space, len(self._items)))
-        except Exception as error:  # users' observations may raise anything
-            raise _misfit(error, self._items[0], self._space) from None
+        except ordinary(Exception):  # users' observations may raise anything
+            raise _misfit(self._items[0], self._space) from None
 
     def finite(self) -> MaskArray:
         """See ``ArrayStack.finite``; ``take`` has left that to others."""
@@ -209,10 +209,7 @@ def _finite_rows(array: npt.NDArray[Any]) -> MaskArray:
     return finite
 
 
-def _misfit(error: Exception, observation: Any, space: spaces.Space[Any]) -> Exception:
-    """What to raise for an error in the conversion of an observation."""
-    if is_of_signal_handler(error):
-        return error
+def _misfit(observation: Any, space: spaces.Space[Any]) -> ConfigError:
     return ConfigError(
         f"_get_observation returned {shown(observation)}, which is no element of {space}"
     )

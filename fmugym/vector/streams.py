@@ -15,6 +15,7 @@ import numpy.typing as npt
 from fmugym.distributions import Recipe
 from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
+from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.generators import row_of, state_of
 
@@ -186,6 +187,6 @@ def _standard_normal() -> int:
     try:
         library = ctypes.CDLL(np.random._generator.__file__)
         function = library.random_standard_normal
-    except (AttributeError, OSError):  # the system does not export it
+    except ordinary(AttributeError, OSError):  # the system does not export it
         return 0
     return ctypes.cast(function, ctypes.c_void_p).value or 0

@@ -14,6 +14,7 @@ from urllib.parse import quote
 import fmpy
 
 from fmugym.errors import FMULoadError
+from fmugym.signals import ordinary
 from fmugym.wine.program import is_buildable, known_program
 
 __all__ = [
@@ -75,7 +76,7 @@ def wine_version(loader: Path) -> str:
         done = subprocess.run(
             [str(loader), "--version"], capture_output=True, text=True, timeout=60, check=True
         )
-    except (OSError, subprocess.SubprocessError) as error:
+    except ordinary(OSError, subprocess.SubprocessError) as error:
         raise FMULoadError(f"Wine does not run: {error}") from None
     return done.stdout.strip()
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fmugym.errors import FMULoadError, printable
+from fmugym.signals import ordinary
 from fmugym.wine.loader import find_wine, obstacle_to_wine, wine_version
 from fmugym.wine.program import alone, wine_folder, worker_program
 
@@ -126,7 +127,7 @@ def _make(loader: Path, prefix: Path) -> None:
         _link_libraries(prefix)
         (prefix / ".update-timestamp").write_text("disable\n")  # or else Wine writes to the links
         (prefix / _READY).touch()
-    except (OSError, subprocess.SubprocessError) as error:
+    except ordinary(OSError, subprocess.SubprocessError) as error:
         said = log.read_text(errors="replace").strip()[-500:] if log.exists() else ""
         raise FMULoadError(printable(f"Wine cannot make its folder: {error} {said}")) from None
 

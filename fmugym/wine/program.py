@@ -21,6 +21,7 @@ from typing import Final
 
 from fmugym.caching import cache_folder
 from fmugym.errors import FMULoadError, printable
+from fmugym.signals import ordinary
 
 if sys.platform != "win32":
     import fcntl
@@ -50,11 +51,9 @@ def wine_folder() -> Path:
         FMULoadError: If there can be none.
     """
     try:
-        folder = cache_folder() / "wine"
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError) as error:
+        return cache_folder("wine").absolute()
+    except ordinary(OSError) as error:
         raise FMULoadError(f"Wine needs a folder in the cache folder: {error}") from None
-    return folder.absolute()
 
 
 @contextlib.contextmanager
@@ -149,7 +148,7 @@ def _compile(target: Path) -> None:
         raise _build_failed(error.output.decode(errors="replace").strip()[-2000:]) from None
     except subprocess.TimeoutExpired:
         raise _build_failed(f"the compiler took longer than {_LONGEST_BUILD:g} s") from None
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise _build_failed(str(error)) from None
 
 

@@ -25,6 +25,7 @@ from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import Column, CountedPool, no_counts, note
 from fmugym.pool.spec import is_start_time
+from fmugym.signals import ordinary
 
 __all__ = ["Backend", "BackendPool"]
 
@@ -129,7 +130,7 @@ class BackendPool(CountedPool):
     def _start(self, starts: Mapping[int, Mapping[str, Any]]) -> None:
         try:
             self._open()
-        except Exception as error:
+        except ordinary(Exception) as error:
             for index in starts:
                 self._take(index, Outcome(Status.ERROR, None, describe_error(error)))
         else:
@@ -285,7 +286,7 @@ def _backends(backend: Any, count: int) -> list[Backend]:
     several = isinstance(backend, Iterable) and not has_method(backend, "step")
     try:
         backends = list(backend) if several else [backend]
-    except Exception:  # an iterable whose own methods fail
+    except ordinary(Exception):  # an iterable whose own methods fail
         backends = [backend]
     for one in backends:
         for method in ("reset", "step", "stop"):
@@ -321,9 +322,9 @@ def _stop(
     try:
         ask_all(calls, clock, _LONGEST_STOP)
         close()
-    except TimeoutError:
+    except ordinary(TimeoutError):
         logger.warning("a backend has not come to its stop within %g s", _LONGEST_STOP)
-    except Exception as error:
+    except ordinary(Exception) as error:
         logger.warning("closing what the backends share failed: %s", error)
 
 

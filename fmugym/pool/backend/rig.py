@@ -14,6 +14,7 @@ from fmugym.archive.texts import number_of
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
+from fmugym.signals import ordinary
 
 __all__ = ["Backend", "Outcome", "Outputs", "Rig", "describe_error"]
 
@@ -134,7 +135,7 @@ class Rig:
         if self._is_running and self._hold is not None:
             try:
                 self._hold()
-            except Exception as error:
+            except ordinary(Exception) as error:
                 logger.debug("%s.hold failed: %s", type(self._backend).__name__, error)
 
     def stop(self) -> None:
@@ -143,7 +144,7 @@ class Rig:
             self._is_running = False
             try:
                 self._backend.stop()
-            except Exception as error:
+            except ordinary(Exception) as error:
                 logger.warning("%s.stop failed: %s", type(self._backend).__name__, error)
 
     def _try(self, method: str, call: Callable[[], Any]) -> Outcome:
@@ -152,7 +153,7 @@ class Rig:
             outputs, status = _pair(call())
             outcome = self._judged(outputs, status)
             measured = float(getattr(self._backend, "sample_time", called_at))
-        except Exception as error:
+        except ordinary(Exception) as error:
             outcome, measured = Outcome(Status.ERROR, None, describe_error(error)), called_at
         if outcome.reason:
             name = f"{type(self._backend).__name__}.{method}"

@@ -29,6 +29,7 @@ from typing import Final, NamedTuple, NoReturn
 from fmugym.pool.process.output import redirect
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["ANSWER", "LARGEST_REQUEST", "PROGRAM", "Program", "main"]
 
@@ -86,7 +87,7 @@ class Program(NamedTuple):
         os.dup2(channel, 0)
         os.dup2(channel, 1)
         os.closerange(3, _MOST_DESCRIPTORS)
-        with contextlib.suppress(OSError):  # it may have been removed
+        with Ignoring(OSError):  # it may have been removed
             os.chdir(self.directory)
         os.execve(self.command[0], list(self.command), self.environment)
 
@@ -150,7 +151,7 @@ class _Server:
         server = os.getpid()
         try:
             pid = os.fork()
-        except OSError as error:
+        except ordinary(OSError) as error:
             pid = -(error.errno or 1)
         if pid == 0:
             answers.close()
@@ -237,7 +238,7 @@ class _Server:
 
 
 def _send(lifeline: socket.socket, answer: int) -> None:
-    with contextlib.suppress(OSError):  # the parent may have closed it
+    with Ignoring(OSError):  # the parent may have closed it
         lifeline.sendall(ANSWER.pack(answer))
 
 

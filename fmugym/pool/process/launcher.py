@@ -24,6 +24,7 @@ from typing import Any, Protocol
 from fmugym.pool.process.fork_server import ANSWER, PROGRAM, Program
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import run_worker
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["Process", "launch", "launch_program"]
 
@@ -165,7 +166,7 @@ def _start(folder: Path, size: int, descriptors: Sequence[int]) -> _ForkedProces
     """Start a worker with the fork server, or with a new one if the old one has ended."""
     try:
         return _fork_server().start(folder, size, descriptors)
-    except (EOFError, BrokenPipeError, ConnectionResetError):
+    except ordinary(EOFError, BrokenPipeError, ConnectionResetError):
         _cached_fork_server.cache_clear()
         return _fork_server().start(folder, size, descriptors)
 
@@ -214,7 +215,7 @@ class _ForkedProcess:
         return None if len(data) < ANSWER.size else int(ANSWER.unpack(data)[0])
 
     def kill(self) -> None:
-        with contextlib.suppress(OSError):  # the fork server has ended, and it has with it
+        with Ignoring(OSError):  # the fork server has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
     def exit_status(self, patience: float) -> int | None:

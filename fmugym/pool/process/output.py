@@ -7,7 +7,6 @@ than a pipe holds waits for its parent.
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import select
@@ -15,6 +14,8 @@ import sys
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, Final
+
+from fmugym.signals import Ignoring
 
 __all__ = ["Output", "print_line_by_line", "redirect"]
 
@@ -126,7 +127,7 @@ class Output:
 
 def _write(stream: int, data: bytes) -> None:
     view = memoryview(data)
-    with contextlib.suppress(OSError):  # this process may have closed it
+    with Ignoring(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
 

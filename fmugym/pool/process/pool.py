@@ -47,6 +47,7 @@ from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
     from fmugym.pool.process.play import PlayAround
@@ -480,7 +481,7 @@ def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
 def _make_memory(size: int) -> Memory:
     try:
         return Memory(size)
-    except OSError as error:
+    except ordinary(OSError) as error:
         raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
 
 

@@ -23,6 +23,7 @@ from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
 from fmugym.pool.process.transport import transport_for
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
+from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["INSTANTIATION", "ROLLOUT", "LostError", "Supervisor", "patience_with"]
 
@@ -116,7 +117,7 @@ class Supervisor:
         """
         try:
             self._process, self._channel = self._launch()
-        except (OSError, EOFError) as error:
+        except ordinary(OSError, EOFError) as error:
             raise LostError(f"no worker process can be started: {error}") from None
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
@@ -241,14 +242,14 @@ class Supervisor:
             if self.released:
                 self._release()
             self._channel.send_code(code)
-        except OSError:  # "contextlib.suppress" takes half a microsecond
+        except ordinary(OSError):  # "Ignoring" takes longer
             return
 
     def tell(self, name: str, *arguments: Any) -> None:
         """Ask for a call of one of the worker's methods; failures show in the reply."""
         self._busy, self._asked = True, time.monotonic()
         self._output.pump()
-        with contextlib.suppress(OSError):
+        with Ignoring(OSError):
             if self.released:
                 self._release()
             self._channel.send_object(Code.REQUEST, (name, arguments))
@@ -330,7 +331,7 @@ class Supervisor:
                 if code == Code.FINE or code == Code.TROUBLE:
                     return code
                 content = self._channel.receive_object(code)
-            except (EOFError, OSError):
+            except ordinary(EOFError, OSError):
                 self._explain_death(doing)
             if code == Code.LOG:
                 self._pass_on(*content)
@@ -389,7 +390,7 @@ def _is_debugged(pid: int) -> bool:
     """Whether a debugger holds the process, which may then take its time; known on Linux only."""
     try:
         status = Path(f"/proc/{pid}/status").read_text()
-    except OSError:
+    except ordinary(OSError):
         return False
     return any(
         line.startswith("TracerPid:") and line.split()[1] != "0" for line in status.splitlines()

@@ -6,7 +6,6 @@ copied from and to shared memory here, so that all workers copy at the same time
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
 import os
@@ -39,6 +38,7 @@ from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo, make_progress
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.spec import ResetMethod
+from fmugym.signals import Ignoring, ordinary
 from fmugym.systems.description import SystemDescription
 from fmugym.systems.fmu import ExtractedSystem
 from fmugym.wine.prefix import Wine
@@ -134,7 +134,7 @@ class Setup:
         try:
             shutil.rmtree(folder, ignore_errors=True)
             shutil.copytree(self.folder, folder, ignore=shutil.ignore_patterns(_COPIES))
-        except (OSError, shutil.Error) as error:
+        except ordinary(OSError, shutil.Error) as error:
             raise FMULoadError(
                 f"{self.path.name} needs a copy of its files for each process: {error}"
             ) from None
@@ -145,7 +145,7 @@ class Setup:
 def _working_directory() -> str:
     try:
         return os.getcwd()
-    except OSError:
+    except ordinary(OSError):
         return ""
 
 
@@ -153,7 +153,7 @@ def _enter(directory: str, folder: Path) -> None:
     """Make a directory the working directory, or a folder if the directory has been removed."""
     try:
         os.chdir(directory)
-    except OSError:
+    except ordinary(OSError):
         os.chdir(folder)
 
 
@@ -166,7 +166,7 @@ class _Forwarder(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send one message."""
-        with contextlib.suppress(OSError):  # the parent has ended, or an FMU closed it
+        with Ignoring(OSError):  # the parent has ended, or an FMU closed it
             self._channel.send_object(Code.LOG, (record.levelno, record.getMessage()))
 
 
@@ -409,7 +409,7 @@ def run_worker(end: socket.socket, memory: Memory) -> int:
     root.handlers, root.propagate = [_Forwarder(channel)], False
     try:
         BlockWorker(channel, memory).serve()
-    except (EOFError, OSError):  # the parent has ended
+    except ordinary(EOFError, OSError):  # the parent has ended
         return 0
     except BaseException:
         root.critical("the worker failed:\n%s", traceback.format_exc())

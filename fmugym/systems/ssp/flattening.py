@@ -181,7 +181,11 @@ class Flat:
         """Whether a node is a connector of a nested system whose name no component has."""
         place, name = node
         nested = place != () and place in self._systems and name in self._systems[place].connectors
-        return nested and _named(node) not in map(".".join, self.components)
+        return nested and _named(node) not in self._names
+
+    @cached_property
+    def _names(self) -> frozenset[str]:
+        return frozenset(map(".".join, self.components))
 
     def _chain(self, target: Node) -> list[tuple[Node, Wire]]:
         """The ways from the first source to a node."""
@@ -276,9 +280,9 @@ class Flat:
         system = self._systems[path]
         if name in system.connectors:
             yield path, name
-        for element in system.elements:
-            if name.startswith(f"{element}."):
-                yield from self._matching((*path, element), name[len(element) + 1 :])
+        for dot in (place for place, letter in enumerate(name) if letter == "."):
+            if name[:dot] in system.elements:
+                yield from self._matching((*path, name[:dot]), name[dot + 1 :])
 
     def _ends(self, node: Node, setting: Setting) -> Iterator[tuple[Node, Any]]:
         """The variables of components that get a value by a node, and their values."""

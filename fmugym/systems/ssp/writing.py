@@ -14,6 +14,7 @@ from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.units import definition_of
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, reason
+from fmugym.signals import ordinary
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
 from fmugym.systems.plan import Loop
@@ -60,7 +61,7 @@ def write_ssp(system: WiredSystem, path: Path) -> None:
             for fmu, place in sources.items():
                 archive.writestr(zipfile.ZipInfo(place, _DATE), fmu.read_bytes())
         os.replace(part, path)
-    except OSError as error:
+    except ordinary(OSError) as error:
         part.unlink(missing_ok=True)
         raise FMULoadError(f"{path} cannot be written: {reason(error)}") from None
 

@@ -589,17 +589,16 @@ class BatchEngine(Engine):
         if stopped.any():
             result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
-        for index in _indices(wrong_rewards, ~failed):
-            reasons[index] = f"_reward_policy returned {result.rewards[index]}{self._when(index)}"
-        for index in _indices(wrong_observations, ~failed):
-            observation = shown(observation_of(result.observations, index))
-            reasons.setdefault(index, f"the observation is {observation}{self._when(index)}")
+        for rows in (wrong_rewards, wrong_observations):
+            for index in _indices(rows, ~failed):
+                reasons[index] = self._not_finite(result, index)
         if reasons:
             self._end_with_faults(result, dict(sorted(reasons.items())), failed)
 
-    def _when(self, index: int) -> str:
+    def _not_finite(self, result: StepResult, index: int) -> str:
+        observation = observation_of(result.observations, index)
         with self.single(index) as env:
-            return f" at t = {env.time:g} s"
+            return env._not_finite(result.rewards[index], observation)
 
     def _end_with_faults(
         self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
@@ -223,8 +223,7 @@ class CompiledEngine(BatchEngine):
             found = trace_hooks(self.env, self._columns)
             require_same(self.env, Readings.of(self.env), found)
             task = found
-        except Exception as reason:  # as in find_programs
-            let_through(reason)
+        except ordinary(Exception) as reason:  # as in find_programs
             logger.info("the hooks cannot be compiled any more: %s", reason)
         finally:
             self._prepare(task)

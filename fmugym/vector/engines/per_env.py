@@ -20,7 +20,7 @@ from fmugym.env import IN_POOL, FMUEnv, Result
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.task.step import conclude
@@ -347,8 +347,7 @@ class PerEnvEngine(Engine):
             return cast(Sequence[Any], checked_actions(space, len(self._envs), actions))
         try:
             items = list(iterate(self._action_space, copy.deepcopy(actions)))
-        except Exception as error:  # users' actions may raise anything
-            let_through(error)
+        except ordinary(Exception):  # users' actions may raise anything
             raise ConfigError(
                 f"the actions do not make one of {space} for each environment: {shown(actions)}"
             ) from None

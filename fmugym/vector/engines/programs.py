@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import UntraceableError
@@ -40,8 +40,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
         require_same(env, sample_states(env, (1.0,)), task)
         with suppress(IndexError):  # hooks may look up what is not in their tables
             require_same(env, sample_states(env, _WILD_SCALES), task)
-    except Exception as reason:  # hooks may raise anything
-        let_through(reason)
+    except ordinary(Exception) as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.signals import let_through
+from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
@@ -102,8 +102,7 @@ def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]
             return np.broadcast_to(array, (count,))
     except FMUGymError:
         raise
-    except Exception as error:  # it makes no array, or its own methods fail
-        let_through(error)
+    except ordinary(Exception):  # it makes no array, or its own methods fail
         raise _mismatch(hook, value, wanted) from None
     raise _mismatch(hook, value, wanted)
 
@@ -115,8 +114,7 @@ def _expected(hook: str, value: Any, wanted: str) -> Iterator[None]:
         yield
     except FMUGymError:
         raise
-    except Exception as error:
-        let_through(error)
+    except ordinary(Exception):
         raise _mismatch(hook, value, wanted) from None
 
 
@@ -171,8 +169,7 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     try:
         array = np.array(value)
         fits = array.dtype.kind in _NUMBERS and array.shape[-1:] in {(), (count,)}
-    except Exception as error:  # lists that make no array, or objects whose own methods fail
-        let_through(error)
+    except ordinary(Exception):  # lists that make no array, or objects whose own methods fail
         fits = False
     if not fits:
         raise ConfigError(

@@ -1,0 +1,62 @@
+"""What to say of a declared reward that is not finite: the term, where it stands, its values."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from fmugym.declared.expressions import CONSTANTS, Expression
+from fmugym.declared.naming import Moment, Naming
+from fmugym.declared.parts import Term
+
+__all__ = ["explanation"]
+
+
+def explanation(
+    terms: Mapping[str, Term],
+    codes: Mapping[str, str],
+    naming: Naming,
+    function: Callable[[str], Callable[[Any], Any]],
+) -> Callable[[Any, float], str]:
+    """Make a method of an environment that explains a reward.
+
+    Args:
+        terms: The terms of the reward by name.
+        codes: Their code, weights included.
+        naming: Makes code of what the terms read.
+        function: Makes a function of code.
+    """
+    parts = [
+        (name, term, function(codes[name]), _readers(term, naming, function))
+        for name, term in terms.items()
+    ]
+
+    def explain(env: Any, reward: float) -> str:
+        found = [(name, term, float(value(env)), read) for name, term, value, read in parts]
+        wrong = [one for one in found if not math.isfinite(one[2])]
+        if not wrong:
+            listing = ", ".join(f"{name} = {value:g}" for name, _, value, _ in found)
+            return f"the reward is {reward}, the sum of {listing}"
+        _, term, value, readers = wrong[0]
+        values = ", ".join(f"{text} = {float(read(env)):g}" for text, read in readers.items())
+        place = term.entry.source.place(term.entry.keys)
+        told = f", where {values}" if values else ""
+        return f"{place}: the reward {term.expression.text!r} is {value}{told},"
+
+    return explain
+
+
+def _readers(
+    term: Term, naming: Naming, function: Callable[[str], Callable[[Any], Any]]
+) -> dict[str, Callable[[Any], Any]]:
+    """Functions for the values that a term reads, by their texts."""
+    return {
+        text: function(naming.code(term.entry, Expression.parse(text), Moment.JUDGED).number.text)
+        for text in _read_by(term.expression)
+    }
+
+
+def _read_by(expression: Expression) -> Iterator[str]:
+    yield from sorted(expression.names - CONSTANTS.keys())
+    yield from (f"previous({name})" for name in sorted(expression.previous_names))

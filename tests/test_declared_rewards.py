@@ -1,0 +1,105 @@
+"""What is said of a declared reward that is not finite, and of tasks that are too large."""
+
+import os
+import time
+
+import pytest
+
+import fmugym
+
+TASK = """
+fmu = {{ bundled = "Pendulum" }}
+time_step = "20ms"
+{reward}
+[variables]
+tau = {{ min = -0.01, max = 0.01 }}
+[expressions]
+shift = "theta - theta_0"
+[agent]
+actions = ["tau"]
+observations = ["theta", "theta_dot"]
+[parameters]
+theta_0 = 0.5
+"""
+TERMS = """
+[reward]
+near = "-theta**2"
+rate = { expr = "tau / (step - step)", weight = 2.0 }
+"""
+
+
+@pytest.fixture
+def task(tmp_path):
+    def write(reward):
+        path = tmp_path / "swing.toml"
+        path.write_text(TASK.format(reward=reward))
+        return path
+
+    return write
+
+
+def fault_of(env):
+    env.reset(seed=0)
+    return env.step(env.action_space.sample())[-1]["fault"]
+
+
+@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+def test_the_term_its_line_and_the_values_are_named(task, hooks):
+    path = task(TERMS)
+    with fmugym.load(path) as env:
+        single = fault_of(env)
+    envs = fmugym.FMUVectorEnv(lambda: fmugym.load(path), 2, hooks=hooks)
+    several = fault_of(envs)
+    envs.close()
+    for text in (single, *several):
+        for fact in ("swing.toml, line 7, reward.rate", "tau / (step - step)", "step = 1", "inf"):
+            assert fact in text
+        assert "near" not in text
+
+
+def test_a_reward_without_a_name_and_previous_values(task):
+    with fmugym.load(task('reward = "1 / (theta - previous(theta_dot) - theta)"')) as env:
+        text = fault_of(env)
+    for fact in ("swing.toml, line 4, reward", "previous(theta_dot) = 0", "theta = 0.5"):
+        assert fact in text
+
+
+def test_a_sum_of_finite_terms(task):
+    with fmugym.load(task('[reward]\nmuch = "1e308"\nmore = "theta_0 * 0 + 1e308"')) as env:
+        assert "much" in (text := fault_of(env))
+        assert "more" in text
+
+
+def in_a_row(text, count):
+    """Expressions, each of which reads the one before."""
+    lines = [
+        'e0 = "theta"',
+        *(f'e{i} = "{text}"'.replace("E", f"e{i - 1}") for i in range(1, count)),
+    ]
+    return "\n".join(["[expressions]", *lines, ""])
+
+
+LARGE = {
+    "doubled": ("[expressions]\n", in_a_row("E + E", 30)),
+    "many operands": ("[expressions]\n", in_a_row("max(E, 1, E, 2, E, 3, E, 4, E, E, E, E)", 9)),
+    "long row": ("[expressions]\n", in_a_row("E + 1", 900)),
+    "many terms": ('reward = "1"', "[reward]\n" + "".join(f'r{i} = "{i}"\n' for i in range(3000))),
+    "power of powers": ("tau = {", 'theta = { unit = "deg**9**9**9" }\ntau = {'),
+    "power of numbers": ("tau = {", 'theta = { unit = "(9**99)**99 deg" }\ntau = {'),
+    "device": ('reward = "1"', 'reward = "1"\nextends = "/dev/zero"'),
+    "pipe": ('reward = "1"', 'reward = "1"\nextends = "pipe"'),
+    "data": ("[agent]", '[data.x]\nfile = "pipe"\ncolumn = "a"\nstep = "1s"\n[agent]'),
+}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such pipes and devices")
+@pytest.mark.parametrize("case", LARGE)
+def test_what_is_too_large_is_refused_at_once(task, case):
+    path = task('reward = "1"')
+    fmugym.load(path).close()  # what is imported and read only once
+    os.mkfifo(path.parent / "pipe")
+    path.write_text(path.read_text().replace(*LARGE[case]))
+    begin = time.process_time()
+    with pytest.raises(fmugym.ConfigError, match=r"swing\.toml"):
+        fmugym.load(path)
+    assert time.process_time() - begin < 3.0  # a second where the processor is free
