@@ -246,7 +246,7 @@ class TestCommand:
         assert facts["actions"] == [{"name": "f", "unit": "N"}]
         assert facts["sample_time"] == 0.02
         assert main(command) == 1  # the files are there
-        assert "agent.h exists" in capsys.readouterr().err
+        assert "agent.c exists" in capsys.readouterr().err
 
     def test_to_an_fmu(self, tmp_path, capsys):
         env = made("fmugym/House-v0")
