@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
+from fmugym.checks import check_count
 from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
@@ -24,6 +25,21 @@ _OF_SECTIONS: Final = frozenset(
     | {"start_time", "positive_reward", "negative_reward"}
 )
 """Keys of a config that other sections of a task determine."""
+
+_OUTSIDE: Final = "it stands above all tables"
+_ELSEWHERE: Final = {
+    "model_input_names": "name the inputs in 'actions' of [agent]",
+    "model_output_names": "name the outputs in 'observations' of [agent]",
+    "model_parameters": "give them in [parameters]",
+    "monitor_names": "a name in an expression is read from the FMU",
+    "samplings": "give variables the key 'sample' in [variables]",
+    "episode_variables": "give them in [memory] or [setpoints]",
+    "bounds": "give variables 'min' and 'max' in [variables]",
+    "max_episode_steps": "it follows from 'episode_length', which stands above all tables",
+    "positive_reward": "give an expression for 'reward'",
+    "negative_reward": "give an expression for 'reward'",
+}
+"""Where a task says what these keys of a config say."""
 
 _OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
 
@@ -52,6 +68,9 @@ def own_config(root: Entry) -> dict[str, Any]:
         ConfigError: If there is no such key, or a value does not fit it.
     """
     section = root.child("config")
+    for key, entry in {} if section.value is None else section.items().items():
+        if key in _OF_SECTIONS:
+            raise entry.error(f"{key!r} is no key of [config]: {_ELSEWHERE.get(key, _OUTSIDE)}")
     own = {} if section.value is None else section.table(_OF_CONFIG)
     for key, entry in own.items():
         with entry.placing():
@@ -70,7 +89,7 @@ def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
     if declared.warm_up.period:
         times["warm_up"] = declared.warm_up.period
     if substeps.value is not None:
-        times["substeps"] = substeps.value
+        times["substeps"] = substeps.check(check_count)
     if length.value is not None:
         times["max_episode_steps"] = _episode_steps(length, time_step)
     if start.value is not None:

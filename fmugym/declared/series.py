@@ -9,7 +9,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,6 +20,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.extras import imported
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
@@ -192,6 +192,10 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv
             return read(path, status.st_mtime_ns, status.st_size)
+    except FileNotFoundError:
+        near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
+        missing = unknown_name("file", path.name, near)
+        raise file.error(f"{missing} (looked in {shown(str(path.parent))})") from None
     except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
@@ -199,12 +203,7 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
 @lru_cache(maxsize=16)
 def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
     """Read a Parquet file, whose cells have types."""
-    try:
-        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-    except ImportError:
-        raise ConfigError(
-            f'{path.name} needs pyarrow: pip install "fmugym-toolbox[parquet]"'
-        ) from None
+    pyarrow, parquet = imported("pyarrow", "parquet"), imported("pyarrow.parquet", "parquet")
     try:
         table = parquet.ParquetFile(path).read()
     except (pyarrow.ArrowException, ValueError) as error:

@@ -17,6 +17,7 @@ import numpy as np
 from fmugym.checks import check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.extras import imported
 from fmugym.search.agent import AGENT, Agent
 from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
@@ -41,13 +42,7 @@ def imported_for_training(name: str) -> Any:
     Raises:
         ConfigError: If it is missing.
     """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"this needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
-            "pip install 'fmugym-toolbox[sb3]'"
-        ) from error
+    return imported(name, "sb3")
 
 
 def algorithm_of(name: str) -> Any:
@@ -155,10 +150,20 @@ def _checked_policy(folder: Path, model: Any, normalization: Any, env: FMUEnv) -
         own, other = getattr(model, f"{what}_space"), getattr(env, f"{what}_space")
         if type(own) is not type(other) or own.shape != other.shape:
             raise ConfigError(
-                f"the agent in {shown(str(folder))} is for another task: its {what} space is "
-                f"{own}, that of the task is {other}"
+                f"the agent in {shown(str(folder))} is for another task: its {what}s are "
+                f"{_kind(own)}, those of the task are {_kind(other)} ({_names(what, env)})"
             )
     return policy_with(model, normalization, env)
+
+
+def _kind(space: Any) -> str:
+    """A space without its limits, which may be long arrays."""
+    return f"{type(space).__name__} of shape {space.shape}"
+
+
+def _names(what: str, env: FMUEnv) -> str:
+    seen = env.observation_names or env.config.model_output_names
+    return ", ".join(seen if what == "observation" else env.config.model_input_names)
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
+from fmugym.declared.configuring import own_config
 from fmugym.declared.systems import fmu_of
 from fmugym.systems import FMUSystem
 from fmugym.tools.overview import overview, plain, tables
@@ -27,8 +28,12 @@ def find_model(path: Path) -> FMU | FMUSystem:
         return FMUSystem.read(path)
     if path.suffix.lower() != ".toml":
         return FMU(path)
-    source = fmu_of(Task.read(path))
-    return source if isinstance(source, FMUSystem) else find_model(source)
+    task = Task.read(path)
+    source = fmu_of(task)
+    if isinstance(source, FMUSystem) or source.suffix.lower() == ".ssp":
+        return source if isinstance(source, FMUSystem) else FMUSystem.read(source)
+    preload = own_config(task.root).get("preload", ())
+    return FMU(source, preload=[preload] if isinstance(preload, str) else preload)
 
 
 def open_model(path: Path) -> FMU:
