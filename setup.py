@@ -9,6 +9,7 @@ import sys
 import sysconfig
 from pathlib import Path
 
+import numpy as np
 from setuptools import Extension, setup
 
 if sysconfig.get_config_var("Py_GIL_DISABLED"):
@@ -29,7 +30,7 @@ native = Extension(
         str(path) for folder in (".", "python") for path in Path("native", folder).glob("*.c")
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
-    include_dirs=["native"],
+    include_dirs=["native", np.get_include()],
     define_macros=[("Py_LIMITED_API", "0x030B0000")],
     extra_compile_args=["/std:c11", "/fp:precise"]
     if WINDOWS

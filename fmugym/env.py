@@ -168,12 +168,12 @@ class FMUEnv(Constructed):
     # Gymnasium's interface.
 
     def __repr__(self) -> str:
-        if "config" not in vars(self):  # the constructor has not come that far
+        if "_spec" not in vars(self):  # the constructor has not come that far
             return object.__repr__(self)
         inputs, outputs = self.config.model_input_names, self.config.model_output_names
         return (
             f"<{type(self).__name__} of {self.fmu.path.name}: {shortened(inputs)} -> "
-            f"{shortened(outputs)} every {self.config.time_step:g} s>"
+            f"{shortened(outputs)} every {self._spec.time_step:g} s>"
         )
 
     def reset(

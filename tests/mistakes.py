@@ -260,7 +260,7 @@ def of_keys() -> Iterator[Mistake]:
     for key in (key for key in KEYS if key not in {"class", "arguments", "extends", "system"}):
         wrong = 3.5 if key in _TEXTS_OR_TABLES else [[]]
         yield task({key: wrong}, key, shown(wrong[0] if key in _TIMES else wrong), WANTED)
-    for key in _OF_SECTIONS & {field.name for field in fields(EnvConfig)}:
+    for key in _OF_SECTIONS:
         yield task(nested(f"config.{key}", 1), f"'{key}' is no key of [config]")
     for key in WARM_UP_KEYS[1:]:
         wrong = misspelt(key)

@@ -17,9 +17,13 @@ typedef struct {
     Logger logger;
 } Callbacks;
 
+enum { NUMBERS = 8, HARMLESS_STEPS = 15 };
+
 typedef struct {
     double values[2];
     char token[32];
+    double *numbers; /* a block of memory of its own */
+    int steps;
 } Mortal;
 
 static int instances;
@@ -76,11 +80,13 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     do_as_told(token, "instantiate");
     Mortal *me = calloc(1, sizeof *me);
     snprintf(me->token, sizeof me->token, "%s", token);
+    me->numbers = calloc(NUMBERS, sizeof *me->numbers);
     return me;
 }
 
 void fmi2FreeInstance(Mortal *me) {
     do_as_told(me->token, "free");
+    free(me->numbers);
     free(me);
 }
 
@@ -101,6 +107,10 @@ int fmi2ExitInitializationMode(Mortal *me) {
 int fmi2DoStep(Mortal *me, double time, double step_size, int no_set_state) {
     do_as_told(me->token, "step");
     me->values[1] = me->values[0];
+    me->steps++;
+    if (strcmp(me->token, "overrun later") == 0 && me->steps > HARMLESS_STEPS) {
+        memset(me->numbers + NUMBERS, 1, 64);
+    }
     return 0;
 }
 

@@ -192,7 +192,7 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (np.empty, tuple, 0, (), self.results(), TOLD),
+                "results": (tuple, 0, (), self.results(), TOLD),
             },
         )
 

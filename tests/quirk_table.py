@@ -30,7 +30,6 @@ STATES = (2, 3)
 NEEDS = {
     "independent": "share the process",
     "one initialization at a time": "are initialized one at a time",
-    "one thread": "are stepped by one thread",
     "libraries": "get a copy of the library each",
     "processes": "get a process with a copy of the FMU's files each",
 }
@@ -132,7 +131,7 @@ QUIRKS = (
         "one saved state", "has one place for the FMU states of all instances",
         neighbours="libraries", log=DISTURB, versions=STATES,
     ),
-    Quirk("static buffer", "steps with a static buffer", neighbours="one thread", log=DISTURB),
+    Quirk("static buffer", "steps with a static buffer", neighbours="libraries", log=DISTURB),
     Quirk(
         "scratch file", "writes and reads a file among its resources",
         neighbours="processes", log=DISTURB,

@@ -18,6 +18,8 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 HERE = Path(__file__).resolve().parent
 TOP = HERE.parent
 SUPPRESSIONS = HERE / "sanitize"
@@ -69,7 +71,8 @@ def build(sanitizer, folder):
     command = ["gcc", "-std=gnu11", "-O1", "-g", "-fno-omit-frame-pointer", "-shared", "-fPIC"]
     command += [f"-fsanitize={sanitizer.flags}", "-fno-sanitize-recover=undefined"]
     command += ["-ffp-contract=off", "-fvisibility=hidden", "-DPy_LIMITED_API=0x030B0000"]
-    command += [f"-I{TOP / 'native'}", f"-I{sysconfig.get_path('include')}"]
+    folders = TOP / "native", sysconfig.get_path("include"), np.get_include()
+    command += [f"-I{folder}" for folder in folders]
     native = TOP / "native"  # its folder worker is a program of its own
     command += [*map(str, sorted([*native.glob("*.c"), *native.glob("python/*.c")]))]
     command += ["-o", str(package / "_native.abi3.so"), "-lm", "-lpthread", "-ldl"]

@@ -4,6 +4,7 @@ import csv
 import errno
 import json
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 import fmugym
 from fmugym import ConfigError
 from fmugym.tools.cli import main
-from fmugym.tools.evaluation import confidence
+from fmugym.tools.evaluation import confidence, evaluate, warning_of_one_reward
+from fmugym.tools.simulation import Player, action_of
 from fmugym.tools.training import arguments_of
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
@@ -129,6 +131,39 @@ def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "agent").exists()
 
 
+@pytest.mark.parametrize("command", ["simulate", "record", "evaluate", "tune", "train"])
+def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, capsys):
+    fmu = fmugym.bundled_fmu("Pendulum")
+    more = {
+        "record": ["--output", tmp_path / "a.csv"],
+        "tune": ["pid of=q setpoint=0 kp=0..1"],
+        "train": ["--output", tmp_path / "agent"],
+    }
+    code, out, err = run(capsys, command, fmu, *more.get(command, []))
+    assert (code, out) == (1, "")
+    assert "fmugym new Pendulum.fmu" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("reward", "terminated", "told"),
+    [
+        ("0", "q_dot > 0.3", "0 in every step"),
+        ("-1", "false", "-1 in every step"),
+        ("-1", "q_dot > 0.3", None),
+        ("-abs(q)", "false", None),
+    ],
+)
+def test_a_reward_that_never_changes_is_warned_of(reward, terminated, told):
+    task = {k: v for k, v in SCENARIOS.items() if k != "costs"}
+    task |= {"reward": reward, "terminated": terminated}
+    make_env, player = partial(fmugym.load, task), Player(partial(action_of, text="random"), False)
+    scores = evaluate(make_env, {"a": player, "b": player}, range(4), 100)
+    warning = warning_of_one_reward(scores)
+    assert (told is None) == (warning is None)
+    assert told is None or told in warning
+
+
 class TestTrain:
     @pytest.fixture(autouse=True)
     def sb3(self):
@@ -140,7 +175,7 @@ class TestTrain:
         arguments = "n_steps=128", "batch_size=256"
         code, out, err = run(capsys, "train", CART_POLE, *arguments, *options)
         assert code == 0
-        assert "6144 steps: reward" in err
+        assert "5120 steps: reward" in err  # five rollouts of 128 steps in 8 environments
         assert "held-out seeds" in out
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
         assert len(rows) > 5
@@ -156,20 +191,62 @@ class TestTrain:
         assert "exists" in err
 
     def test_no_agent_is_evaluated_twice(self, tmp_path, capsys):
-        """PPO learns after every 128 steps here, and an evaluation is due after every 16."""
+        """PPO learns after every 128 steps here, and an evaluation is due after every 27."""
         folder = tmp_path / "agent"
-        options = "--steps", "160", "--envs", "4", "--episodes", "1", "--output", folder
+        options = "--steps", "270", "--envs", "4", "--episodes", "1", "--output", folder
         code, _, err = run(capsys, "train", CART_POLE, "n_steps=32", *options)
         assert code == 0
         assert "n_steps" not in err
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
-        assert [int(row["steps"]) for row in rows] == [16, 132, 256]
+        assert [int(row["steps"]) for row in rows] == [28, 136, 256]
 
-    def test_a_rollout_that_is_longer_than_the_training_is_told(self, tmp_path, capsys):
-        options = "--steps", "100", "--envs", "2", "--episodes", "1", "--output", tmp_path / "a"
+    def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, capsys):
+        options = "--steps", "100", "--envs", "2", "--output", tmp_path / "a"
         code, _, err = run(capsys, "train", CART_POLE, "n_steps=64", *options)
-        assert code == 0
+        assert code == 1
         assert "128 steps (n_steps=64 in 2 environments)" in err
+        assert not (tmp_path / "a").exists()
+
+    @pytest.mark.parametrize(
+        ("arguments", "steps", "done"),
+        [
+            (["n_steps=16", "batch_size=32"], 100, 96),
+            ([], 300, 256),  # shorter rollouts than the 2048 steps of PPO's own
+            (["--algorithm", "SAC", "learning_starts=10", "train_freq=10"], 99, 80),
+            (["--algorithm", "SAC", "learning_starts=10"], 33, 32),
+        ],
+    )
+    def test_steps_are_a_ceiling(self, tmp_path, capsys, arguments, steps, done):
+        fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
+        options = "--steps", steps, "--envs", "2", "--episodes", "1", "--output", tmp_path / "a"
+        code, *_ = run(capsys, "train", tmp_path / "a.toml", *arguments, *options)
+        assert code == 0
+        last = (tmp_path / "a" / "evaluations.csv").read_text().splitlines()[-1]
+        assert int(last.partition(",")[0]) == done
+
+    def test_the_scores_are_those_of_the_agent_that_is_kept(self, tmp_path, capsys, monkeypatch):
+        """A training whose agent gets worse: it pushes, where none should."""
+        pushes = iter([0.0, 5.0, 5.0])
+
+        def train(self):
+            self._n_updates += 1
+            for parameter in self.policy.parameters():
+                parameter.data.zero_()
+            self.policy.action_net.bias.data.fill_(next(pushes))
+
+        monkeypatch.setattr("stable_baselines3.PPO.train", train)
+        fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
+        options = "--steps", "192", "--envs", "2", "--output", tmp_path / "agent", "n_steps=32"
+        code, out, err = run(capsys, "train", tmp_path / "a.toml", *options, "--json")
+        told = json.loads(out)
+        text = (tmp_path / "agent" / "evaluations.csv").read_text()
+        rows = list(csv.DictReader(text.splitlines()))
+        best = max(rows, key=lambda row: float(row["reward"]))
+        assert code == 0
+        assert best != rows[-1]
+        for score in told["scores"]:
+            assert score["mean_reward"] == float(best[score["name"]])
+        assert f"the agent after {best['steps']} steps" in err
 
     def test_scenarios_are_the_evaluation(self, tmp_path, capsys):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
@@ -183,6 +260,15 @@ class TestTrain:
         rows = list(csv.DictReader(text.splitlines()))
         assert {"early", "late"} < rows[0].keys()
 
+    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, capsys):
+        fmugym.Task.from_dict(SCENARIOS | {"reward": "0"}).write(tmp_path / "a.toml")
+        options = "--steps", "64", "--envs", "2", "--episodes", "1", "--output", tmp_path / "agent"
+        own = "n_steps=8", "batch_size=16"
+        code, _, err = run(capsys, "train", tmp_path / "a.toml", *own, *options)
+        assert code == 0
+        assert err.count("the reward was 0") == 1
+        assert err.count("in evaluation") > 2
+
     def test_an_interruption_keeps_the_best_agent(self, tmp_path, capsys, monkeypatch):
         def train(self):
             raise KeyboardInterrupt
@@ -195,6 +281,33 @@ class TestTrain:
         assert (folder / "model.zip").exists()
         code, out, _ = run(capsys, "evaluate", CART_POLE, "--agent", folder, "--episodes", "1")
         assert (code, str(folder) in out) == (0, True)
+
+    @pytest.mark.parametrize("patience", [1, 0])
+    def test_an_interruption_in_an_evaluation(self, tmp_path, capsys, monkeypatch, patience):
+        """The agent is kept, although it was never evaluated if there is a second Ctrl-C."""
+        from fmugym.tools import training
+
+        original, calls = training.evaluate, iter([False] * 1 + [True] + [False] * 9 * patience)
+
+        def evaluate(*args, **kwargs):  # the second scenario of the first evaluation
+            if next(calls, True):
+                raise KeyboardInterrupt
+            return original(*args, **kwargs)
+
+        monkeypatch.setattr(training, "evaluate", evaluate)
+        fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
+        folder = tmp_path / "agent"
+        options = "--output", folder, "--episodes", "1", "--envs", "2", "--steps", "400"
+        arguments = "n_steps=32", "batch_size=32"
+        code, _, err = run(capsys, "train", tmp_path / "a.toml", *arguments, *options)
+        assert code == 130
+        assert "nothing was trained" not in err
+        assert str(folder) in err
+        code, *_ = run(
+            capsys, "evaluate", tmp_path / "a.toml", "--agent", folder, "--episodes", "1"
+        )
+        assert code == 0
+        assert ("reward" in json.loads((folder / "agent.json").read_text())) == bool(patience)
 
     @pytest.mark.parametrize(
         ("arguments", "fact"),

@@ -15,12 +15,14 @@ from export_tools import (
     network_for,
 )
 from test_export import TASKS, Filtered, heating
+from test_export_search import HEATERS, HISTORY, PID, agent_for, heater, played, require_same
 
 import fmugym
 from fmugym import ConfigError
 from fmugym.export import Activation, Layer, Network, agent_of, write_onnx
 from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import computed, interpolated
+from fmugym.search.agent import Agent
 
 onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
 runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
@@ -118,6 +120,42 @@ class TestEpisodes:
             gain = [0.5, 1.0, 2.0][action[0]]
             assert runner.step([env.state]).item() == pytest.approx(gain * (action[1] - 1.0))
             observation, *_ = env.step(action)
+        env.close()
+
+
+class TestSearch:
+    """Agents that a search has found, beside their Python policies."""
+
+    @pytest.mark.parametrize("task", HEATERS)
+    def test_of_task_files(self, task, tmp_path):
+        document, text, form = HEATERS[task]
+        env = heater(document)
+        agent = agent_for(env, text, form)
+        exported = agent_of(env, agent)
+        runner = Runner(write_onnx(exported, tmp_path / "agent.onnx"))
+        env.reset(seed=1)
+        for name, value in drawn_in(env, exported.logic).items():
+            runner.memory[name][:] = value
+        both = played(env, agent, lambda values: runner.step([values])[0])
+        require_same(both, different=2)
+        env.close()
+
+    def test_of_choices(self, tmp_path):
+        env = made("CartPole")
+        agent = agent_for(env, None, HISTORY)
+        exported = agent_of(env, agent)
+        runner = Runner(write_onnx(exported, tmp_path / "agent.onnx"))
+        policy, rows = agent.policy().bind(env), np.random.default_rng(0).normal(size=(200, 4))
+        chosen = [policy.act(row) for row in rows.astype(np.float32)]
+        assert 5 < np.sum(chosen) < 195
+        assert [runner.step([row]).item() for row in rows] == [-10.0 + 20.0 * one for one in chosen]
+        env.close()
+
+    def test_the_memory_is_json_without_nan(self, tmp_path):
+        env = heater(HEATERS["a controller"][0])
+        path = write_onnx(agent_of(env, Agent("by hand", PID)), tmp_path / "agent.onnx")
+        facts = runtime.InferenceSession(str(path)).get_modelmeta().custom_metadata_map
+        assert json.loads(facts["memory"])["agent_controller"] == [0.0, None]
         env.close()
 
 

@@ -22,6 +22,7 @@ STOREYS = [
     {"env"},
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
+    {"search"},
     {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
     {"export", "logs", "minari"},
     {"envs", "pettingzoo", "rllib", "tools"},

@@ -1,12 +1,15 @@
 """The C sources compile for every platform without a warning, and without Python."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from fmugym.pool import has_native_pool
@@ -37,7 +40,49 @@ def test_core_compiles(target, source, tmp_path):
 
 def test_core_needs_no_python():
     for path in NATIVE.glob("*.[ch]"):
-        assert "Python.h" not in path.read_text(encoding="utf-8")
+        assert not {"Python.h", "numpy/arrayobject.h"} & included(path)
+
+
+def included(path):
+    return set(re.findall(r"#include <(.+)>", path.read_text(encoding="utf-8")))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Python's headers are for another compiler there")
+@pytest.mark.parametrize("source", sorted(NATIVE.glob("python/*.c")), ids=lambda path: path.stem)
+def test_what_presents_it_to_python_compiles(source, tmp_path):
+    """Against the stable ABI, and numpy's C interface without what is deprecated."""
+    folders = [f"-I{NATIVE}", "-isystem", np.get_include(), f"-I{sysconfig.get_path('include')}"]
+    command = [sys.executable, "-m", "ziglang", "cc", *OPTIONS, "-DPy_LIMITED_API=0x030B0000"]
+    command += [*folders, "-c", str(source), "-o", str(tmp_path / "object.o")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_no_object_of_others_is_looked_into():
+    """The fields of objects are declared for the extension's own types, and for no others."""
+    declaring = {p.name for p in NATIVE.glob("**/*.[ch]") if "PyObject_HEAD" in p.read_text()}
+    assert declaring == {"python.h"}
+
+
+@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
+def test_the_extension_loads_without_numpy():
+    """It imports numpy when the first array is made."""
+    from fmugym import _native
+
+    script = f"""
+import importlib.util, sys, types
+sys.modules["numpy"] = None
+for name in ("fmugym", "fmugym.errors"):
+    sys.modules[name] = types.ModuleType(name)
+sys.modules["fmugym.errors"].SimulationError = RuntimeError
+spec = importlib.util.spec_from_file_location("fmugym._native", {_native.__file__!r})
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+print(module.statistics()["jobs"])
+"""
+    command = [sys.executable, "-S", "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stdout == "0\n", done.stderr
 
 
 def build_without_compiler(folder, **environment):

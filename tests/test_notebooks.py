@@ -27,8 +27,25 @@ def test_objects_are_shown_in_one_informative_line():
     many.close()
 
 
-def test_an_environment_that_was_not_constructed_can_be_shown():
-    assert "CartPoleEnv object" in repr(CartPoleEnv.__new__(CartPoleEnv))
+class Failing(fmugym.FMI2CSEnv):
+    """Its step size is that of the FMU; without one, its constructor fails."""
+
+    def __init__(self, fmu_path):
+        config = {"model_input_names": "tau", "model_output_names": "q"}
+        try:
+            super().__init__(fmu_path, config)
+        except fmugym.FMULoadError:
+            self.shown = repr(self)
+
+    def _is_done(self):
+        return False
+
+
+def test_environments_can_be_shown_at_any_time():
+    assert "Failing object" in Failing("absent.fmu").shown
+    env = Failing(fmugym.bundled_fmu("Pendulum"))
+    assert repr(env) == "<Failing of Pendulum.fmu: tau -> q every 0.01 s>"
+    env.close()
 
 
 def test_figures_are_pictures_without_a_magic_line():

@@ -28,6 +28,7 @@ from fmugym.tools.cli import main
 from fmugym.trial import plan as trial_plan
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
+from fmugym.trial.known import known_verdict
 from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -148,8 +149,6 @@ class TestEpisodes:
 
     @pytest.mark.parametrize("way", WAYS)
     def test_vector(self, make_fmu, version, quirk, way):
-        if (quirk.neighbours, way) == ("one thread", "two"):
-            way = "default"  # the caller knows better than to insist
         path = make_fmu(quirk.token, version)
         envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
         envs.reset(seed=3)
@@ -301,8 +300,20 @@ def test_inputs_stay_within_their_limits(make_fmu):
 @pytest.mark.usefixtures("nothing_warned")
 def test_an_fmu_that_is_not_deterministic_is_told_apart(make_fmu, caplog):
     env = QuirkEnv(make_fmu("noise"))
-    assert "gives other outputs each time, even if it begins afresh" in caplog.text
+    assert "gives other values of y each time, even if it begins afresh" in caplog.text
     env.close()
+
+
+@pytest.mark.usefixtures("nothing_warned")
+def test_an_output_that_tells_the_processors_time_is_no_reason_for_processes(make_fmu, caplog):
+    path = make_fmu("tells its time")
+    make_vector(path).close()
+    assert "gives other values of calls each time" in caplog.text
+    assert "disturb each other" not in caplog.text
+    verdict = known_verdict(fmugym.FMU(path))
+    assert verdict.noisy == ("calls",)
+    assert verdict.neighbours is Neighbours.INDEPENDENT
+    assert verdict.reset_method is ResetMethod.RESTORE
 
 
 @pytest.mark.usefixtures("nothing_warned")
@@ -358,7 +369,7 @@ class TestVerdict:
     def test_survives_its_text(self):
         verdict = Verdict(
             complete=True,
-            deterministic=False,
+            noisy=("y",),
             resets={ResetMethod.RESTORE: Grade.WRONG, ResetMethod.RESET: Grade.TOLERANCE},
             neighbours=Neighbours.ONE_THREAD,
             isolate=True,

@@ -211,16 +211,51 @@ class TestLoops:
         assert np.allclose(rows[:, 0], expected, rtol=1e-9, atol=1e-12)
         assert np.allclose(rows[:, 1], -0.6 * expected, rtol=1e-9, atol=1e-12)
 
-    def test_of_components_that_cannot_repeat_a_step_are_refused(self, fmus):
-        for version, what in ((1, "saved"), (3, None)):
-            plan = loop_of_gains(fmus | {2: fmus[version]}, Loop())
-            if what is None:
-                SystemFMU(plan)
-                continue
-            with pytest.raises(ConfigError, match=rf"'a'.*'b'.*{what}.*component 'a'"):
-                SystemFMU(plan)
-            with pytest.raises(ConfigError, match=r"component 'a'.*FMI 1\.0"):
-                SystemFMU(replace(plan, master="jacobi"))
+    @in_each_engine
+    @by_each_master
+    def test_of_components_that_cannot_repeat_a_step_are_not_solved(
+        self, make, fmus, native, master
+    ):
+        """FMI 1.0 knows neither saved states nor an Initialization Mode."""
+        parts = loop_of_gains(fmus | {2: fmus[1]}, None).components
+        loop = fmugym.FMUSystem(
+            {one.name: fmugym.Component(one.path, dict(one.starts)) for one in parts},
+            ["a.y1 -> b.u1", "b.y1 -> a.u1"],
+            master=master,
+        )
+        rows = play(make(loop, ["a.u2"], ["a.y1", "b.y1"], native), 3, np.full((3, 1, 1), 2.6))
+        a, b = rows.T
+        assert (a[0], b[0]) == (0.0, 0.0)
+        assert a[1:] == pytest.approx(0.5 * b[:-1] + 2.6, rel=1e-12)
+        newest = a[1:] if master == "gauss_seidel" else a[:-1]
+        assert b[1:] == pytest.approx(-0.6 * newest, rel=1e-12)
+
+    @in_each_engine
+    def test_through_fmi_1_begins_with_its_start_values(self, make, fmus, native):
+        a = linear("a", fmus[1], d=[[0.5, 1], [0, 0]])
+        values = dict(a.starts) | {"u1": 4.0, "u2": 1.0}
+        b = fmugym.Component(fmus[3], dict(linear("b", fmus[3], d=[[2, 0], [0, 0]]).starts))
+        loop = fmugym.FMUSystem(
+            {"a": fmugym.Component(a.path, values), "b": b}, ["a.y1 -> b.u1", "b.y1 -> a.u1"]
+        )
+        outputs, statuses = make(loop, (), ["b.u1", "b.y1"], native).reset(*NO_START)
+        assert not statuses.any()
+        assert outputs[:, 0].tolist() == [3.0, 6.0]
+
+    def test_that_are_not_solved_are_told(self, fmus):
+        parts = {"a": fmus[1], "b": fmus[2], "c": fmus[3]}
+        links = ["a.y1 -> b.u1", "b.y1 -> a.u1", "b.y2 -> c.u1", "c.y1 -> b.u2"]
+        loop = fmugym.FMUSystem(parts, links)
+        groups = [(group.components, group.loop is not None) for group in loop.plan.groups]
+        assert groups == [(("a",), False), (("b", "c"), True)]
+        for fact in ("a cannot save its FMU state", "a is an FMU of FMI 1.0"):
+            assert any(finding.startswith(fact) for finding in loop.findings)
+        assert not any(
+            "cannot save" in finding
+            for finding in fmugym.FMUSystem(parts, links, master="jacobi").findings
+        )
+        with pytest.raises(ConfigError, match="algebraic loop"):
+            fmugym.FMUSystem(parts, links, loops="refuse")
 
     @in_each_engine
     def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):

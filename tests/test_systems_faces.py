@@ -1,6 +1,8 @@
 """Systems where an FMU can stand: environments, task files, the command line, pictures."""
 
 import json
+import pickle
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -315,6 +317,24 @@ class TestTaskFiles:
         assert all(fact in str(error.value) for fact in facts), error.value
 
 
+def test_the_master_of_an_archive_can_be_chosen(archive):
+    system = FMUSystem.read(archive, master="jacobi")
+    assert pickle.loads(pickle.dumps(system)).plan.master == "jacobi"
+    document = {
+        "fmu": str(archive),
+        "time_step": "15min",
+        "reward": "-T",
+        "variables": {"T": {"name": "east.T_air"}, "u": {"name": "east.u"}},
+        "agent": {"actions": ["u"], "observations": ["T"]},
+    }
+    for given in ("jacobi", "gauss_seidel"):
+        with closing(fmugym.load(document, master=given)) as env:
+            assert env.fmu.plan.master == given
+            assert pickle.loads(pickle.dumps(env)).fmu.plan.master == given
+    with pytest.raises(ConfigError, match=r"jacob.*jacobi"):
+        fmugym.load(document, master="jacob")
+
+
 class TestCommandLine:
     def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, capsys):
         for path in (archive, task()):
@@ -329,6 +349,40 @@ class TestCommandLine:
                 assert fact in text
             picture = (tmp_path / "system.svg").read_text()
             assert all(f">{name}<" in picture for name in ("east", "west", "outside", "Q_int"))
+
+    def test_info_describes_what_cannot_run(self, tmp_path, capsys):
+        given = FMUSystem({"cart": bundled_fmu("CartPole", "1.0")}, error_tolerance=1e-3)
+        path = given.write(tmp_path / "cart.ssp")
+        assert main(["info", str(path)]) == 0
+        text = capsys.readouterr().out
+        assert "does NOT run here: error_tolerance" in text
+        assert "component 'cart' cannot save its FMU state" in text
+        assert "cart.theta_dot" in text
+
+    @pytest.mark.parametrize("declared", [True, False])
+    def test_the_master_can_be_chosen(self, archive, task, tmp_path, capsys, declared):
+        path = task()
+        if not declared:
+            head, _, rest = path.read_text().partition("[system]")
+            path.write_text(f'{head}fmu = "{archive}"\n{rest[rest.index("[variables]") :]}')
+        assert main(["info", str(path), "--master", "jacobi", "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)["system"]["master"] == "jacobi"
+        runs = []
+        for options in ([], ["--master", "gauss_seidel"], ["--master", "jacobi"]):
+            file = tmp_path / f"{len(runs)}.csv"
+            run = ["simulate", str(path), "--steps", "3", "--output", str(file), *options]
+            assert main(run) == 0
+            runs.append(file.read_text())
+        assert runs[0] == runs[1] != runs[2]
+
+    def test_a_single_fmu_has_no_master(self, tmp_path, capsys):
+        path = tmp_path / "task.toml"
+        path.write_text('fmu = { bundled = "House" }\n')
+        for one in (HOUSE, path):
+            assert main(["info", str(one), "--master", "jacobi"]) == 1
+            assert "House.fmu is a single FMU" in capsys.readouterr().err
+        assert main(["validate", "somewhere:Own", "--master", "jacobi"]) == 1
+        assert "'somewhere:Own'" in capsys.readouterr().err
 
     def test_info_as_json(self, archive, capsys):
         assert main(["info", str(archive), "--json"]) == 0

@@ -4,13 +4,17 @@ import copy
 import logging
 import random
 import zipfile
+from contextlib import closing
 from types import MappingProxyType
 
+import model_tools
 import numpy as np
 import pytest
+import system_tools
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
 from lxml import etree
 
+import fmugym
 from fmugym import (
     Component,
     ConfigError,
@@ -300,6 +304,90 @@ class TestReading:
         )
         (connector,) = FMUSystem.read(pack(root, unit)).plan.connectors
         assert connector.ends[0].gain == 7.0
+
+
+WATT = '<ssc:BaseUnit kg="1" m="2" s="-3" factor="{}"/>'
+ODD_UNITS = (
+    f'<ssd:Units><ssc:Unit name="odd">{WATT.format(7)}</ssc:Unit>'
+    f'<ssc:Unit name="even">{WATT.format(2)}</ssc:Unit></ssd:Units>'
+)
+
+
+@pytest.fixture
+def odd_fmu(tmp_path):
+    """The bytes of an FMU whose ``y1`` is in a unit that it does not define, and ``u1`` in none."""
+    own = {"u1": 'start="0" unit=""', "u2": 'start="0" unit="even"', "y1": 'unit="odd"'}
+    variables = [(n, kind, own.get(n, more)) for n, kind, more in system_tools.VARIABLES]
+    path = tmp_path / "odd.fmu"
+    return model_tools.model_fmu(path, "linear", 2, "{linear}", variables).read_bytes()
+
+
+class TestUnits:
+    """What the file says of units counts where an FMU says nothing."""
+
+    ODD = MappingProxyType({"source": "resources/odd.fmu"})
+
+    def read(self, pack, odd_fmu, root):
+        return FMUSystem.read(pack(root, ODD_UNITS, odd_fmu=odd_fmu))
+
+    def pair(self, ports, wires, of_first="output odd", of_second="input"):
+        parts = [component("a", {"y1": of_first}, **self.ODD)]
+        parts.append(component("b", {"u1": of_second, "u2": "input even"}, **self.ODD))
+        return system("r", ports, parts, wires)
+
+    def test_an_empty_unit_is_none(self, pack):
+        ports = HOUSE_PORTS | {"Q_int": "input"}
+        text = system("r", {"q": "input"}, [component("h", ports)], [connection("q", "h.Q_int")])
+        given = text.replace("<ssc:Real/>", '<ssc:Real unit=""/>')
+        more = bindings(values({"h.A_f": '<ssv:Real value="3" unit=""/>'}))
+        found = FMUSystem.read(pack(given.replace("<ssd:Elements>", f"{more}<ssd:Elements>")))
+        assert found.connectors == FMUSystem.read(pack(text)).connectors
+        assert starts_of(found) == {"h": {"A_f": 3.0}}
+
+    def test_an_empty_unit_of_an_fmu_is_none(self, pack, odd_fmu):
+        root = self.pair({}, [connection("a.y1", "b.u1")])
+        found = self.read(pack, odd_fmu, root)
+        assert links_of(found) == [("a", "y1", "b", "u1", 1.0, 0.0)]
+
+    def test_that_the_file_defines_convert_between_fmus(self, pack, odd_fmu):
+        found = self.read(pack, odd_fmu, self.pair({}, [connection("a.y1", "b.u2")]))
+        assert links_of(found) == [("a", "y1", "b", "u2", 3.5, 0.0)]
+
+    def test_that_the_file_defines_convert_through_systems(self, pack, odd_fmu):
+        inner = system(
+            "inner",
+            {"out": "output even"},
+            [component("a", {"y1": "output odd"}, **self.ODD)],
+            [connection("a.y1", "out")],
+        )
+        outer = component("b", {"u2": "input even"}, **self.ODD)
+        wires = [connection("inner.out", "b.u2", linear(2.0))]
+        found = self.read(pack, odd_fmu, system("r", {}, [inner, outer], wires))
+        assert links_of(found) == [("inner.a", "y1", "b", "u2", 7.0, 0.0)]
+
+    def test_of_a_connector_is_that_of_a_variable_without_one(self, pack, odd_fmu):
+        root = self.pair({"q": "input odd"}, [connection("q", "b.u1")], of_second="input even")
+        (connector,) = self.read(pack, odd_fmu, root).connectors
+        assert (connector.unit, connector.ends[0].gain) == ("odd", 3.5)
+        root = self.pair({}, [connection("a.y1", "b.u1")], of_second="input W")
+        assert links_of(self.read(pack, odd_fmu, root)) == [("a", "y1", "b", "u1", 7.0, 0.0)]
+
+    def test_that_the_file_defines_are_known_to_tasks(self, pack, odd_fmu, tmp_path):
+        fmu = self.read(pack, odd_fmu, self.pair({"q": "input odd"}, [connection("q", "b.u2")]))
+        task = {
+            "fmu": str(fmu.file),
+            "time_step": "1s",
+            "reward": "-y",
+            "variables": {
+                "q": {"name": "q", "unit": "W", "min": 0, "max": 14},
+                "y": {"name": "a.y1", "unit": "W"},
+            },
+            "agent": {"actions": ["q"], "observations": ["y"]},
+        }
+        with closing(fmugym.load(task)) as env:
+            env.reset(seed=0)
+            env.step(np.array([14.0], np.float32))
+            assert env.inputs == (2.0,)
 
 
 def traced_by_fmpy(ssd):

@@ -19,6 +19,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.process.last_words import OutputTail, describe_exit
 from fmugym.trial import attempt, trial
 from fmugym.trial.cache import cache_folder
+from fmugym.trial.known import known_verdict
 from fmugym.trial.opening import make_pool
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="its faults are those of Unix")
@@ -137,6 +138,30 @@ class TestDeath:
             envs.reset()
             assert envs.step(np.ones((2, 1), np.float32))[0].tolist() == [[1.0], [1.0]]
             envs.close()
+
+
+HEAP = """
+import sys, numpy, fmu_tools
+env = fmu_tools.PlainEnv(sys.argv[1], {config})
+for _ in range(3):
+    env.reset()
+    for _ in range(50):
+        env.step(numpy.ones(1))
+env.close()
+print("closed")
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="glibc checks the heap")
+def test_an_instance_that_damages_its_heap_later_runs_elsewhere(make_fmu):
+    """The caller would be ended when it closes the environment, if not before."""
+    path = make_fmu("overrun later")
+    code = HEAP.format(config=CONFIG)
+    command = [sys.executable, "-c", code, path]
+    environment = os.environ | {"PYTHONPATH": str(building.HERE)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "closed\n"), done.stderr
+    assert known_verdict(FMU(path)).isolate
 
 
 class TestIsolated:

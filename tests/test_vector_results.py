@@ -167,41 +167,39 @@ TOLD = "drawn", "_drawn", *LateDict.parts(dict, None)
 
 
 def test_results_that_fit_are_taken(monkeypatch):
-    require_refused((np.empty, tuple, 0, (), ARRAYS, TOLD), monkeypatch, refused=False)
+    require_refused((tuple, 0, (), ARRAYS, TOLD), monkeypatch, refused=False)
 
 
 @pytest.mark.parametrize(
     "results",
     [
-        (np.empty, tuple, 0, (), (), TOLD),
-        (np.empty, tuple, 0, (), ARRAYS[:-1], TOLD),
-        (np.empty, tuple, 0, (), ARRAYS[:3], TOLD),
-        (np.empty, tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), TOLD),
-        (np.empty, tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), TOLD),
-        (np.empty, tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), TOLD),
-        (np.empty, tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), TOLD),
-        (np.empty, tuple, (("a", 0), ("b", 1)), (), ARRAYS, TOLD),
-        (np.empty, dict, 0, (), ARRAYS, TOLD),
-        (np.empty, tuple, 0, (), 7, TOLD),
-        (np.empty, tuple, 9, (), ARRAYS, TOLD),
-        (np.empty, tuple, None, (), ARRAYS, TOLD),
-        (np.empty, tuple, 0, 0, ARRAYS, TOLD),
-        (np.empty, tuple, 0, (("a", 1),), ARRAYS, TOLD),
-        (np.empty, tuple, 0, (("a",),), ARRAYS, TOLD),
-        (np.empty, tuple, 0, ("ab",), ARRAYS, TOLD),
+        (tuple, 0, (), (), TOLD),
+        (tuple, 0, (), ARRAYS[:-1], TOLD),
+        (tuple, 0, (), ARRAYS[:3], TOLD),
+        (tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), TOLD),
+        (tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), TOLD),
+        (tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), TOLD),
+        (tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), TOLD),
+        (tuple, (("a", 0), ("b", 1)), (), ARRAYS, TOLD),
+        (dict, 0, (), ARRAYS, TOLD),
+        (tuple, 0, (), 7, TOLD),
+        (tuple, 9, (), ARRAYS, TOLD),
+        (tuple, None, (), ARRAYS, TOLD),
+        (tuple, 0, 0, ARRAYS, TOLD),
+        (tuple, 0, (("a", 1),), ARRAYS, TOLD),
+        (tuple, 0, (("a",),), ARRAYS, TOLD),
+        (tuple, 0, ("ab",), ARRAYS, TOLD),
         (
-            np.empty,
             tuple,
             functools.reduce(lambda form, _: (("a", form),), range(999), 0),
             (),
             ARRAYS,
             TOLD,
         ),
-        ("empty", tuple, 0, (), ARRAYS, TOLD),
-        (np.empty, tuple, 0, (), ARRAYS),
-        (np.empty, tuple, 0, (), ARRAYS, TOLD[:-1]),
-        (np.empty, tuple, 0, (), ARRAYS, ("drawn", "_drawn", list, *TOLD[3:])),
-        (np.empty, tuple, 0, (), ARRAYS, ("drawn", 7, *TOLD[2:])),
+        (tuple, 0, (), ARRAYS),
+        (tuple, 0, (), ARRAYS, TOLD[:-1]),
+        (tuple, 0, (), ARRAYS, ("drawn", "_drawn", list, *TOLD[3:])),
+        (tuple, 0, (), ARRAYS, ("drawn", 7, *TOLD[2:])),
     ],
 )
 def test_results_that_do_not_fit_are_refused(results, monkeypatch):

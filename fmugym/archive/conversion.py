@@ -11,6 +11,7 @@ from typing import Any, Final
 from fmpy.validation import validate_model_description
 
 from fmugym.archive.description import (
+    BASE_UNITS,
     INTERFACES,
     Capabilities,
     ModelDescription,
@@ -28,7 +29,6 @@ _IDENTIFIER: Final = re.compile(r"[^/\\:]{1,200}")
 _OF_ERRORS: Final = re.compile("error|fatal|discard|warning", re.IGNORECASE)
 _MOST_CATEGORIES: Final = 32
 _MOST_EQUATIONS: Final = 1_000_000
-_BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _REFERENCES: Final = range(2**32)
 _ITEMS: Final = range(-(2**63), 2**63)
 
@@ -153,7 +153,7 @@ def _unit(element: Any) -> Unit:
     }
     if base is None:
         return Unit(display_units=displays)
-    dimension = tuple(int(base.get(name, "0")) for name in _BASE_UNITS)
+    dimension = tuple(int(base.get(name, "0")) for name in BASE_UNITS)
     return Unit(dimension, *_linear(base, "factor"), displays)
 
 
@@ -283,7 +283,7 @@ def _convert_variable(source: Any, element: Any, updates: bool) -> Variable:
         variability=source.variability,
         initial=_initial(source),
         start=source.start,
-        unit=_inherited(source, "unit", str),
+        unit=_inherited(source, "unit", str) or None,
         minimum=_bound(source, "min", -math.inf),
         maximum=_bound(source, "max", math.inf),
         nominal=_nominal(source),

@@ -18,12 +18,16 @@ from fmugym.checks import integer_of
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
+    "BASE_UNITS",
     "INTERFACES",
     "Capabilities",
     "ModelDescription",
     "ModelExchange",
     "Unit",
 ]
+
+BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+"""What the dimension of a unit has exponents of."""
 
 INTERFACES = ("co_simulation", "model_exchange")
 """The interfaces by which an FMU may be run, the preferred one first."""
@@ -108,8 +112,8 @@ class Unit:
     """A unit that the model description defines.
 
     Attributes:
-        dimension: The exponents of kg, m, s, A, K, mol, cd and rad; None where the FMU does not
-            give them, as in FMI 1.0.
+        dimension: The exponents of ``BASE_UNITS``; None where the FMU does not give them, as in
+            FMI 1.0.
         factor, offset: A value in this unit times ``factor``, plus ``offset``, is the value in the
             SI unit of this dimension.
         display_units: Factor and offset by name: a value in this unit times the factor, plus the
@@ -119,7 +123,7 @@ class Unit:
     dimension: tuple[int, ...] | None = None
     factor: float = 1.0
     offset: float = 0.0
-    display_units: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    display_units: Mapping[str, tuple[float, float]] = field(default_factory=dict, hash=False)
 
 
 @dataclass(frozen=True)

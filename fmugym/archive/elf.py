@@ -28,6 +28,7 @@ _NEED: Final = struct.Struct("<HHIII")
 _NEEDED_VERSION: Final = struct.Struct("<IHHII")
 _SHARED: Final = 3
 _LOAD, _DYNAMIC = 1, 2
+_WRITABLE: Final = 2
 _SYMBOL_TABLE: Final = 11
 _VERSION_TABLE: Final = 0x6FFFFFFF
 _NEEDED_TABLE: Final = 0x6FFFFFFE
@@ -42,9 +43,11 @@ class Segment(NamedTuple):
     """A row of the program header."""
 
     kind: int
+    is_writable: bool
     offset: int
     address: int
     size: int
+    size_in_memory: int
 
 
 class ElfLibrary:
@@ -77,8 +80,16 @@ class ElfLibrary:
         offset, size, count = self._header[5], self._header[9], self._header[10]
         rows = (self._source.unpack(_SEGMENT, offset + k * size) for k in range(count))
         return [
-            Segment(kind, start, address, length) for kind, _, start, address, _, length, *_ in rows
+            Segment(kind, bool(flags & _WRITABLE), start, address, length, length_in_memory)
+            for kind, flags, start, address, _, length, length_in_memory, _ in rows
         ]
+
+    @property
+    def writable(self) -> list[tuple[int, int]]:
+        """Distance from the beginning of the loaded file, and size, of its writable data."""
+        loaded = [segment for segment in self._segments if segment.kind == _LOAD]
+        begin = next((s.address for s in loaded if s.offset == 0), 0)
+        return [(s.address - begin, s.size_in_memory) for s in loaded if s.is_writable]
 
     @cached_property
     def _dynamic(self) -> list[tuple[int, int]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
-from fmugym.archive.description import Unit
+from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.errors import ConfigError, shown
 
 __all__ = ["IDENTITY", "Conversion", "conversion_between", "conversion_of_link", "definition_of"]
@@ -59,7 +59,7 @@ def conversion_between(
         if dimension is not None and dimension == own_unit.dimension:
             factor, offset = to_base
             return Conversion(own_unit.factor / factor, (own_unit.offset - offset) / factor)
-    return _conversion_by_pint(own, wanted)
+    return _conversion_by_pint(own, definitions, wanted, definitions)
 
 
 def _defined(
@@ -104,7 +104,9 @@ def conversion_of_link(
         for other, (to_base, base_offset) in _defined(target, target_units):
             if dimension is not None and dimension == other:
                 return Conversion(factor / to_base, (offset - base_offset) / to_base)
-    return IDENTITY if source == target else _conversion_by_pint(source, target)
+    if source == target:
+        return IDENTITY
+    return _conversion_by_pint(source, source_units, target, target_units)
 
 
 def definition_of(name: str, units: Mapping[str, Unit]) -> Unit | None:
@@ -119,9 +121,11 @@ _LARGE: Final = 2.0**20
 """The factor is taken from a large difference, so that an offset costs it no digits."""
 
 
-def _conversion_by_pint(own: str, wanted: str) -> Conversion:
+def _conversion_by_pint(
+    own: str, own_units: Mapping[str, Unit], wanted: str, wanted_units: Mapping[str, Unit]
+) -> Conversion:
+    (source, before), (target, after) = _known(own, own_units), _known(wanted, wanted_units)
     pint, registry = _pint()
-    source, target = _parsed(own), _parsed(wanted)
     try:
         zero, large = (
             float(registry.Quantity(value, source).to(target).magnitude) for value in (0.0, _LARGE)
@@ -130,7 +134,22 @@ def _conversion_by_pint(own: str, wanted: str) -> Conversion:
         raise ConfigError(
             f"the unit {shown(wanted)} does not measure what the unit {shown(own)} measures"
         ) from None
-    return Conversion((large - zero) / _LARGE, zero)
+    factor = (large - zero) / _LARGE
+    offset = after.inverse(factor * before.offset + zero)
+    return Conversion(before.factor * factor / after.factor, offset)
+
+
+def _known(name: str, definitions: Mapping[str, Unit]) -> tuple[Any, Conversion]:
+    """A unit of pint, and the conversion to it: what pint does not know is defined by SI units."""
+    try:
+        return _parsed(name), IDENTITY
+    except ConfigError:
+        unit = definition_of(name, definitions)
+        if unit is None or unit.dimension is None:
+            raise
+    powers = zip(BASE_UNITS, unit.dimension, strict=True)
+    base = "*".join(f"{symbol}**({power})" for symbol, power in powers)
+    return _parsed(base), Conversion(unit.factor, unit.offset)
 
 
 @cache

@@ -29,7 +29,7 @@ class CMA:
 
     Attributes:
         mean: The best guess until now, shape (n,).
-        sigma: The present length of steps.
+        sigma: The present length of steps: the root mean square of their standard deviations.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class CMA:
         mean, (norm, sigma) = self.mean + self.sigma * step, self._limits
         self.mean = mean * min(1.0, norm / max(float(np.linalg.norm(mean)), 1e-300))
         growth = min(1.0, self._fade / self._damping * (length / usual - 1))
-        self.sigma = min(self.sigma * math.exp(growth), sigma)
+        self.sigma = min(self.sigma * math.exp(growth) * self._normalize(), sigma)
 
     def _whitened(self, step: FloatArray) -> FloatArray:
         found: FloatArray = self._axes @ (step @ self._axes / self._scales)
@@ -91,6 +91,14 @@ class CMA:
 
     def _moved(self, path: FloatArray, fade: float, step: FloatArray) -> FloatArray:
         return math.sqrt(fade * (2 - fade) * self._mass) * step - fade * path
+
+    def _normalize(self) -> float:
+        """Divide steps by their size, which else would grow beside ``sigma``, and return it."""
+        variances = self._covariance if self._separable else np.diagonal(self._covariance)
+        size = math.sqrt(float(variances.mean()))
+        self._covariance /= size**2
+        self._scales, self._path = self._scales / size, self._path / size
+        return size
 
     def _adapt(self, best: FloatArray, missing: float) -> None:
         """Adapt the covariances; ``missing`` makes up for a path that stood still."""

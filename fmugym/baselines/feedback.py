@@ -44,6 +44,11 @@ class Law(Controller):
             The action, and what the controller remembers then.
         """
 
+    def step(self, rows: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
+        """Do what ``law`` does, for observations of shape (N, k)."""
+        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
+        return self.law(value, setpoint, state)
+
     def _prepare(self) -> None:
         self._check_signal("of", self.of)
         self._check_signal("setpoint", self.setpoint)
@@ -54,9 +59,8 @@ class Law(Controller):
         self._state = tuple(np.where(mask, start, now) for start, now in pairs)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
-        value, setpoint = self._column(rows, self.of), self._column(rows, self.setpoint)
         action: FloatArray
-        action, self._state = self.law(value, setpoint, self._state)
+        action, self._state = self.step(rows, self._state)
         return action
 
 

@@ -155,11 +155,13 @@ def has_range(text: Any) -> bool:
 
 
 def _ends(name: str, value: str) -> tuple[float, float]:
-    low, high = _RANGE.split(value, maxsplit=1)
     try:
-        return float(low), float(high)
+        low, high = map(float, _RANGE.split(value, maxsplit=1))
     except ValueError:
         raise ConfigError(f"expected a range such as {name}=0.05..5, got {shown(value)}") from None
+    if low > high:
+        raise ConfigError(f"{name}={value}: the first end of a range is the lower one")
+    return low, high
 
 
 def _range(low: float, high: float) -> Uniform | LogUniform:

@@ -18,16 +18,8 @@ from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["bounds_of", "clock_of", "own_config", "samplings_of", "time_step_of", "times_of"]
 
-_OF_SECTIONS: Final = frozenset(
-    {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
-    | {"samplings"}
-    | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
-    | {"start_time", "positive_reward", "negative_reward"}
-)
-"""Keys of a config that other sections of a task determine."""
-
-_OUTSIDE: Final = "it stands above all tables"
-_ELSEWHERE: Final = {
+_OF_SECTIONS: Final = {
+    **dict.fromkeys(("time_step", "substeps", "warm_up", "start_time"), "it stands above [config]"),
     "model_input_names": "name the inputs in 'actions' of [agent]",
     "model_output_names": "name the outputs in 'observations' of [agent]",
     "model_parameters": "give them in [parameters]",
@@ -35,11 +27,11 @@ _ELSEWHERE: Final = {
     "samplings": "give variables the key 'sample' in [variables]",
     "episode_variables": "give them in [memory] or [setpoints]",
     "bounds": "give variables 'min' and 'max' in [variables]",
-    "max_episode_steps": "it follows from 'episode_length', which stands above all tables",
+    "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
     "positive_reward": "give an expression for 'reward'",
     "negative_reward": "give an expression for 'reward'",
 }
-"""Where a task says what these keys of a config say."""
+"""Keys of a config that other sections of a task determine, and how."""
 
 _OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
 
@@ -70,7 +62,7 @@ def own_config(root: Entry) -> dict[str, Any]:
     section = root.child("config")
     for key, entry in {} if section.value is None else section.items().items():
         if key in _OF_SECTIONS:
-            raise entry.error(f"{key!r} is no key of [config]: {_ELSEWHERE.get(key, _OUTSIDE)}")
+            raise entry.error(f"{key!r} is no key of [config]: {_OF_SECTIONS[key]}")
     own = {} if section.value is None else section.table(_OF_CONFIG)
     for key, entry in own.items():
         with entry.placing():

@@ -16,7 +16,7 @@ __all__ = ["TaskEnv"]
 
 
 _ARGUMENTS: Final = (
-    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "scenario"),
+    *("config", "log_level", "render_mode", "backend", "isolation", "hooks", "master", "scenario"),
 )
 
 
@@ -33,6 +33,8 @@ class TaskEnv(FMUEnv):
         backend: As for ``FMUEnv``.
         isolation: As for ``FMUEnv``.
         hooks: As for ``FMUEnv``.
+        master: Of a system: ``"gauss_seidel"`` or ``"jacobi"``, in the place of what its SSP
+            archive or the task says.
 
     Attributes:
         task: The task.
@@ -55,12 +57,13 @@ class TaskEnv(FMUEnv):
         backend: Any = None,
         isolation: str | None = None,
         hooks: str = "auto",
+        master: str | None = None,
         **unknown: Never,
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
         self.task = Task.of(config)
-        source = fmu_of(self.task)
+        source = fmu_of(self.task, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, describe(self.task, source), needs_reward)
         self._quantities_of_task = plan.quantities

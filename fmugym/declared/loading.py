@@ -31,7 +31,8 @@ def load(
         scenario: The name of a scenario of the task, in which the episodes then take place.
         physical: Whether observations and actions are in the units of the task, as controllers
             need them, whatever it says for agents; see ``Task.physical``.
-        arguments: Arguments of the environment, such as ``render_mode``; see ``TaskEnv``.
+        arguments: Arguments of the environment, such as ``render_mode`` and ``master``; see
+            ``TaskEnv``.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the

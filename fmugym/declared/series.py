@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import datetime
 import math
@@ -15,17 +16,18 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_option, check_path
+from fmugym.checks import check_integer, check_option, check_path
 from fmugym.declared.entries import Entry
 from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
+from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.extras import imported
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
 DATA_KEYS: Final = (
-    *("file", "column", "time", "values", "times", "step", "period", "interpolation"),
+    *("file", "table", "column", "time", "values", "times", "step", "period", "interpolation"),
     *("unit", "input", "min", "max"),
 )
 """The keys of a column of data."""
@@ -36,11 +38,6 @@ _CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
 _NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
 
 _PARQUET: Final = (".parquet", ".pq")
-
-Cells = Sequence[Any]
-"""The cells of a column: texts of a CSV file, values of a Parquet file."""
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +114,7 @@ def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period:
 
 
 def read_data(entry: Entry) -> Series:
-    """Read a column of a CSV or Parquet file, or a list of values.
+    """Read a column of a file, or a list of values.
 
     Raises:
         ConfigError: If the file or the column is missing, or a cell is no number. The text says
@@ -126,28 +123,34 @@ def read_data(entry: Entry) -> Series:
     table = entry.table(DATA_KEYS)
     if ("file" in table) == ("values" in table):
         raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
-    times, values = _rows_of_list(entry) if "values" in table else _rows_of_file(entry)
-    if not len(times):
-        raise entry.error("expected at least one value")
-    spacing = times[-1] - times[-2] if len(times) > 1 else _DAY
-    given = table.get("period")
-    period = times[-1] - times[0] + spacing if given is None else given.check(duration)
     kind = table.get("interpolation")
-    how = "linear" if kind is None else kind.check(check_option, _INTERPOLATIONS)
-    return Series.of(entry, times, values, float(period), how == "previous")
+    is_stepped = kind is not None and kind.check(check_option, _INTERPOLATIONS) == "previous"
+    rows = _rows_of_list(entry) if "values" in table else _rows_of_file(entry, is_stepped)
+    times, values, period = rows
+    if "period" in table:
+        period = table["period"].check(duration)
+    elif period is None:  # one more row than there are
+        period = times[-1] - times[0] + (times[-1] - times[-2] if len(times) > 1 else _DAY)
+    return Series.of(entry, times, values, float(period), is_stepped)
 
 
-def _rows_of_list(entry: Entry) -> tuple[FloatArray, FloatArray]:
+_Rows = tuple[FloatArray, FloatArray, float | None]
+"""Times, values, and the period that a file gives."""
+
+
+def _rows_of_list(entry: Entry) -> _Rows:
     """The values of a list or an array, and their times."""
     values, times = _listed(entry.child("values")), entry.child("times")
+    if not len(values):
+        raise entry.error("expected at least one value")
     if (times.value is None) == (entry.child("step").value is None):
         raise entry.error("give either the 'step' between the values, or their 'times'")
     if times.value is None:
-        return _even_times(entry.child("step"), len(values)), values
+        return _even_times(entry.child("step"), len(values)), values, None
     moments = _listed(times)
     if len(moments) != len(values):
         raise times.error(f"there are {len(moments)} times, but {len(values)} values")
-    return moments, values
+    return moments, values, None
 
 
 def _listed(entry: Entry) -> FloatArray:
@@ -164,14 +167,55 @@ def _even_times(step: Entry, count: int) -> FloatArray:
     return np.arange(count, dtype=np.float64) * seconds
 
 
-def _rows_of_file(entry: Entry) -> tuple[FloatArray, FloatArray]:
-    rows, column = _read_file(entry.child("file")), entry.required("column")
-    if column.text() not in rows:
-        raise column.error(unknown_name("column", column.value, rows))
-    values = _numbers(column, rows[column.value])
-    if entry.child("step").value is not None:
-        return _even_times(entry.child("step"), len(values)), values
-    return _times(entry, rows), values
+def _rows_of_file(entry: Entry, is_stepped: bool) -> _Rows:
+    table, column = _table(entry), entry.required("column")
+    name = _name_of(column, table.columns)
+    cells, step = table.columns[name], entry.child("step")
+    if step.value is not None:
+        return _even_times(step, len(cells)), _numbers(column, cells), None
+    if table.period is None:
+        values = _numbers(column, cells)
+        return _times(entry, table.columns), values, None
+    times = _times(entry, table.columns)
+    # A mean holds for the time before its row; lines between means lead through the middle of it.
+    times = times - table.means.get(name, 0.0) * (1.0 if is_stepped else 0.5)
+    there = ~np.isnan(cells)
+    _require_short_gaps(column, times[there], table.period, there)
+    return times[there], _numbers(column, np.asarray(cells)[there]), table.period
+
+
+def _table(entry: Entry) -> Table:
+    """The table of a file that is meant. A file of rows has one only."""
+    tables, name = _read_file(entry.child("file")), entry.child("table")
+    if name.value is None and len(tables) == 1:
+        return next(iter(tables.values()))
+    if name.value is None:
+        raise entry.error(f"name one of the tables as 'table': {', '.join(map(repr, tables))}")
+    if name.text() not in tables:
+        raise name.error(unknown_name("table", name.value, tables))
+    return tables[name.value]
+
+
+def _name_of(column: Entry, columns: Mapping[str, Cells]) -> str:
+    """The name of a column that is given by its name, or by its number from 1 on."""
+    if isinstance(column.value, int):
+        return list(columns)[column.check(check_integer, 1, len(columns)) - 1]
+    if column.text() not in columns:
+        raise column.error(unknown_name("column", column.value, columns))
+    return str(column.value)
+
+
+def _require_short_gaps(
+    column: Entry, times: FloatArray, period: float, there: npt.NDArray[np.bool_]
+) -> None:
+    """Refuse a column in which values are missing for more than a day in a row."""
+    gaps = np.diff(times, append=times[:1] + period)
+    longest = gaps.max() if len(gaps) else math.inf
+    if longest > _DAY and not there.all():
+        raise column.error(
+            f"{np.sum(~there)} of {len(there)} values of {shown(column.value)} are missing, for "
+            "more than a day at a time"
+        )
 
 
 def _numbers(entry: Entry, cells: Cells) -> FloatArray:
@@ -184,13 +228,13 @@ def _numbers(entry: Entry, cells: Cells) -> FloatArray:
     return numbers
 
 
-def _read_file(file: Entry) -> Mapping[str, Cells]:
-    """The cells of each column. Environments of one task read a file once."""
+def _read_file(file: Entry) -> Mapping[str, Table]:
+    """The tables of a file by name. Environments of one task read it once."""
     path = check_path("file", file.text())
     try:
         status = path.stat()
         with file.placing():
-            read = _read_parquet if path.suffix.lower() in _PARQUET else _read_csv
+            read = _read_parquet if path.suffix.lower() in _PARQUET else _read_text
             return read(path, status.st_mtime_ns, status.st_size)
     except FileNotFoundError:
         near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
@@ -201,7 +245,7 @@ def _read_file(file: Entry) -> Mapping[str, Cells]:
 
 
 @lru_cache(maxsize=16)
-def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
+def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
     """Read a Parquet file, whose cells have types."""
     pyarrow, parquet = imported("pyarrow", "parquet"), imported("pyarrow.parquet", "parquet")
     try:
@@ -210,16 +254,26 @@ def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
         raise ConfigError(f"{path.name} is no Parquet file: {reason(error)}") from None
     if not table.num_rows:
         raise ConfigError(f"{path.name} has no rows")
-    return {name: table[name].to_pylist() for name in table.column_names}
+    return {path.stem: Table({name: table[name].to_pylist() for name in table.column_names})}
 
 
 @lru_cache(maxsize=16)
-def _read_csv(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
-    """Read a file. A semicolon separates cells where the first line has one."""
+def _read_text(path: Path, changed: int, size: int) -> Mapping[str, Table]:
+    """Read a file. Its first line tells what it is."""
+    content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    if content.startswith((b"#1", b"LOCATION,")):  # names of places have any encoding
+        lines = [line.decode("latin-1") for line in content.splitlines()]
+        if content.startswith(b"#1"):
+            return read_modelica(path.name, lines)
+        return {path.stem: read_weather(path.name, lines)}
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        return {path.stem: _read_csv(path, content.decode("utf-8").splitlines())}
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is not encoded in UTF-8") from None
+
+
+def _read_csv(path: Path, lines: Sequence[str]) -> Table:
+    """Read rows of cells. A semicolon separates them where the first line has one."""
     delimiter = ";" if lines and ";" in lines[0] else ","
     header, *rows = [row for row in csv.reader(lines, delimiter=delimiter) if row] or [[]]
     for number_of_row, row in enumerate(rows, 2):
@@ -230,7 +284,7 @@ def _read_csv(path: Path, changed: int, size: int) -> Mapping[str, Cells]:
     if not rows:
         raise ConfigError(f"{path.name} has no rows below its header")
     names = [name.strip() for name in header]
-    return dict(zip(names, zip(*rows, strict=True), strict=True))
+    return Table(dict(zip(names, zip(*rows, strict=True), strict=True)))
 
 
 def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -45,18 +46,47 @@ _CHECKS: Final[dict[str, Callable[..., Any]]] = {
 """All other keys are texts."""
 
 
-def fmu_of(task: Task) -> Path | FMUSystem:
-    """Find the FMU of a task: the path of an FMU or of an SSP archive, or a declared system.
+def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
+    """Find the FMU of a task: the path of an FMU, or the system of an SSP archive or of the file.
+
+    Args:
+        task: The task.
+        master: Of a system, in the place of what the archive or the file says.
 
     Raises:
         ConfigError: If the task names none, or there is no bundled FMU of this name.
     """
     section = task.root.child("system")
     if section.value is None:
-        return _path(task.root.required("fmu"))
+        return _fmu_or_archive(task.root.required("fmu"), master)
     if task.root.child("fmu").value is not None:
         raise section.error("a task has either 'fmu' or 'system'")
-    return system_of(section)
+    return system_of(section, master)
+
+
+def _fmu_or_archive(entry: Entry, master: str | None) -> Path | FMUSystem:
+    path = _path(entry)
+    if path.suffix.lower() == ".ssp":
+        status = _status(entry, path)
+        with entry.placing(), _placing_load(entry):
+            return _read_archive(path, status.st_mtime_ns, status.st_size, master)
+    if master is not None:
+        raise entry.error(f"a master is for systems; {path.name} is a single FMU")
+    return path
+
+
+@contextmanager
+def _placing_load(entry: Entry) -> Iterator[None]:
+    """Let errors of a file say where the task names it."""
+    try:
+        yield
+    except FMULoadError as error:
+        raise type(error)(str(entry.error(error))) from error
+
+
+@lru_cache(maxsize=16)
+def _read_archive(path: Path, changed: int, size: int, master: str | None) -> FMUSystem:
+    return FMUSystem.read(path, master=master)
 
 
 def _path(entry: Entry) -> Path:
@@ -73,8 +103,12 @@ def _path(entry: Entry) -> Path:
         return bundled_fmu(entry.required("bundled").text(), version)
 
 
-def system_of(section: Entry) -> FMUSystem:
+def system_of(section: Entry, master: str | None = None) -> FMUSystem:
     """Make the system that the section ``[system]`` declares.
+
+    Args:
+        section: The section.
+        master: In the place of what it says.
 
     Raises:
         ConfigError: If it has a mistake. The text says where.
@@ -83,11 +117,14 @@ def system_of(section: Entry) -> FMUSystem:
     table = section.table(_KEYS)
     named = section.required("components").items()
     components = {name: _component(entry) for name, entry in named.items()}
-    key = json.dumps(section.value, default=repr), tuple(map(_version, components.values()))
+    states = tuple(map(_version, components.values()))
+    key = json.dumps(section.value, default=repr), states, master
     known = _known.get(key)
     if known is not None:
         return known
     options = {name: _value(table[name]) for name in table if name not in _TABLES}
+    if master is not None:
+        options["master"] = master
     if "units" in table:
         units = table["units"].items()
         options["units"] = {name: entry.text() for name, entry in units.items()}
@@ -162,10 +199,8 @@ def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:
         return source.as_fmu().description
     entry = task.root.child("fmu")
     status = _status(entry, source)
-    try:
+    with _placing_load(entry):
         description = _read_description(source, status.st_mtime_ns, status.st_size)
-    except FMULoadError as error:
-        raise type(error)(str(entry.error(error))) from error
     return _resized(description, task.root.child("parameters"))
 
 
@@ -189,6 +224,4 @@ def _status(entry: Entry, path: Path) -> Any:
 
 @lru_cache(maxsize=16)
 def _read_description(path: Path, changed: int, size: int) -> ModelDescription:
-    if path.suffix.lower() == ".ssp":
-        return FMUSystem.read(path).as_fmu().description
     return FMU(path).description

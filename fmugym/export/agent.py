@@ -11,9 +11,10 @@ from fmugym.archive.description import Unit
 from fmugym.checks import check_text
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.export.decisions import decision_of
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
-from fmugym.export.policies import network_of_model
+from fmugym.search.agent import Agent as FoundAgent
 
 __all__ = ["Agent", "agent_of"]
 
@@ -34,29 +35,16 @@ class Agent:
     Attributes:
         name: What functions and files are called by.
         logic: What surrounds the network.
-        network: The network.
+        network: The network; None for none.
         notes: Lines that tell a reader what it is.
         units: The units of the plant by name.
     """
 
     name: str
     logic: Logic
-    network: Network
+    network: Network | None
     notes: tuple[str, ...] = ()
     units: Mapping[str, Unit] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        count = len(self.logic.observation)
-        if self.network.width != count:
-            raise ConfigError(
-                f"the agent is for another task: its network takes {self.network.width} values, "
-                f"the task gives {count}"
-            )
-        if self.network.space != self.logic.action_space:
-            raise ConfigError(
-                f"the agent is for another task: its actions are {self.network.space}, those of "
-                f"the task are {self.logic.action_space}"
-            )
 
     @property
     def version(self) -> str:
@@ -76,8 +64,10 @@ def agent_of(
     """Put an agent together from its task and its policy.
 
     Args:
-        env: The environment that the agent was trained in, without wrappers.
-        model: A model of Stable-Baselines3 or sb3-contrib, or a ``Network``.
+        env: The environment that the agent was trained in, without wrappers. Agents of a search
+            and controllers need the physical form of a task, see ``Task.physical``.
+        model: An agent that a search has found, or its policy, a ``PID`` or a ``Hysteresis``; a
+            model of Stable-Baselines3 or sb3-contrib; or a ``Network``.
         normalization: The ``VecNormalize`` of the training; None if there was none.
         name: What functions and files are called by: letters, digits and _.
         all_inputs: Whether the agent also writes inputs that no action changes, such as the
@@ -92,15 +82,18 @@ def agent_of(
         raise ConfigError(f"the name must have letters, digits and _ only, got {shown(name)}")
     if name in _TAKEN:
         raise ConfigError(f"the name {name!r} is that of a file of C; choose another one")
-    network = model if isinstance(model, Network) else network_of_model(model, normalization)
-    logic = logic_of(env, all_inputs=all_inputs, external=external)
-    return Agent(name, logic, network, _notes(env, model), env.fmu.description.units)
+    decision = decision_of(env, model, normalization)
+    logic = logic_of(env, decision, all_inputs=all_inputs, external=external)
+    return Agent(name, logic, decision.network, _notes(env, model), env.fmu.description.units)
 
 
 def _notes(env: FMUEnv, model: Any) -> tuple[str, ...]:
     spec = getattr(env, "spec", None)
     task = type(env).__name__ if spec is None else str(spec.id)
+    policy = type(model).__name__
+    if isinstance(model, FoundAgent):
+        policy = model.name if model.text is None else f"{model.name} ({model.text})"
     return (
-        f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {type(model).__name__}.",
+        f"Task: {task}, FMU: {env.fmu.description.model_name}, policy: {policy}.",
         "Compile it with -ffp-contract=off for the same numbers on every processor.",
     )

@@ -129,7 +129,7 @@ class _Source:
 
     def text(self) -> str:
         """The whole file."""
-        step, network = self._step(), self._network()
+        step, network = self._step(), self._agent.network
         return "\n".join(
             [
                 f"/* See {self._name}.h. */",
@@ -141,7 +141,7 @@ class _Source:
                 "",
                 *self._table_lines(),
                 *self._helper_lines(),
-                *network,
+                *(() if network is None else network_lines(self._name, network)),
                 *self._init(),
                 "",
                 *step,
@@ -155,7 +155,7 @@ class _Source:
         uses: Counter[int] = Counter()
         for number in self._logic.needed - self._logic.loads.keys():
             uses.update(self._graph.nodes[number].operands)
-        uses.update(self._logic.observation)
+        uses.update(self._logic.features)
         uses.update(self._logic.input_nodes)
         uses.update(node for kept in self._logic.kept for node in kept.updates)
         return uses
@@ -235,8 +235,8 @@ class _Source:
                 return "count"
             case "active":
                 return "(count > 0)"
-            case "chosen":
-                return f"chosen[{load[1]}]"
+            case "given":
+                return f"given[{load[1]}]"
         return constant(load[1], node.dtype.char)
 
     def _kept_value(self, field: int, element: int) -> str:
@@ -297,13 +297,9 @@ class _Source:
         return [
             f"int {name}_step({name}_state *state, const double *measurements, double *actions) {{",
             "    const int64_t count = state->count;",
-            f"    {self._agent.network.c_type} observation[{len(logic.observation)}];",
-            f"    {self._chosen_type} chosen[{len(self._agent.network.parts)}];",
             "",
             *self._check_of_measurements(),
-            *self._evaluated(logic.observation),
-            *self._stored("observation", logic.observation, self._agent.network.c_type),
-            f"    {name}_network(observation, chosen);",
+            *self._asking_the_network(),
             *self._evaluated([*logic.input_nodes, *updates]),
             *self._stored("actions", logic.input_nodes, "double"),
             *self._stored_state(),
@@ -323,9 +319,14 @@ class _Source:
         yield "        }"
         yield "    }"
 
-    @property
-    def _chosen_type(self) -> str:
-        return c_type(np.dtype(self._logic.action_space.dtype))
+    def _asking_the_network(self) -> Iterator[str]:
+        features, network = self._logic.features, self._agent.network
+        if network is not None:
+            yield from self._evaluated(features)
+            yield f"    {network.c_type} features[{len(features)}];"
+            yield f"    {c_type(network.gives)} given[{len(network.parts)}];"
+            yield from self._stored("features", features, network.c_type)
+            yield f"    {self._name}_network(features, given);"
 
     def _stored(self, array: str, nodes: Sequence[int], kind: str) -> Iterator[str]:
         for index, node in enumerate(nodes):
@@ -337,8 +338,3 @@ class _Source:
         for field, kept in zip(self._fields, self._logic.kept, strict=True):
             if kept.updates:
                 yield from self._stored(f"state->{field}", kept.updates, c_type(kept.dtype))
-
-    # The network.
-
-    def _network(self) -> Iterator[str]:
-        return network_lines(self._name, self._agent.network, self._chosen_type)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 from xml.etree import ElementTree
 
-from fmugym.archive.description import Unit
+from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.variable import Variable
 from fmugym.export.agent import Agent
 
@@ -33,7 +33,6 @@ _KINDS: Final[Mapping[str, str]] = {
 
 _OF_FMI_2: Final = {"real": "Real", "boolean": "Boolean"}
 _OF_FMI_3: Final = {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64"}
-_BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def _add_units(root: Any, ports: Sequence[Port], units: Mapping[str, Unit]) -> N
         unit = units.get(name)
         if unit is None or unit.dimension is None:
             continue
-        exponents = zip(_BASE_UNITS, unit.dimension, strict=True)
+        exponents = zip(BASE_UNITS, unit.dimension, strict=True)
         facts = {base: str(power) for base, power in exponents if power}
         facts |= {} if unit.factor == 1.0 else {"factor": repr(unit.factor)}
         facts |= {} if unit.offset == 0.0 else {"offset": repr(unit.offset)}

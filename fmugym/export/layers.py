@@ -67,13 +67,12 @@ _ACTIVATIONS: Final[Mapping[str, str]] = {
 }
 
 
-def network_lines(name: str, network: Network, chosen: str) -> Iterator[str]:
+def network_lines(name: str, network: Network) -> Iterator[str]:
     """The arrays and functions of a network.
 
     Args:
         name: The name of the agent.
         network: The network.
-        chosen: The type of the elements of the action.
     """
     letter = network.dtype.char
     kind = TYPES[letter]
@@ -96,7 +95,7 @@ def network_lines(name: str, network: Network, chosen: str) -> Iterator[str]:
     yield "}"
     yield ""
     yield from _scaling_arrays(name, network)
-    yield f"static void {name}_network(const {kind} *observation, {chosen} *chosen) {{"
+    yield f"static void {name}_network(const {kind} *features, {c_type(network.gives)} *given) {{"
     yield from _network_body(name, network, letter)
     yield "}"
     yield ""
@@ -112,7 +111,7 @@ def _scaling_arrays(name: str, network: Network) -> Iterator[str]:
 def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
     kind = TYPES[letter]
     widths = [network.width, *(len(layer.bias) for layer in network.layers)]
-    before = "observation"
+    before = "features"
     if network.scaling is not None:
         yield f"    {kind} scaled[{network.width}];"
     for index, width in enumerate(widths[1:]):
@@ -121,7 +120,7 @@ def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
     if network.scaling is not None:
         before = "scaled"
         yield f"    for (int i = 0; i < {network.width}; i++) {{"
-        yield f"        const double shifted = (double)observation[i] - {name}_mean[i];"
+        yield f"        const double shifted = (double)features[i] - {name}_mean[i];"
         yield f"        const double x = shifted / {name}_divisor[i];"
         yield f"        const double limit = {name}_limit[i];"
         yield f"        scaled[i] = ({kind})(x > limit ? limit : x < -limit ? -limit : x);"
@@ -132,7 +131,7 @@ def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
         before = f"values_{index}"
         for activation in layer.activations:
             yield from _activation_lines(activation, before, widths[index + 1], letter)
-    yield from _decision(network, before, letter)
+    yield from _result(network, before)
 
 
 def _activation_lines(activation: Activation, array: str, width: int, letter: str) -> Iterator[str]:
@@ -145,32 +144,21 @@ def _activation_lines(activation: Activation, array: str, width: int, letter: st
     yield "    }"
 
 
-def _decision(network: Network, values: str, letter: str) -> Iterator[str]:
-    """From the last values to the elements of the action."""
+def _result(network: Network, values: str) -> Iterator[str]:
+    """The last values themselves, or the elements that the largest ones choose."""
     if isinstance(network.space, spaces.Box):
-        yield from _continuous(network, values, letter)
+        yield f"    for (int i = 0; i < {len(network.parts)}; i++) {{"
+        yield f"        given[i] = {values}[i];"
+        yield "    }"
         return
-    chosen, begin = c_type(np.dtype(network.space.dtype)), 0
+    begin = 0
     for index, (count, start) in enumerate(zip(network.parts, network.starts, strict=True)):
-        yield f"    chosen[{index}] = 0;"
+        yield f"    given[{index}] = 0;"
         yield f"    for (int i = 1; i < {count}; i++) {{"
-        yield f"        if ({values}[{begin} + i] > {values}[{begin} + chosen[{index}]]) {{"
-        yield f"            chosen[{index}] = ({chosen})i;"
+        yield f"        if ({values}[{begin} + i] > {values}[{begin} + given[{index}]]) {{"
+        yield f"            given[{index}] = ({c_type(network.gives)})i;"
         yield "        }"
         yield "    }"
         if start:
-            yield f"    chosen[{index}] += {start};"
+            yield f"    given[{index}] += {start};"
         begin += count
-
-
-def _continuous(network: Network, values: str, letter: str) -> Iterator[str]:
-    space: Any = network.space
-    kind = c_type(np.dtype(space.dtype))
-    for index, (low, high) in enumerate(zip(space.low.flat, space.high.flat, strict=True)):
-        first, last = constant(low, letter), constant(high, letter)
-        x = f"{values}[{index}]"
-        if network.squashed:
-            text = f"{first} + {constant(0.5, letter)} * ({x} + 1) * ({last} - {first})"
-        else:
-            text = f"{x} < {first} ? {first} : {x} > {last} ? {last} : {x}"
-        yield f"    chosen[{index}] = ({kind})({text});"

@@ -1,12 +1,14 @@
-"""What surrounds the network of an agent: from measurements to its observation, and to inputs.
+"""What surrounds the network of an agent: from measurements to its features, and to inputs.
 
-The hooks of the task are traced as those of vector environments are. Between two samples a
-controller knows its measurements and what it has kept: earlier measurements, actions and inputs,
-and the episode variables that ``_update`` writes.
+The hooks of the task are traced as those of vector environments are, and between them what the
+agent itself computes. Between two samples a controller knows its measurements and what it has
+kept: earlier measurements, actions and inputs, the episode variables that ``_update`` writes, and
+what the agent remembers.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -18,6 +20,7 @@ from gymnasium import spaces
 from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.export.decisions import Decision
 from fmugym.export.devices import without_imperfections
 from fmugym.export.external import found_in
 from fmugym.task.readings import Readings, reading
@@ -26,7 +29,8 @@ from fmugym.vector.hooks.graph import Graph, Node
 from fmugym.vector.hooks.lowering import Store
 from fmugym.vector.hooks.patches import exclusive
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.symbols import loaded
+from fmugym.vector.hooks.symbolic import element_names
+from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded, spread
 from fmugym.vector.hooks.tables import tables_in
 from fmugym.vector.hooks.trace import SeenArray, Tracer
 
@@ -34,10 +38,13 @@ __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
 
 Load = tuple[Any, ...]
 """Where a value comes from: ``("measurement", i)``, ``("kept", field, i)``, ``("count",)``,
-``("active",)``, ``("chosen", i)`` or ``("constant", value)``."""
+``("active",)``, ``("given", i)`` by the network, or ``("constant", value)``."""
 
-_CHOSEN: Final = "chosen"
+_GIVEN: Final = "given"
+_ANY_ACTION: Final = "any action"
+_PAST_ACTIONS: Final = ("action", "previous_action")
 _SEED: Final = 0
+_OF_ANY: Final = Decision()
 
 
 @dataclass(frozen=True)
@@ -86,12 +93,10 @@ class Logic:
         measurements: The plant's outputs that it reads.
         inputs: The plant's inputs that it writes.
         input_nodes: The node of each.
-        observation: The nodes of the elements of the observation, in the order in which networks
-            take them.
+        features: The nodes of what the network takes; none if there is no network.
         kept: What it keeps.
         parameters: What was drawn in each episode.
         time_step: From one sample to the next, in seconds.
-        observation_space, action_space: Those of the environment.
     """
 
     graph: Graph
@@ -99,27 +104,32 @@ class Logic:
     measurements: tuple[Variable, ...]
     inputs: tuple[Variable, ...]
     input_nodes: tuple[int, ...]
-    observation: tuple[int, ...]
+    features: tuple[int, ...]
     kept: tuple[Kept, ...]
     parameters: tuple[Parameter, ...]
     time_step: float
-    observation_space: spaces.Space[Any]
-    action_space: spaces.Space[Any]
 
     @property
     def needed(self) -> frozenset[int]:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
-        roots = [*self.observation, *self.input_nodes, *updates]
+        roots = [*self.features, *self.input_nodes, *updates]
         return _closure(self.graph, roots, self.loads)
 
 
-def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str] = ()) -> Logic:
-    """Trace what a task does between measurements and observation, and from action to inputs.
+def logic_of(
+    env: FMUEnv,
+    decision: Decision = _OF_ANY,
+    *,
+    all_inputs: bool = False,
+    external: Collection[str] = (),
+) -> Logic:
+    """Trace what a task and its agent do between measurements and inputs, but for the network.
 
     Args:
         env: The environment. It is not stepped. What its sensors and actuators do is left out; see
             ``without_imperfections``.
+        decision: From the observation to the action; by default that of any network.
         all_inputs: Whether the controller also writes inputs that no action changes, such as the
             weather that the task feeds to the plant.
         external: The names of data that the controller is given as measurements, forecasts of
@@ -127,13 +137,15 @@ def logic_of(env: FMUEnv, *, all_inputs: bool = False, external: Collection[str]
 
     Raises:
         ConfigError: If a hook does what cannot be translated, or reads what a controller does not
-            have. The text names the hook or the value.
+            have, or the network is for another task. The text names the hook or the value.
     """
     with without_imperfections(env) as ideal:
-        return _logic_of_ideal(ideal, all_inputs, external)
+        return _logic_of_ideal(ideal, decision, all_inputs, external)
 
 
-def _logic_of_ideal(env: FMUEnv, all_inputs: bool, external: Collection[str]) -> Logic:
+def _logic_of_ideal(
+    env: FMUEnv, decision: Decision, all_inputs: bool, external: Collection[str]
+) -> Logic:
     if env._own.step or env._own.reset:
         name = "step" if env._own.step else "reset"
         raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
@@ -146,7 +158,7 @@ def _logic_of_ideal(env: FMUEnv, all_inputs: bool, external: Collection[str]) ->
         if env._play is not None:  # compiled steps keep in the pool what hooks read
             env._player.give_back(env)
         with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-            traced = _ControllerTracer(env, {}).traced()
+            traced = _ControllerTracer(env, decision).traced()
         return _Assembly(env, traced, all_inputs, external).logic()
     except UntraceableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
@@ -156,13 +168,23 @@ def _logic_of_ideal(env: FMUEnv, all_inputs: bool, external: Collection[str]) ->
 class _Traced:
     graph: Graph
     observation: tuple[int, ...]
+    features: tuple[int, ...]
+    action: tuple[int, ...]
     inputs: tuple[int, ...]
+    are_chosen: tuple[bool, ...]
     updates: Mapping[str, tuple[int, ...]]
     types: Mapping[str, np.dtype[Any]]
+    starts: Mapping[str, npt.NDArray[Any]]
 
 
 class _ControllerTracer(Tracer):
     """Traces one sample of a controller in a single graph."""
+
+    def __init__(self, env: FMUEnv, decision: Decision) -> None:
+        super().__init__(env, {})
+        self._decision, self._features = decision, ()
+
+    _features: tuple[int, ...]
 
     def traced(self) -> _Traced:
         """Trace the hooks, again if ``_update`` gives variables other types."""
@@ -179,25 +201,68 @@ class _ControllerTracer(Tracer):
         for store in stores:
             row: Any = store.row
             nodes[row[1]].append(store.node)
+        observation = self._observed()
+        action, memory = self._decided(observation)
+        are_chosen, inputs = self._followed(action)
+        remembered = dict(zip(self._decision.starts, memory, strict=True))
+        return _Traced(
+            self._graph,
+            observation,
+            self._features,
+            tuple(action.reshape(-1).tolist()),
+            inputs,
+            are_chosen,
+            {name: tuple(numbers) for name, numbers in (nodes | remembered).items()},
+            self._variables | dict.fromkeys(remembered, np.dtype(np.float64)),
+            self._decision.starts,
+        )
+
+    def _observed(self) -> tuple[int, ...]:
         seen: list[SeenArray] = []
         observed: list[Store] = []
         self._contents = Contents(self._env)
         self._call("_get_observation", lambda v: self._see_observation(v, seen, observed))
-        self._decide()
-        inputs = self._call("_get_inputs", self._input_nodes)
-        updates = {name: tuple(numbers) for name, numbers in nodes.items()}
-        observation = tuple(store.node for store in observed)
-        return _Traced(self._graph, observation, tuple(inputs), updates, dict(self._variables))
+        return tuple(store.node for store in observed)
 
-    def _decide(self) -> None:
-        """Let hooks read the action that the network has chosen now."""
-        env: Any = self._env
-        names = np.empty(env.action_space.shape or (), object)
-        for index, place in enumerate(np.ndindex(names.shape)):
-            names[place] = (_CHOSEN, index)
+    def _decided(self, observation: Iterable[int]) -> tuple[npt.NDArray[Any], list[list[int]]]:
+        """The nodes of the action, and of what the agent remembers then."""
+        graph, space, double = self._graph, self._env.action_space, np.dtype(np.float64)
+        observed = [spread(graph, np.array(n), graph.nodes[n].dtype) for n in observation]
+        memory = [
+            loaded(graph, "row", element_names(start.shape, "before", name), double)
+            for name, start in self._decision.starts.items()
+        ]
+        action, then = self._decision.decide(as_symbols(graph, observed), memory, self._asked)
+        shape = space.shape or ()
+        elements = as_symbols(graph, action).reshape(*shape, LANES)
+        kept = [self._nodes(one, None, double).tolist() for one in then]
+        return self._nodes(elements, shape, space.dtype), kept
+
+    def _asked(self, features: Any) -> Any:
+        """What the network gives for some features, which are noted."""
+        network, space = self._decision.network, self._env.action_space
+        self._features = tuple(self._nodes(features, None, None).tolist())
+        if network is not None:
+            network.require_fitting(len(self._features), space)
+        names = element_names((math.prod(space.shape or ()),), _GIVEN)
+        dtype = np.dtype(space.dtype) if network is None else network.gives
+        return loaded(self._graph, "row", names, dtype)
+
+    def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
+        """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
+        env, dtype = self._env, np.dtype(self._env.action_space.dtype)
         env.previous_action, env.previous_state = env.action, env.state
-        env.action = loaded(self._graph, "row", names, env.action_space.dtype)
-        self._contents = Contents(env)
+        unknown = loaded(self._graph, "row", element_names(action.shape, _ANY_ACTION), dtype)
+        found = []
+        for one in (unknown, unknown.like(spread(self._graph, action, dtype).cells)):
+            env.action = one
+            self._contents = Contents(env)
+            found.append(self._call("_get_inputs", self._input_nodes))
+        are_chosen = (
+            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in _closure(self._graph, [node]))
+            for node in found[0]
+        )
+        return tuple(are_chosen), tuple(found[1])
 
 
 class _Assembly:
@@ -209,12 +274,12 @@ class _Assembly:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
         self._episode = env._plan.draw(rng)
+        self._starts = {**self._episode.variables, **traced.starts}
         self._drawn = set(env._plan.drawn_names)
         self._external = self._given(external)
+        rows = zip(env._interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [
-            (variable, node)
-            for variable, node in zip(env._interface.inputs, traced.inputs, strict=True)
-            if all_inputs or self._is_chosen(node)
+            (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
         ]
         if not self._inputs:
             raise ConfigError(f"the actions of {type(env).__name__} change no input of the FMU")
@@ -233,13 +298,9 @@ class _Assembly:
             for one in found
         }
 
-    def _is_chosen(self, node: int) -> bool:
-        nodes = (self._graph.nodes[number] for number in self._closure([node]))
-        return any(_is_row(one, _CHOSEN) for one in nodes)
-
     def logic(self) -> Logic:
-        """Find all that the observation and the inputs depend on, from sample to sample."""
-        roots = [*self._traced.observation, *(node for _, node in self._inputs)]
+        """Find all that the features and the inputs depend on, from sample to sample."""
+        roots = [*self._traced.features, *(node for _, node in self._inputs)]
         needed = self._closure(roots)
         while True:
             found = [*roots, *self._next_values(needed)]
@@ -259,12 +320,10 @@ class _Assembly:
             (*(outputs[place] for place in places), *self._external.values()),
             tuple(variable for variable, _ in self._inputs),
             tuple(node for _, node in self._inputs),
-            self._traced.observation,
+            self._traced.features,
             tuple(self._kept),
             tuple(self._parameters),
             env._interface.time_step,
-            env.observation_space,
-            env.action_space,
         )
 
     def _closure(self, roots: Iterable[int]) -> frozenset[int]:
@@ -279,6 +338,8 @@ class _Assembly:
             yield from self._traced.updates.get(name, ())
         if any(_is_row(node, "input") for node in self._nodes(needed)):
             yield from self._traced.inputs
+        if any(node.kind in _PAST_ACTIONS for node in self._nodes(needed)):
+            yield from self._traced.action
 
     def _variables_in(self, needed: Iterable[int]) -> list[str]:
         rows = [node.what for node in self._nodes(needed) if _is_row(node, "before")]
@@ -334,16 +395,14 @@ class _Assembly:
         space: Any = self._env.action_space
         dtype, first = np.dtype(space.dtype), np.ravel(self._env._no_action)
         has_older = any(node.kind == "previous_action" for node in nodes)
-        if has_older or any(node.kind == "action" for node in nodes):
-            rows = [("row", (_CHOSEN, index)) for index in range(len(first))]
-            chosen = [self._graph.load(*row, dtype, 0).node for row in rows]
-            self._add("action", dtype, first.tolist(), chosen)
+        if any(node.kind in _PAST_ACTIONS for node in nodes):
+            self._add("action", dtype, first.tolist(), self._traced.action)
         if has_older:
             last = [self._graph.load("action", i, dtype, 0).node for i in range(len(first))]
             self._add("previous_action", dtype, first.tolist(), last)
 
     def _add_variable(self, name: str) -> None:
-        dtype, value = self._traced.types[name], np.ravel(self._episode.variables[name])
+        dtype, value = self._traced.types[name], np.ravel(self._starts[name])
         updates = self._traced.updates.get(name, ())
         self._add(name, dtype, value.astype(dtype).tolist(), updates)
         if name in self._drawn:
@@ -397,8 +456,8 @@ class _Assembly:
                 return "kept", self._fields["inputs"], row[1]
             case "step_count":
                 return ("count",)
-            case "chosen":
-                return _CHOSEN, row[1]
+            case "given":
+                return _GIVEN, row[1]
             case "before":
                 return "kept", self._fields[row[1]], row[2]
             case "parameter" if row[1] in self._drawn:
@@ -413,7 +472,7 @@ def _is_row(node: Node, kind: str) -> bool:
     return node.kind == "row" and what[0] == kind
 
 
-def _closure(graph: Graph, roots: Iterable[int], known: Container[int]) -> frozenset[int]:
+def _closure(graph: Graph, roots: Iterable[int], known: Container[int] = ()) -> frozenset[int]:
     """Some nodes, and all that they are computed from, as far as they are not known."""
     found: set[int] = set()
     waiting = list(roots)

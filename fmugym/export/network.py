@@ -152,12 +152,30 @@ class Network:
         return (1,) * int(np.prod(space.shape))
 
     @property
+    def gives(self) -> np.dtype[Any]:
+        """The type of what it gives: the last values, or the chosen elements."""
+        return self.dtype if isinstance(self.space, spaces.Box) else np.dtype(self.space.dtype)
+
+    @property
     def starts(self) -> tuple[int, ...]:
         """The lowest value of each discrete element; empty if actions are continuous."""
         space: Any = self.space
         if isinstance(space, spaces.Box):
             return ()
         return tuple(int(start) for start in np.ravel(space.start))
+
+    def require_fitting(self, count: int, space: spaces.Space[Any]) -> None:
+        """Refuse a task that gives another number of values, or has other actions."""
+        if self.width != count:
+            raise ConfigError(
+                f"the agent is for another task: its network takes {self.width} values, the task "
+                f"gives {count}"
+            )
+        if self.space != space:
+            raise ConfigError(
+                f"the agent is for another task: its actions are {self.space}, those of the task "
+                f"are {space}"
+            )
 
     def values(self, observation: FloatArray) -> FloatArray:
         """The last values for an observation of shape (k,)."""
@@ -171,17 +189,25 @@ class Network:
 
     def action(self, observation: FloatArray) -> FloatArray:
         """The action for an observation of shape (k,), flat."""
-        values, space = self.values(observation), self.space
-        if isinstance(space, spaces.Box):
-            low, high = np.ravel(space.low), np.ravel(space.high)
-            if self.squashed:
-                values = low + 0.5 * (values + 1) * (high - low)
-            else:
-                values = np.clip(values, low, high)
-            return values.astype(space.dtype)
+        values = self.values(observation)
+        if isinstance(self.space, spaces.Box):
+            limited: FloatArray = self.limited(values).astype(self.space.dtype)
+            return limited
         ends = np.cumsum(self.parts)[:-1]
         best = [int(np.argmax(part)) for part in np.split(values, ends)]
         return np.array(best, np.int64) + np.array(self.starts, np.int64)
+
+    def limited(self, values: Any) -> Any:
+        """Bring the last values into the range of the actions; all may be arrays or symbols.
+
+        Args:
+            values: Shape (m, ...).
+        """
+        space: Any = self.space
+        limits = zip(values, space.low.flat, space.high.flat, strict=True)
+        if self.squashed:
+            return np.stack([low + 0.5 * (x + 1) * (high - low) for x, low, high in limits])
+        return np.stack([np.clip(x, low, high) for x, low, high in limits])
 
 
 def network_of(modules: Any, space: spaces.Space[Any], **more: Any) -> Network:

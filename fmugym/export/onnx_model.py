@@ -15,7 +15,7 @@ from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
 from fmugym.export.agent import Agent
 from fmugym.export.c99 import field_names
-from fmugym.export.network import Activation
+from fmugym.export.network import Activation, Network, Scaling
 from fmugym.export.onnx_nodes import Nodes, imported_onnx
 from fmugym.export.onnx_operations import computed, interpolated
 from fmugym.vector.hooks.graph import Node
@@ -73,13 +73,14 @@ class _Model:
         self._onnx, self._nodes = imported_onnx(), Nodes()
         self._fields = field_names(agent)
         self._names: dict[int, str] = {}
-        self._chosen: list[str] = []
+        self._given: list[str] = []
 
     def model(self) -> Any:
         """The checked model."""
         logic, updates = self._logic, [n for kept in self._logic.kept for n in kept.updates]
-        self._evaluate(logic.observation)
-        self._chosen = self._network(self._rows(logic.observation, self._agent.network.dtype))
+        if self._agent.network is not None:
+            self._evaluate(logic.features)
+            self._given = self._network(self._agent.network)
         self._evaluate([*logic.input_nodes, *updates])
         self._store("actions", logic.input_nodes, _DOUBLE)
         outputs = [self._value("actions", _DOUBLE, len(logic.inputs))]
@@ -126,7 +127,10 @@ class _Model:
 
     def _metadata(self) -> dict[str, str]:
         logic = self._logic
-        starts = {name: list(k.starts) for name, k in zip(self._fields, logic.kept, strict=True)}
+        starts = {
+            name: [None if start != start else start for start in kept.starts]  # JSON has no NaN
+            for name, kept in zip(self._fields, logic.kept, strict=True)
+        }
         facts: dict[str, Any] = {
             "sample_time": logic.time_step,
             "measurements": [{"name": v.name, "unit": v.unit} for v in logic.measurements],
@@ -180,8 +184,8 @@ class _Model:
                 return _COUNT
             case "active":
                 return nodes.add("Greater", _COUNT, nodes.constant(0, _WHOLE))
-            case "chosen":
-                return self._chosen[load[1]]
+            case "given":
+                return self._given[load[1]]
         return nodes.constant(load[1], node.dtype)
 
     def _column(self, array: str, place: int) -> str:
@@ -211,50 +215,31 @@ class _Model:
 
     # The network.
 
-    def _network(self, values: str) -> list[str]:
-        """The elements of the action, each of shape (N,)."""
-        nodes, network = self._nodes, self._agent.network
+    def _network(self, network: Network) -> list[str]:
+        """What the network gives, each element of shape (N,)."""
+        nodes, values = self._nodes, self._rows(self._logic.features, network.dtype)
         if network.scaling is not None:
-            values = self._scaled(values)
+            values = self._scaled(values, network.scaling, network.dtype)
         for layer in network.layers:
             weights, bias = nodes.tensor(layer.weights), nodes.tensor(layer.bias)
             values = nodes.add("Gemm", values, weights, bias, transB=1)
             for activation in layer.activations:
                 values = _activated(nodes, values, activation, network.dtype)
         if isinstance(network.space, spaces.Box):
-            return self._continuous(values)
-        return self._discrete(values)
+            return [self._column(values, index) for index in range(len(network.parts))]
+        return self._chosen(network, values)
 
-    def _scaled(self, values: str) -> str:
-        nodes, scaling = self._nodes, self._agent.network.scaling
+    def _scaled(self, values: str, scaling: Scaling, dtype: np.dtype[Any]) -> str:
+        nodes = self._nodes
         parts = [getattr(scaling, name).astype(_DOUBLE) for name in ("mean", "divisor", "limit")]
         mean, divisor, limit = map(nodes.tensor, parts)
         shifted = nodes.add("Sub", nodes.cast(values, _DOUBLE), mean)
         scaled = nodes.add("Min", nodes.add("Div", shifted, divisor), limit)
-        return nodes.cast(
-            nodes.add("Max", scaled, nodes.tensor(-parts[2])), self._agent.network.dtype
-        )
+        return nodes.cast(nodes.add("Max", scaled, nodes.tensor(-parts[2])), dtype)
 
-    def _continuous(self, values: str) -> list[str]:
-        nodes, network = self._nodes, self._agent.network
-        space: Any = network.space
-        low, high = (np.ravel(one).astype(network.dtype) for one in (space.low, space.high))
-        if network.squashed:
-            one, half = (nodes.constant(number, network.dtype) for number in (1.0, 0.5))
-            share = nodes.add("Mul", half, nodes.add("Add", values, one))
-            values = nodes.add("Mul", share, nodes.tensor(high - low))
-            values = nodes.add("Add", nodes.tensor(low), values)
-        else:
-            values = nodes.add(
-                "Min", nodes.add("Max", values, nodes.tensor(low)), nodes.tensor(high)
-            )
-        typed = nodes.cast(values, np.dtype(space.dtype))
-        return [self._column(typed, index) for index in range(len(low))]
-
-    def _discrete(self, values: str) -> list[str]:
-        nodes, network, begin, chosen = self._nodes, self._agent.network, 0, []
-        dtype = np.dtype(network.space.dtype)
-        axis = nodes.tensor(np.array([1]))
+    def _chosen(self, network: Network, values: str) -> list[str]:
+        nodes, begin, chosen = self._nodes, 0, []
+        dtype, axis = network.gives, nodes.tensor(np.array([1]))
         for count, start in zip(network.parts, network.starts, strict=True):
             ends = [nodes.tensor(np.array([place])) for place in (begin, begin + count)]
             part = nodes.add("Slice", values, *ends, axis)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
@@ -358,7 +358,12 @@ class Pool(ABC):
 
 
 def names_of(variables: tuple[Variable, ...]) -> str:
-    """The names of variables, for a message; of many, the first ones."""
-    names = ", ".join(variable.name for variable in variables[:_MOST_NAMES])
-    more = len(variables) - _MOST_NAMES
-    return printable(f"{names} and {more} more" if more > 0 else names)
+    """The names of variables for a message."""
+    return first_of([variable.name for variable in variables])
+
+
+def first_of(names: Sequence[str]) -> str:
+    """The first of some names for a message, which tells how many more there are."""
+    few = ", ".join(names[:_MOST_NAMES])
+    more = len(names) - _MOST_NAMES
+    return printable(f"{few} and {more} more" if more > 0 else few)

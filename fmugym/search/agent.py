@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,7 +14,7 @@ from fmugym.baselines import controller_of
 from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.base import FloatArray
 from fmugym.errors import ConfigError, reason, shown
-from fmugym.search.policy import Form, Policy
+from fmugym.search.policy import CONSTANT, Form, Policy
 
 __all__ = ["AGENT", "Agent"]
 
@@ -46,6 +45,13 @@ class Agent:
     scale: Any = (np.empty(0), np.empty(0))
     names: tuple[str, ...] = ()
     actions: str = ""
+
+    @classmethod
+    def constant(cls, name: str, value: float, ranges: Sequence[tuple[float, float]]) -> Self:
+        """The agent that always gives all numbers of the action one value."""
+        middles = np.array([(low + high) / 2 for low, high in ranges])
+        halves = np.array([(high - low) / 2 for low, high in ranges])
+        return cls(name, None, CONSTANT, (value - middles) / halves)
 
     def policy(self) -> Policy:
         """The controller, to be bound to an environment.
@@ -84,18 +90,18 @@ class Agent:
             ConfigError: If the file is missing or damaged.
         """
         try:
-            with np.load(folder / AGENT, allow_pickle=False) as file:
-                facts = json.loads(str(file["facts"]))
-                numbers = [np.asarray(file[n], np.float64) for n in ("weights", "mean", "divisor")]
+            with (folder / AGENT).open("rb") as file, np.load(file, allow_pickle=False) as found:
+                facts = json.loads(str(found["facts"]))
+                numbers = [np.asarray(found[n], np.float64) for n in ("weights", "mean", "divisor")]
             form = facts["form"]
-            found = None if form is None else Form(**form | {"hidden": tuple(form["hidden"])})
+            form = None if form is None else Form(**form | {"hidden": tuple(form["hidden"])})
             if facts["version"] != _VERSION or not all(np.isfinite(one).all() for one in numbers):
                 raise ValueError("of another version, or not finite")
-            told = facts["name"], facts["controller"], found
+            told = facts["name"], facts["controller"], form
             return cls(
                 *told, numbers[0], tuple(numbers[1:]), tuple(facts["names"]), facts["actions"]
             )
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        except Exception as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"the agent in {shown(str(folder))} cannot be read: {reason(error)}"
             ) from None

@@ -54,7 +54,8 @@ class Entrant:
         rounds: How many it has had.
         merit: That of the best candidate in validation.
         best: Its numbers, shape (n,).
-        gained: The round in which it was found.
+        gained: The round in which it was found, or in which something was changed.
+        starts: How often the search has started anew.
     """
 
     cma: CMA
@@ -65,6 +66,7 @@ class Entrant:
     merit: Merit = NO_MERIT
     best: FloatArray = field(default_factory=lambda: np.empty(0))
     gained: int = 0
+    starts: int = 0
     agreement: float = 1.0
 
     def play(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> Merit:

@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["LIMIT", "Form", "Policy", "Scale"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -78,6 +78,9 @@ class Form:
             part = weights[:, place : place + before * after]
             yield part.reshape(-1, before, after) / math.sqrt(before)
             place += before * after
+
+
+CONSTANT: Final = Form("constant action", blind=True)
 
 
 class Scale:
@@ -158,6 +161,7 @@ class Policy(Controller):
         self._require_task()
         if self.form is not None:
             weights = np.atleast_2d(self.weights)
+            self._require_sizes(self.form, weights)
             self._layers = list(self.form.layers(weights, len(self.names), self.acting))
 
     def _require_task(self) -> None:
@@ -178,6 +182,15 @@ class Policy(Controller):
             if found
         )
         raise ConfigError(f"the agent is for another task: {told or 'the order differs'}")
+
+    def _require_sizes(self, form: Form, weights: FloatArray) -> None:
+        sizes = len(self.names), self.acting
+        given = [(weights.shape[1], form.size(*sizes), "weights")]
+        if not callable(self.scale):
+            given += [(len(one), form.features(*sizes), "scales") for one in self.scale]
+        for count, needed, what in given:
+            if count != needed:
+                raise ConfigError(f"a {form.name} needs {needed} {what} here, got {count}")
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:
@@ -229,11 +242,10 @@ class Policy(Controller):
         """
         features, *kept = self._features(observed, memory)
         given = None if self.form is None else network(features)
-        if self.parts:
+        if given is None or self.parts:
             action = list(base if given is None else given)
         else:
-            changes = [0.0] * self.acting if given is None else given
-            action = list(map(_corrected, base, changes, self.limits))
+            action = list(map(_corrected, base, given, self.limits))
         return action, (*kept, self._told(action)) if kept else ()
 
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
@@ -258,9 +270,13 @@ class Policy(Controller):
         return np.stack([(2.0 * one - low - high) / (high - low) for one, (low, high) in pairs])
 
     def _network(self, features: FloatArray) -> Any:
-        """The outputs for features of shape (f, N), row by row, so that groups do not matter."""
+        """The outputs for features of shape (f, N), row by row, so that groups do not matter.
+
+        Rows are contiguous, as products of rows with gaps may be rounded in another way.
+        """
         mean, divisor = self.scale(features) if callable(self.scale) else self.scale
-        values = np.clip((features.T - mean) / divisor, -LIMIT, LIMIT)[:, None]
+        rows = np.ascontiguousarray(features.T)
+        values = np.clip((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
         *hidden, last = self._layers
         for layer in hidden:
             values = np.tanh(values @ layer[:, :-1] + layer[:, -1:])

@@ -37,23 +37,26 @@ class Probe:
         names: What is observed.
         actions: The action space, in words.
         acting: How many numbers choose an action.
+        ranges: The lowest and the highest value of each number; empty if actions are chosen.
         limits: What each cost may add up to in an episode.
         document: What the task declares; empty if it is no declared one.
         length: The steps of an episode; None if they are not limited.
         is_same: Whether all episodes are the same.
         seconds: Real time of a step of one environment among many.
-        rewards: The rewards that were seen, at most two of them.
+        only_reward: The reward of every step; None if it has changed, or an episode has ended by
+            success or failure.
     """
 
     names: tuple[str, ...]
     actions: str
     acting: int
+    ranges: tuple[tuple[float, float], ...]
     limits: Mapping[str, float]
     document: Mapping[str, Any]
     length: int | None
     is_same: bool
     seconds: float
-    rewards: tuple[float, ...]
+    only_reward: float | None
 
     @classmethod
     def of(cls, make_env: Callable[[], FMUEnv], envs: int = _ENVS) -> Probe:
@@ -74,7 +77,7 @@ class Probe:
             limits = dict(getattr(env, "cost_limits", {}))
             document = env.task.document if hasattr(env, "task") else {}
         with closing(FMUVectorEnv(make_env, min(envs, _ENVS))) as many:
-            is_same, seconds, rewards = _steps(many)
+            is_same, seconds, only_reward = _steps(many)
         if seconds < _QUICK:
             with closing(FMUVectorEnv(make_env, min(envs, _MANY))) as many:
                 seconds = _steps(many)[1]
@@ -82,12 +85,13 @@ class Probe:
             policy.names,
             str(policy.space),
             policy.acting,
+            policy.limits,
             limits,
             document,
             length,
             is_same,
             seconds,
-            rewards,
+            only_reward,
         )
 
     @property
@@ -100,19 +104,20 @@ class Probe:
         return self.seconds * self.most_steps * candidates * episodes
 
 
-def _steps(envs: FMUVectorEnv) -> tuple[bool, float, tuple[float, ...]]:
-    """Whether all environments go the same way, the seconds of a step, and some rewards."""
+def _steps(envs: FMUVectorEnv) -> tuple[bool, float, float | None]:
+    """Whether all environments go the same way, the seconds of a step, and the only reward."""
     space, count = envs.single_observation_space, envs.num_envs
     envs.single_action_space.seed(0)
     observations, _ = envs.reset(seed=list(range(count)))
     rows = rows_of(space, observations, count)
     is_same, seen, steps, begin = bool((rows == rows[0]).all()), set[float](), 0, perf_counter()
-    over = False
+    ended = over = False
     while not over and steps < _STEPS and perf_counter() - begin < _SECONDS:
         action = envs.single_action_space.sample()
         observations, rewards, terminated, truncated, _ = envs.step(np.array([action] * count))
         rows, steps = rows_of(space, observations, count), steps + 1
         is_same = is_same and bool((rows == rows[0]).all() and (rewards == rewards[0]).all())
         seen = seen if len(seen) > 1 else seen.union(rewards.tolist())
-        over = bool((terminated | truncated).all())
-    return is_same, (perf_counter() - begin) / (steps * count), tuple(seen)
+        ended, over = ended or bool(terminated.any()), bool((terminated | truncated).all())
+    only = seen.pop() if len(seen) == 1 and not ended else None
+    return is_same, (perf_counter() - begin) / (steps * count), only

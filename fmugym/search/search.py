@@ -16,7 +16,7 @@ from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
 from fmugym.search.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
-from fmugym.search.policy import Form, Policy, Scale
+from fmugym.search.policy import CONSTANT, Form, Policy, Scale
 
 __all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
 
@@ -44,7 +44,9 @@ _SHARE: Final = 10
 """A class of policies has at least so many rounds, and this part of all rounds."""
 
 _PATIENCE: Final = 15
-"""A class that leads and gains nothing in so many rounds goes."""
+_STARTS: Final = 3
+"""A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
+when that was so in each of these starts."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -56,10 +58,11 @@ _MANY: Final = 200
 """More weights than this are searched without covariances."""
 
 _LINEAR, _HISTORY = Form("linear"), Form("linear with history", history=True)
-_NETWORK, _CONSTANT = Form("network", hidden=(16,)), Form("constant action", blind=True)
+_NETWORK = Form("network", hidden=(16,))
 
-_SIGMAS: Final = {_LINEAR: 1.0, _HISTORY: 1.0, _NETWORK: 4.0, _CONSTANT: 1.0}
-"""The first steps of the weights; a quarter of it where they correct a controller."""
+_SIGMAS: Final = {_LINEAR: 1.0, _HISTORY: 1.0, _NETWORK: 4.0, CONSTANT: 1.0}
+_CORRECTION: Final = 0.25
+"""The first steps of the weights, and the part of them where they correct a controller."""
 
 
 @dataclass(frozen=True)
@@ -131,9 +134,9 @@ class Search:
         self._population, self._episodes = population, episodes
         self._rng = np.random.default_rng(seed)
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
-        self._guesses = [self._tuner("guess", one, _TRYING) for one in guesses]
+        self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
         if not (fixed or tunable or guesses):
-            make = _Policies(Agent("", None), _CONSTANT, (np.empty(0), np.empty(0)))
+            make = _Policies(Agent("", None), CONSTANT, (np.empty(0), np.empty(0)))
             self._tuned = [replace(self._entrant(make), quota=_TRYING)]
         self._contenders: list[Entrant] = []
         self._gone: list[Entrant] = []
@@ -196,8 +199,12 @@ class Search:
             if one.rounds - one.gained < _PATIENCE:
                 continue
             if 1 < one.episodes < MOST_EPISODES:
-                one.episodes, one.gained = 2 * one.episodes, one.rounds
+                one.episodes *= 2
             else:
+                one.starts += 1
+                one.cma = self._cma(one.make, one.best)
+            one.gained = one.rounds
+            if one.starts == _STARTS:
                 self._contenders.remove(one)
                 self._gone.append(one)
         self.is_over = not self._contenders
@@ -222,19 +229,20 @@ class Search:
         return Entrant(cma, _Tuned(name, tunable), self._episodes, quota)
 
     def _entrant(self, make: _Policies) -> Entrant:
-        form = make.form
-        size = form.size(*self._sizes)
-        sigma = _SIGMAS[form] * (1.0 if make.under.text is None else 0.25)
-        cma = CMA(
-            np.zeros(size),
+        cma = self._cma(make, np.zeros(make.form.size(*self._sizes)))
+        return Entrant(cma, make, self._episodes)
+
+    def _cma(self, make: _Policies, start: FloatArray) -> CMA:
+        sigma = _SIGMAS[make.form] * (1.0 if make.under.text is None else _CORRECTION)
+        return CMA(
+            start,
             sigma,
             self._population,
             self._rng,
-            separable=size > _MANY,
+            separable=len(start) > _MANY,
             largest=_LARGEST,
             largest_sigma=_GROWTH * sigma,
         )
-        return Entrant(cma, make, self._episodes)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""

@@ -162,7 +162,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         derivatives=_derivatives(plan, parts),
         findings=plan.findings,
         error_categories=tuple(sorted({c for part in parts for c in part.error_categories})),
-        units=_units(parts),
+        units=_units(plan, parts),
         plan=plan,
         parts=tuple(parts),
         ends=ends,
@@ -254,12 +254,12 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
     )
 
 
-def _units(parts: Iterable[ModelDescription]) -> dict[str, Unit]:
+def _units(plan: SystemPlan, parts: Iterable[ModelDescription]) -> dict[str, Unit]:
     """All units; where two components disagree on a name, the first one wins."""
     units: dict[str, Unit] = {}
     for part in parts:
         units = {**part.units, **units}
-    return units
+    return {**dict(plan.units), **units}
 
 
 def _variables(

@@ -86,7 +86,7 @@ class SystemFMU(FMU):
             raise ConfigError(f"the system {plan.name!r} has no components")
         self._opened = tuple(map(_open, plan.components))
         description = describe_system(plan, [fmu.description for fmu in self._opened])
-        _require_solvable(Layout(description))
+        Layout(description)  # which refuses names and roles that are wrong
         path = Path(plan.name) if plan.file is None else plan.file
         LoadableFMU.__init__(self, path, description, ())
         self.limits, self.interface = ArchiveLimits(), None
@@ -123,11 +123,26 @@ class SystemFMU(FMU):
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
         """What keeps the components from being loaded; see ``FMU.obstacles``."""
-        return tuple(
+        found = [
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
             for text in fmu.obstacles
-        )
+        ]
+        return (*self._unable(), *found)
+
+    def _unable(self) -> Iterator[str]:
+        """What components lack that the estimate of errors needs."""
+        for component, fmu in self._pairs() if self.plan.control is not None else ():
+            able = fmu.description.capabilities
+            for flag, what in (
+                (able.can_get_and_set_fmu_state, "save its FMU state"),
+                (able.can_handle_variable_communication_step_size, "vary its step size"),
+            ):
+                if not flag:
+                    yield (
+                        "error_tolerance needs components that can repeat steps as smaller ones, "
+                        f"and component {component.name!r} cannot {what}"
+                    )
 
     @cached_property
     def missing_libraries(self) -> tuple[str, ...]:
@@ -142,10 +157,13 @@ class SystemFMU(FMU):
         """Extract each FMU into a folder of its own; see ``FMU.extract``.
 
         Raises:
+            ConfigError: If a component cannot repeat steps, and ``error_tolerance`` needs it.
             FMULoadError: If one of them cannot run here, or its archive is damaged.
         """
         if self._folder is not None:
             return self._folder
+        for text in self._unable():
+            raise ConfigError(text)
         for component, fmu in self._pairs():
             with _naming(component):
                 _require_runnable(fmu)
@@ -163,44 +181,6 @@ class SystemFMU(FMU):
             raise
         self._folder = folder
         return folder
-
-
-def _require_solvable(layout: Layout) -> None:
-    """Refuse loops that no master could solve.
-
-    Raises:
-        ConfigError: If a component cannot repeat a step although a loop or the estimate of errors
-            needs it, or a component of a loop has no Initialization Mode.
-    """
-    for part in layout.parts if layout.plan.control is not None else ():
-        able = part.description.capabilities
-        for flag, what in (
-            (able.can_get_and_set_fmu_state, "save its FMU state"),
-            (able.can_handle_variable_communication_step_size, "vary its step size"),
-        ):
-            if not flag:
-                raise ConfigError(
-                    "error_tolerance needs components that can repeat steps as smaller ones, and "
-                    f"{part.label} cannot {what}"
-                )
-    repeated = [group for group in layout.plan.groups if group.loop is not None]
-    for group in repeated if layout.plan.master == "gauss_seidel" else ():
-        numbers = layout.parts_of(group)
-        for part in (layout.parts[i] for i in numbers):
-            if not part.description.capabilities.can_get_and_set_fmu_state:
-                raise ConfigError(
-                    f"{layout.loop_label(numbers)} cannot be solved: its steps are repeated from "
-                    f"saved FMU states, and {part.label} cannot save its own. master='jacobi' "
-                    "needs no repetition"
-                )
-    for evaluation in layout.plan.initialization:
-        numbers = tuple(layout.routes[i].source_part for i in layout.routes_of(evaluation))
-        for part in (layout.parts[i] for i in numbers if evaluation.loop is not None):
-            if not part.has_mode:
-                raise ConfigError(
-                    f"{layout.loop_label(numbers)} cannot be solved at the start: {part.label} is "
-                    "an FMU of FMI 1.0, which has no Initialization Mode"
-                )
 
 
 def _open(component: Component) -> FMU:

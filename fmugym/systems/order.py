@@ -7,7 +7,7 @@ comes after all it depends on.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Container, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -28,16 +28,25 @@ class Order:
         initialization: The links in the order of the initialization.
         loops: The links of each algebraic loop between steps.
         late: Links whose value is one step late although no loop asks for it.
+        unsolved: The components because of which loops between steps are not solved.
+        unsolved_at_start: The components because of which loops at the start are not solved.
     """
 
     groups: tuple[Group, ...]
     initialization: tuple[Evaluation, ...]
     loops: tuple[tuple[Link, ...], ...]
     late: tuple[Link, ...]
+    unsolved: tuple[str, ...] = ()
+    unsolved_at_start: tuple[str, ...] = ()
 
 
 def order_of(
-    names: Sequence[str], links: Sequence[Link], told: Mapping[str, Feedthrough], loop: Loop
+    names: Sequence[str],
+    links: Sequence[Link],
+    told: Mapping[str, Feedthrough],
+    loop: Loop,
+    unable: Container[str] = (),
+    unable_at_start: Container[str] = (),
 ) -> Order:
     """Order the components and links of a system.
 
@@ -49,14 +58,41 @@ def order_of(
         links: The connections.
         told: The direct feed-through of each component.
         loop: How algebraic loops are solved.
+        unable: The components that cannot repeat a step. Their inputs in a loop count as given, so
+            that only the rest of the loop is solved.
+        unable_at_start: Those for which the same holds at the start.
     """
     in_step = _chains(links, {name: one.in_step for name, one in told.items()})
-    found = _loops(in_step)
-    loops = tuple(tuple(links[place] for place in sorted(cycle)) for cycle in found)
-    teams = _teams(names, loops)
+    solvable, unsolved = _cut(in_step, links, unable)
+    loops, solved = (_linked_loops(graph, links) for graph in (in_step, solvable))
+    teams = _teams(names, solved)
     order, late = _order_of_teams(names, teams, links, told)
-    groups = tuple(_group(team, loops, loop) for team in order)
-    return Order(groups, _initialization(links, told, loop), loops, late)
+    groups = tuple(_group(team, solved, loop) for team in order)
+    at_start = _chains(links, {name: one.at_start for name, one in told.items()})
+    evaluable, unsolved_at_start = _cut(at_start, links, unable_at_start)
+    evaluations = tuple(_evaluations(evaluable, loop))
+    return Order(groups, evaluations, loops, late, unsolved, unsolved_at_start)
+
+
+def _cut(
+    graph: dict[int, list[int]], links: Sequence[Link], unable: Container[str]
+) -> tuple[dict[int, list[int]], tuple[str, ...]]:
+    """Let nothing depend on the links of loops that end at components that are unable.
+
+    Returns:
+        The graph, and the names of these components.
+    """
+    cut = {i: links[i].target for loop in _loops(graph) for i in loop if links[i].target in unable}
+    if not cut:
+        return graph, ()
+    rest = {place: [one for one in others if one not in cut] for place, others in graph.items()}
+    return rest, tuple(dict.fromkeys(cut.values()))
+
+
+def _linked_loops(
+    graph: Mapping[int, Sequence[int]], links: Sequence[Link]
+) -> tuple[tuple[Link, ...], ...]:
+    return tuple(tuple(links[place] for place in sorted(cycle)) for cycle in _loops(graph))
 
 
 def _chains(
@@ -91,14 +127,10 @@ def _loops(graph: Mapping[int, Sequence[int]]) -> list[list[int]]:
     return [c for c in strong_components(graph) if len(c) > 1 or c[0] in graph[c[0]]]
 
 
-def _initialization(
-    links: Sequence[Link], told: Mapping[str, Feedthrough], loop: Loop
-) -> tuple[Evaluation, ...]:
-    graph = _chains(links, {name: one.at_start for name, one in told.items()})
-    return tuple(
-        Evaluation(tuple(sorted(c)), loop if len(c) > 1 or c[0] in graph[c[0]] else None)
-        for c in strong_components(graph)
-    )
+def _evaluations(graph: Mapping[int, Sequence[int]], loop: Loop) -> Iterator[Evaluation]:
+    for found in strong_components(graph):
+        is_loop = len(found) > 1 or found[0] in graph[found[0]]
+        yield Evaluation(tuple(sorted(found)), loop if is_loop else None)
 
 
 def _teams(names: Sequence[str], loops: Iterable[Sequence[Link]]) -> dict[str, tuple[str, ...]]:

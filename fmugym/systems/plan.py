@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fmugym.archive.description import Unit
 from fmugym.archive.safe_zip import ArchiveLimits
 
 __all__ = [
@@ -215,6 +216,7 @@ class SystemPlan:
         findings: What is doubtful in the system, as texts.
         control: How the step sizes follow from an estimate of the error; None if they do not.
         file: Where the system was read from; None if it was made in Python.
+        units: Definitions by name of units that the FMUs do not define.
     """
 
     name: str
@@ -232,3 +234,4 @@ class SystemPlan:
     findings: tuple[str, ...] = ()
     control: Control | None = None
     file: Path | None = None
+    units: tuple[tuple[str, Unit], ...] = ()

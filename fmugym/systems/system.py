@@ -69,7 +69,13 @@ class FMUSystem(WiredSystem):
     """
 
     @classmethod
-    def read(cls, path: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> Self:
+    def read(
+        cls,
+        path: str | os.PathLike[str],
+        limits: ArchiveLimits | None = None,
+        *,
+        master: str | None = None,
+    ) -> Self:
         """Read an SSP archive. Nothing of its FMUs is executed.
 
         Nested systems become one level: a component ``plant`` of the system ``car`` is named
@@ -79,6 +85,7 @@ class FMUSystem(WiredSystem):
         Args:
             path: The ``.ssp`` file.
             limits: What is too large to be opened.
+            master: One of those of ``FMUSystem``; by default what the archive says.
 
         Raises:
             ConfigError: If the system has a mistake.
@@ -86,6 +93,8 @@ class FMUSystem(WiredSystem):
                 results and is not supported, such as signal dictionaries.
         """
         arguments = arguments_of(path, limits)
+        if master is not None:
+            arguments["master"] = master
         try:
             return cls(**arguments)
         except FMUGymError as error:
@@ -118,8 +127,7 @@ class FMUSystem(WiredSystem):
             probe_timeout: See ``FMU``.
 
         Raises:
-            ConfigError: If a component cannot repeat steps, and a loop or ``error_tolerance`` needs
-                it; or with ``error_tolerance``, a component is named ``master``.
+            ConfigError: If with ``error_tolerance``, a component is named ``master``.
             FMULoadError: If an FMU of a component cannot be read any more.
         """
         return SystemFMU(self.plan, probe_timeout=probe_timeout)
@@ -142,7 +150,7 @@ class FMUSystem(WiredSystem):
     def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
         """A system pickles as the file that it came from, or as its arguments."""
         if self.file is not None:
-            return type(self).read, (self.file,)
+            return _read_again, (type(self), self.file, self.master)
         return _again, (type(self), self.arguments())
 
     def arguments(self) -> dict[str, Any]:
@@ -174,6 +182,10 @@ class FMUSystem(WiredSystem):
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,
         }
+
+
+def _read_again(cls: type[FMUSystem], file: Path, master: str) -> FMUSystem:
+    return cls.read(file, master=master)
 
 
 def _again(cls: type[FMUSystem], arguments: dict[str, Any]) -> FMUSystem:

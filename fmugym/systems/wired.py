@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Never
@@ -93,7 +93,12 @@ class WiredSystem:
     def order(self) -> Order:
         """The order of steps and of the initialization, and the algebraic loops."""
         told = {name: one.feedthrough for name, one in self.components.items()}
-        return order_of(list(self.components), self._wiring.links, told, self.loop)
+        parts = {name: one.fmu.description for name, one in self.components.items()}
+        old = {name for name, part in parts.items() if part.fmi_major_version == 1}
+        unable = {n for n, part in parts.items() if not part.capabilities.can_get_and_set_fmu_state}
+        if self.master == "jacobi":  # which repeats no steps
+            unable = set()
+        return order_of(list(told), self._wiring.links, told, self.loop, unable, old)
 
     @property
     def links(self) -> tuple[Link, ...]:
@@ -121,12 +126,6 @@ class WiredSystem:
     @cached_property
     def findings(self) -> tuple[str, ...]:
         """What is doubtful in the system and in its FMUs, as texts."""
-        own = [f"algebraic loop: {_told_loop(loop)}" for loop in self.order.loops]
-        own += [
-            f"{link.target} steps before {link.source}, so that {link.target}.{link.input} gets "
-            "the value of the step before"
-            for link in self.order.late
-        ]
         untold = [
             f"{name} does not tell its direct feed-through; each output is taken to depend on all "
             "inputs"
@@ -138,7 +137,7 @@ class WiredSystem:
             for name, one in self.components.items()
             for finding in one.fmu.findings
         ]
-        return (*self._given_findings, *own, *untold, *of_fmus)
+        return (*self._given_findings, *_findings_of(self.order), *untold, *of_fmus)
 
     @cached_property
     def plan(self) -> SystemPlan:
@@ -158,6 +157,7 @@ class WiredSystem:
             findings=self.findings,
             control=self.control,
             file=self.file,
+            units=tuple(self.unit_definitions.items()),
             **times,
         )
 
@@ -209,6 +209,23 @@ def _times(step_size: Any, start_time: Any, stop_time: Any, tolerance: Any) -> d
         for name, value in given.items()
     }
     return checked | {"start_time": check_number("start_time", start_time)}
+
+
+def _findings_of(order: Order) -> Iterator[str]:
+    for loop in order.loops:
+        yield f"algebraic loop: {_told_loop(loop)}"
+    for name in order.unsolved:
+        yield f"{name} cannot save its FMU state, so that its algebraic loop is not solved in steps"
+    for name in order.unsolved_at_start:
+        yield (
+            f"{name} is an FMU of FMI 1.0, which has no Initialization Mode: in its algebraic loop "
+            "it begins with the start values of its inputs"
+        )
+    for link in order.late:
+        yield (
+            f"{link.target} steps before {link.source}, so that {link.target}.{link.input} gets "
+            "the value of the step before"
+        )
 
 
 def _told_loop(loop: Sequence[Link]) -> str:

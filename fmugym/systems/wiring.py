@@ -32,11 +32,6 @@ class Port:
         return f"{self.component.name}.{self.variable.name}"
 
     @property
-    def units(self) -> Mapping[str, Unit]:
-        """The units that its FMU defines."""
-        return self.component.fmu.description.units
-
-    @property
     def kind(self) -> str:
         """Of the variable, where items of enumerations count as integers."""
         kind = self.variable.kind
@@ -64,7 +59,7 @@ class Wiring:
         units: Units of the system's own inputs, outputs and parameters; without one, they have
             that of the variable behind them.
         own_names: The names of the system itself that contain a dot, at least.
-        definitions: Units that ``units`` use and that the FMUs need not know.
+        definitions: Units of ``units``, and of FMUs that do not define them themselves.
 
     Attributes:
         links: Those between components.
@@ -114,7 +109,7 @@ class Wiring:
             if target is None:
                 self._add_output(connection, source)
             else:
-                self.links.append(_link(connection, source, target))
+                self.links.append(self._link(connection, source, target))
 
     def port(self, name: str) -> Port | None:
         """Find the variable that a name stands for; None for a name of the system itself.
@@ -130,6 +125,19 @@ class Wiring:
         if dots and name not in self.own_names:
             raise unknown_name("component", name[: dots[0]], self.components)
         return None
+
+    def _link(self, connection: Connection, source: Port, target: Port) -> Link:
+        _check_kinds(connection, source, target)
+        own, other = source.variable, target.variable
+        units = self._units(source), self._units(target)
+        conversion = _conversion(connection, own.unit, units[0], other.unit, units[1])
+        end = _end(connection, target, conversion)
+        ends = source.component.name, own.name, end.component, end.variable
+        return Link(*ends, end.gain, end.offset)
+
+    def _units(self, port: Port) -> Mapping[str, Unit]:
+        """The units that a variable may have; its FMU knows best what it means by a name."""
+        return {**self.definitions, **port.component.fmu.description.units}
 
     def _drive(self, target: Port, connection: Connection) -> None:
         """Note what drives an input; there may be only one."""
@@ -175,12 +183,14 @@ class Wiring:
     ) -> Conversion:
         """From the unit of an input of the system to that of a variable behind it."""
         own, definitions = self._own_unit(name, first)
-        return _conversion(connection, own, definitions, target.variable.unit, target.units)
+        units = self._units(target)
+        return _conversion(connection, own, definitions, target.variable.unit, units)
 
     def _own_unit(self, name: str, port: Port) -> tuple[str | None, Mapping[str, Unit]]:
         """The unit of a name of the system, by default that of a variable behind it."""
-        unit = self.units.get(name, port.variable.unit)
-        return unit, self.definitions if unit in self.definitions else port.units
+        if name not in self.units:
+            return port.variable.unit, self._units(port)
+        return self.units[name], {**self._units(port), **self.definitions}
 
     def _add_output(self, connection: Connection, source: Port) -> None:
         name = connection.target
@@ -193,7 +203,7 @@ class Wiring:
         _require_number(connection, source)
         own, definitions = self._own_unit(name, source)
         unit = source.variable.unit
-        conversion = _conversion(connection, unit, source.units, own, definitions)
+        conversion = _conversion(connection, unit, self._units(source), own, definitions)
         _check_gain(connection, source, source)
         self._ends[name] = [_end(connection, source, conversion)]
 
@@ -242,14 +252,6 @@ def _require_source(source: Port, connection: Connection) -> None:
             f"{connection}: {source.name} is a {variable.variability} {variable.causality}; a "
             "connection must begin at an output"
         )
-
-
-def _link(connection: Connection, source: Port, target: Port) -> Link:
-    _check_kinds(connection, source, target)
-    own, other = source.variable, target.variable
-    conversion = _conversion(connection, own.unit, source.units, other.unit, target.units)
-    end = _end(connection, target, conversion)
-    return Link(source.component.name, own.name, end.component, end.variable, end.gain, end.offset)
 
 
 def _end(connection: Connection, port: Port, conversion: Conversion) -> End:

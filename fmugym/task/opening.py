@@ -210,7 +210,7 @@ def _find_file(cls: type, path: Path) -> Path:
         return path
     own = takewhile(lambda c: c.__module__ != "fmugym.env", cls.__mro__)
     folders = [Path(inspect.getfile(c)).parent if _has_file(c) else Path.cwd() for c in own]
-    candidates = [folder / path for folder in folders]
+    candidates = [folder / path for folder in folders or [Path.cwd()]]
     return next((c for c in candidates if _exists(c)), candidates[0])
 
 

@@ -51,11 +51,11 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
   with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
 - ``missing_tool``: the tool that must be installed as well; null if none is known to be missing
-- ``trial``: what the first meeting on this machine has shown: ``deterministic``, the grades of
-  ``resets`` by method, the ``reset_method``, the ``component_resets`` of a system by the names of
-  its components, what ``several_instances`` need, ``isolate``,
-  the grade of an ``initial_state`` in another process, how many ``instances_at_once`` it used, and
-  the ``deaths`` of workers; null before
+- ``trial``: what the first meeting on this machine has shown: ``deterministic``, the
+  ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the
+  ``component_resets`` of a system by the names of its components, what ``several_instances``
+  need, ``isolate``, the grade of an ``initial_state`` in another process, how many
+  ``instances_at_once`` it used, and the ``deaths`` of workers; null before
 - ``capabilities``: flags by name, those of ``fmugym.archive.description.Capabilities``
 - ``default_experiment``: ``start_time``, ``stop_time``, ``step_size`` in s, and ``tolerance``
 - ``fixed_internal_step_size``: in s

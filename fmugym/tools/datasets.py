@@ -19,6 +19,7 @@ from fmugym.tools.options import (
     add_command,
     add_episodes,
     add_json,
+    add_master,
     add_players,
     check_numbers,
     only_player,
@@ -40,6 +41,7 @@ def add_dataset(commands: Commands) -> None:
     command = add_command(commands, "dataset", _dataset, text)
     command.add_argument("name", metavar="NAME", help="of the dataset, such as house/pi-v0")
     command.add_argument("--task", metavar="TASK", help=HELP_OF_TASK)
+    add_master(command)
     sources = command.add_mutually_exclusive_group()
     sources.add_argument(
         "--log", action="append", metavar="FILE", help="a CSV file of a plant; more than once"
@@ -82,7 +84,7 @@ def _dataset(arguments: argparse.Namespace) -> None:
         raise ConfigError("a new dataset needs --task; --output FOLDER reads an existing one")
     is_played = not (arguments.recording or arguments.log)
     player = only_player(arguments) if is_played else None
-    make_env: MakeEnv = maker_of(arguments.task, arguments.scenario)
+    make_env: MakeEnv = maker_of(arguments.task, arguments.scenario, arguments.master)
     if player is not None:
         make_env = partial(player.make_env, make_env)
     recordings = _recordings(arguments, make_env, player)

@@ -28,6 +28,7 @@ __all__ = [
     "plot_scores",
     "student",
     "table",
+    "warning_of_one_reward",
 ]
 
 _Z: Final = 1.959963984540054
@@ -58,6 +59,7 @@ class Score:
         real_time_factor: Simulated seconds in a second of real time, the controller included.
         scenario: The scenario of the episodes; None for those of the task.
         kpis: The KPIs of the episodes that have reported some, by name.
+        only_reward: The reward of every step of all episodes; None if it has changed.
     """
 
     name: str
@@ -68,6 +70,7 @@ class Score:
     real_time_factor: float
     scenario: str | None = None
     kpis: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    only_reward: float | None = None
 
     @property
     def mean(self) -> float:
@@ -192,6 +195,32 @@ def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | 
         sum(one.seconds for one in episodes) / took,
         scenario,
         {n: tuple(one.kpis[n] for one in episodes if n in one.kpis) for n in names},
+        _only(one.only_reward for one in episodes),
+    )
+
+
+def _only(values: Iterable[float | None]) -> float | None:
+    """The value that all have; None if they differ."""
+    found = set(values)
+    return found.pop() if len(found) == 1 else None
+
+
+def warning_of_one_reward(scores: Sequence[Score]) -> str | None:
+    """Say that a reward has never changed, so that there may be nothing to learn.
+
+    Args:
+        scores: Those of one evaluation.
+
+    Returns:
+        A line of text; None if rewards differ, or so do the lengths of episodes with rewards.
+    """
+    reward = _only(score.only_reward for score in scores)
+    lengths = {steps for score in scores for steps in score.steps}
+    if reward is None or (reward and len(lengths) > 1):
+        return None
+    return (
+        f"the reward was {reward:g} in every step of the first evaluation: agents learn from "
+        "differences, so say in the task what is better and what is worse"
     )
 
 

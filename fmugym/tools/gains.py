@@ -76,7 +76,9 @@ def _tune(arguments: argparse.Namespace) -> None:
 
 def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) -> None:
     """Search, and keep the best of each round."""
-    make_env = partial(maker_of(arguments.task, arguments.scenario), physical=True)
+    make_env = partial(
+        maker_of(arguments.task, arguments.scenario, arguments.master), physical=True
+    )
     with progress(arguments.rounds, "tune", "rounds") as advance:
 
         def noted(best: Tuning) -> None:

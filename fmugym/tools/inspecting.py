@@ -15,6 +15,7 @@ from fmugym.tools.options import (
     Commands,
     add_command,
     add_json,
+    add_master,
     add_task,
     say,
     say_json,
@@ -36,6 +37,7 @@ def add_info(commands: Commands) -> None:
     text = "say what an FMU or a system is, where it runs, and which variables it has"
     command = add_command(commands, "info", _info, text)
     _add_fmu(command)
+    add_master(command)
     add_json(command)
     command.add_argument(
         "--plot",
@@ -57,7 +59,7 @@ def _add_fmu(command: argparse.ArgumentParser) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    model = find_model(arguments.fmu)
+    model = find_model(arguments.fmu, arguments.master)
     wanted = {"everything": arguments.all, "pattern": arguments.filter}
     if isinstance(model, FMUSystem):
         facts, as_lines = overview_of_system(model, **wanted), as_text_of_system
@@ -129,7 +131,7 @@ def add_validate(commands: Commands) -> None:
 
 
 def _validate(arguments: argparse.Namespace) -> int:
-    report = validate(maker_of(arguments.task))
+    report = validate(maker_of(arguments.task, master=arguments.master, takes_fmu=True))
     if arguments.json:
         say_json({"task": arguments.task, **report.as_dict()})
     else:

@@ -148,9 +148,11 @@ def _search(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, *counts)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
-    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
-    scenarios = {name: partial(maker_of(arguments.task, name), physical=True) for name in names}
-    make_env = partial(make_env, physical=True)
+    task, master = arguments.task, arguments.master
+    make_env = partial(maker_of(task, master=master), physical=True)
+    scenarios = {
+        name: partial(maker_of(task, name, master), physical=True) for name in scenarios_of(task)
+    }
     quest = Quest(
         make_env,
         scenarios or {"unseen episodes": make_env},
@@ -230,8 +232,9 @@ def _plan_of(arguments: argparse.Namespace) -> Plan:
     options = argparse.Namespace(**given)
     check_numbers(options, "steps", "envs", "episodes")
     own = arguments_of(arguments.arguments) or before.get("arguments", {})
-    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
-    held_out = {name: maker_of(arguments.task, name) for name in names}
+    names, master = scenarios_of(arguments.task), arguments.master
+    make_env = maker_of(arguments.task, master=master)
+    held_out = {name: maker_of(arguments.task, name, master) for name in names}
     return Plan(
         make_env,
         held_out or {"held-out seeds": make_env},

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
 from fmugym.errors import ConfigError, shown
+from fmugym.systems.plan import MASTERS
 from fmugym.tools.agents import agent_player
 from fmugym.tools.overview import plain
 from fmugym.tools.progress import quiet
@@ -28,6 +29,7 @@ __all__ = [
     "add_common",
     "add_episodes",
     "add_json",
+    "add_master",
     "add_players",
     "add_task",
     "check_numbers",
@@ -138,6 +140,13 @@ def add_json(command: argparse.ArgumentParser) -> None:
 def add_task(command: argparse.ArgumentParser, also: str = "") -> None:
     """Add the argument for the task."""
     command.add_argument("task", metavar="TASK", help=HELP_OF_TASK + also)
+    add_master(command)
+
+
+def add_master(command: argparse.ArgumentParser) -> None:
+    """Add the option for how systems run."""
+    text = "how a system exchanges values, in the place of what its SSP archive or task says"
+    command.add_argument("--master", choices=MASTERS, help=text)
 
 
 def add_episodes(

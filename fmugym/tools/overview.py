@@ -16,6 +16,7 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.packages import missing_tool, source_of
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, printable
+from fmugym.pool.base import first_of
 from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "overview", "plain", "start_value", "tables"]
@@ -87,6 +88,7 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         return None
     return {
         "deterministic": verdict.deterministic,
+        "noisy_outputs": list(verdict.noisy),
         "resets": {str(method): str(grade) for method, grade in verdict.resets.items()},
         "reset_method": str(verdict.reset_method) if verdict.resets else None,
         "component_resets": verdict.components_of(getattr(fmu, "plan", None)),
@@ -239,7 +241,7 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         own = trial["component_resets"].items()
         parts.append("its components begin " + ", ".join(f"{name} by {m!r}" for name, m in own))
     if not trial["deterministic"]:
-        parts.append("fresh instances differ")
+        parts.append(f"fresh instances differ in {first_of(trial['noisy_outputs'])}")
     if trial["several_instances"]:
         parts.append(f"several instances: {_NEEDS[trial['several_instances']]}")
     if trial["cannot_be_read_before_a_step"]:

@@ -49,7 +49,10 @@ def add_simulate(commands: Commands) -> None:
 
 def _simulate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
-    player, make_env = only_player(arguments), maker_of(arguments.task, arguments.scenario)
+    player, make_env = (
+        only_player(arguments),
+        maker_of(arguments.task, arguments.scenario, arguments.master),
+    )
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     summaries: list[Summary] = []
 
@@ -132,7 +135,9 @@ def _record_one(
 ) -> None:
     """Record the episodes of one who acts."""
     with (
-        closing(player.make_env(maker_of(arguments.task, arguments.scenario))) as env,
+        closing(
+            player.make_env(maker_of(arguments.task, arguments.scenario, arguments.master))
+        ) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
         policy = player.make_policy(env)
@@ -170,7 +175,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         for scenario in _scenarios(arguments):
-            make_env = maker_of(arguments.task, scenario)
+            make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario
             with progress(None, label) as advance:
                 played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
@@ -215,7 +220,8 @@ def add_bench(commands: Commands) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     report: Report | None = None
     with shown_in_any_case(lambda: _show_speeds(report, arguments)):
-        make, sizes = maker_of(arguments.task), arguments.envs or [8, 64, 1024]
+        make = maker_of(arguments.task, master=arguments.master, takes_fmu=True)
+        sizes = arguments.envs or [8, 64, 1024]
         for report in bench(make, sizes, arguments.seconds):  # noqa: B007 - shown at the end
             pass  # each has the speeds of the one before, so that Ctrl-C leaves the last
 

@@ -171,9 +171,9 @@ def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
 
 def _warnings(probe: Probe) -> list[str]:
     found = []
-    if len(probe.rewards) == 1:
+    if probe.only_reward is not None:
         found.append(
-            f"the reward has been {probe.rewards[0]:g} in each step: what is to be learned?"
+            f"the reward has been {probe.only_reward:g} in each step: what is to be learned?"
         )
     if probe.length is None:
         found.append(f"episodes have no length; they are stopped after {probe.most_steps} steps")
@@ -183,9 +183,13 @@ def _warnings(probe: Probe) -> list[str]:
 def _declared(probe: Probe) -> tuple[list[Agent], dict[str, str]]:
     """The controllers of the task: those that are ready, and the texts of those with ranges."""
     given = probe.document.get("controllers", {})
-    texts = {name: text for name, text in given.items() if isinstance(text, str)}
-    ready = [Agent(name, text) for name, text in texts.items() if not has_range(text)]
-    return ready, {name: text for name, text in texts.items() if has_range(text)}
+    tunable = {name: one for name, one in given.items() if has_range(one)}
+    ready = [
+        Agent(name, one) if isinstance(one, str) else Agent.constant(name, one, probe.ranges)
+        for name, one in given.items()
+        if name not in tunable
+    ]
+    return ready, tunable
 
 
 def _told_baseline(fixed: list[str], tunable: list[str], guesses: list[str]) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from fmugym.baselines import Controller, controller_of
+from fmugym.baselines import controller_of
 from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
@@ -78,6 +78,7 @@ class Summary:
         total_reward, total_cost: Sums over the episode; no cost if the task has none.
         end: ``"terminated"``, ``"truncated"``, or ``"fault: ..."`` with its reason.
         kpis: The KPIs that the task has reported at the end, by name.
+        only_reward: The reward of every step; None if it has changed.
     """
 
     seed: int
@@ -87,6 +88,7 @@ class Summary:
     total_cost: float | None
     end: str
     kpis: Mapping[str, float] = field(default_factory=dict)
+    only_reward: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers in types that JSON has."""
@@ -148,7 +150,7 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     return policy_of_controller(controller_of(given), env)
 
 
-def policy_of_controller(controller: Controller, env: FMUEnv) -> Policy:
+def policy_of_controller(controller: Any, env: FMUEnv) -> Policy:
     """Bind a controller to an environment.
 
     Raises:
@@ -190,10 +192,13 @@ def simulate(
     observation, info = env.reset(seed=seed)
     total, cost, end, begin = 0.0, None, "stopped", inner.time
     limit = inner.spec.max_episode_steps if inner.spec is not None else None
+    values: set[float] = set()
     for step in range(1, most_steps + 1):
         observation, reward, terminated, truncated, info = env.step(policy.act(observation))
         truncated = truncated or step == limit
         total += float(reward)
+        if len(values) < 2:
+            values.add(float(reward))
         cost = float(info["cost"]) + (cost or 0.0) if "cost" in info else cost
         advance(1)
         if terminated or truncated:
@@ -201,4 +206,5 @@ def simulate(
             end = end or ("terminated" if terminated else "truncated")
             break
     kpis = {name: float(value) for name, value in info.get("kpis", {}).items()}
-    return Summary(seed, inner.step_count, inner.time - begin, total, cost, end, kpis)
+    only = values.pop() if len(values) == 1 else None
+    return Summary(seed, inner.step_count, inner.time - begin, total, cost, end, kpis, only)

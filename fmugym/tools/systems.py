@@ -11,27 +11,38 @@ from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.configuring import own_config
 from fmugym.declared.systems import fmu_of
+from fmugym.errors import ConfigError
 from fmugym.systems import FMUSystem
 from fmugym.tools.overview import overview, plain, tables
 
 __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"]
 
 
-def find_model(path: Path) -> FMU | FMUSystem:
+def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
     """Find what a file is or names: an FMU, an SSP archive, or a task file with one of both.
+
+    Args:
+        path: The file.
+        master: Of a system, in the place of what the file says.
 
     Raises:
         ConfigError: If the task file or the system has a mistake.
         FMULoadError: If the archive or an FMU cannot be read.
     """
     if path.suffix.lower() == ".ssp":
-        return FMUSystem.read(path)
-    if path.suffix.lower() != ".toml":
-        return FMU(path)
-    task = Task.read(path)
-    source = fmu_of(task)
-    if isinstance(source, FMUSystem) or source.suffix.lower() == ".ssp":
-        return source if isinstance(source, FMUSystem) else FMUSystem.read(source)
+        return FMUSystem.read(path, master=master)
+    if path.suffix.lower() == ".toml":
+        return _model_of(Task.read(path), master)
+    if master is not None:
+        raise ConfigError(f"a master is for systems; {path.name} is a single FMU")
+    return FMU(path)
+
+
+def _model_of(task: Task, master: str | None) -> FMU | FMUSystem:
+    """The system that a task file names, or the FMU with the libraries of the task."""
+    source = fmu_of(task, master)
+    if isinstance(source, FMUSystem):
+        return source
     preload = own_config(task.root).get("preload", ())
     return FMU(source, preload=[preload] if isinstance(preload, str) else preload)
 

@@ -23,13 +23,21 @@ __all__ = ["maker_of", "scenarios_of"]
 _MODELS: Final = {".fmu", ".ssp"}
 
 
-def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
+def maker_of(
+    target: str,
+    scenario: str | None = None,
+    master: str | None = None,
+    *,
+    takes_fmu: bool = False,
+) -> Callable[..., FMUEnv]:
     """Find what a text names.
 
     Args:
-        target: The path of a task file, an FMU or an SSP archive, a registered id, or
-            ``"module:Class"``. For an FMU or archive it is the task that ``fmugym new`` proposes.
+        target: The path of a task file, a registered id, or ``"module:Class"``.
         scenario: A scenario of the task file; None for any episodes.
+        master: Of a system, in the place of what its archive or task says.
+        takes_fmu: Whether the path of an FMU or an SSP archive will do, too. It stands for the task
+            that ``fmugym new`` proposes, whose reward is 0: nothing can be learned or judged in it.
 
     Returns:
         A function that makes the environment. It takes arguments of the environment, and
@@ -41,16 +49,27 @@ def maker_of(target: str, scenario: str | None = None) -> Callable[..., FMUEnv]:
         FMULoadError: If the FMU cannot be read.
     """
     path = Path(target)
+    own: dict[str, Any] = {} if master is None else {"master": master}
     if path.suffix.lower() in _MODELS:
-        return partial(load, Task.from_dict(tomllib.loads(Proposal(open_model(path)).text())))
+        if path.is_file() and not takes_fmu:
+            raise ConfigError(
+                f"{shown(target)} has no reward, so that nothing can be played for: "
+                f"'fmugym new {path.name} --output task.toml' writes a task file to say one in"
+            )
+        task = Task.from_dict(tomllib.loads(Proposal(open_model(path)).text()))
+        return partial(load, task, **own)
     if path.suffix.lower() == ".toml" or path.is_file():
-        return partial(load, Task.read(path), scenario=scenario)
+        return partial(load, Task.read(path), scenario=scenario, **own)
     module, separator, name = target.partition(":")
     if separator and name.isidentifier() and "/" not in module:
         if scenario is not None:
             raise ConfigError(f"{shown(target)} is no task file and has no scenarios")
+        if master is not None:
+            raise ConfigError(f"{shown(target)} is no task file and chooses its own master")
         return partial(load, Task.from_dict({"class": target}))
-    return partial(_registered, target, {} if scenario is None else {"scenario": scenario})
+    if scenario is not None:
+        own["scenario"] = scenario
+    return partial(_registered, target, own)
 
 
 def _nearest(target: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import json
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -19,10 +20,23 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
-from fmugym.tools.agents import algorithm_of, imported_for_training, policy_with, save
+from fmugym.tools.agents import (
+    FACTS,
+    agent_player,
+    algorithm_of,
+    imported_for_training,
+    policy_with,
+    save,
+)
 from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
 from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
-from fmugym.tools.evaluation import HELD_OUT_SEED, Score, Wrap, evaluate
+from fmugym.tools.evaluation import (
+    HELD_OUT_SEED,
+    Score,
+    Wrap,
+    evaluate,
+    warning_of_one_reward,
+)
 from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.simulation import Player
 from fmugym.tools.tracking import Tracker
@@ -54,7 +68,7 @@ class Plan:
         held_out: By name, functions that make the environments of evaluations.
         folder: Where the agent is written; it must not exist, unless a training is resumed.
         algorithm: The name of a class of Stable-Baselines3 or sb3-contrib.
-        steps: Steps of all environments together.
+        steps: Steps of all environments together, at most.
         num_envs: Environments that step together.
         seed: Of the environments and of the algorithm.
         episodes: Episodes of an evaluation in each environment of ``held_out``.
@@ -148,11 +162,11 @@ def train(
         watch: Who is told of the training, in the place of ``tell``.
 
     Returns:
-        The scores of the last evaluation.
+        The scores of the agent that is kept.
 
     Raises:
-        ConfigError: If Stable-Baselines3 is missing, an argument does not fit, or there is no such
-            training to resume.
+        ConfigError: If Stable-Baselines3 is missing, an argument does not fit, the steps are too
+            few to learn once, or there is no such training to resume.
         FileExistsError: If the folder exists, unless a training is resumed.
     """
     make_sb3_env = imported_for_training("fmugym.sb3").make_sb3_env
@@ -168,7 +182,7 @@ def train(
             venv = import_module("stable_baselines3.common.vec_env").VecNormalize(venv)
         with closing(_Training(plan, venv, watch or Watch(tell), resume)) as training:
             training.run()
-        return training.scores
+            return training.scores_of_kept()
     finally:
         venv.close()
 
@@ -218,7 +232,7 @@ def _require_same(plan: Plan) -> None:
 
 
 def _new_model(plan: Plan, venv: Any) -> Any:
-    own = dict(plan.arguments or {})
+    own = _with_fitting_rollouts(plan)
     policy = own.pop("policy", None)
     if policy is None:
         is_dict = isinstance(venv.observation_space, spaces.Dict)
@@ -231,16 +245,29 @@ def _new_model(plan: Plan, venv: Any) -> Any:
         raise ConfigError(f"{plan.algorithm} cannot be made: {reason(error)}") from error
 
 
-class _Training:
-    """A training: evaluates the agent now and then, keeps the best one, and can be resumed.
+def _with_fitting_rollouts(plan: Plan) -> dict[str, Any]:
+    """The arguments of the plan, with shorter rollouts where it has fewer steps than usual ones."""
+    own, most = dict(plan.arguments or {}), plan.steps // plan.num_envs
+    default = inspect.signature(algorithm_of(plan.algorithm)).parameters.get("n_steps")
+    if default is not None and 0 < most < default.default:
+        own.setdefault("n_steps", 1 << (most.bit_length() - 1))  # so that batches divide rollouts
+    return own
 
-    Attributes:
-        scores: The scores of the last evaluation.
-    """
+
+def _steps_between_updates(model: Any, num_envs: int) -> int:
+    """The steps of all environments after which an algorithm learns; it cannot stop before."""
+    if hasattr(model, "rollout_buffer"):
+        return int(model.n_steps) * num_envs
+    frequency: Any = getattr(model, "train_freq", None)
+    steps = 1 if frequency is None or frequency.unit.value == "episode" else frequency.frequency
+    return int(steps) * num_envs
+
+
+class _Training:
+    """A training: evaluates the agent now and then, keeps the best one, and can be resumed."""
 
     def __init__(self, plan: Plan, venv: Any, watch: Watch, resume: bool) -> None:
         self._plan, self._venv, self._watch = plan, venv, watch
-        self.scores: list[Score] = []
         self._due = max(1, plan.steps // _EVALUATIONS)
         self._progress = {"best": -float("inf"), "next": self._due, "last": -1, "updates": -1}
         self._is_new = not resume
@@ -248,6 +275,7 @@ class _Training:
             self._load()
         else:
             self._model = _new_model(plan, venv)
+            self._require_an_update()
             plan.folder.mkdir(parents=True, exist_ok=True)
         facts: dict[str, Any] = {"schema": 1, "steps": plan.steps, **plan.facts()}
         if plan.diary is not None:
@@ -274,7 +302,7 @@ class _Training:
         """Train until the end, and evaluate once more."""
         self._log_to()
         remaining = self._plan.steps - self._steps
-        self._tell_of_long_rollouts(remaining)
+        remaining -= remaining % _steps_between_updates(self._model, self._plan.num_envs)
         try:
             if remaining > 0:
                 self._model.learn(
@@ -285,16 +313,21 @@ class _Training:
             else:
                 self.evaluate()
         except KeyboardInterrupt:
+            if not (self._plan.folder / FACTS).exists():  # a second one may end the evaluation
+                self._keep()
             self.evaluate()
             raise
 
-    def _tell_of_long_rollouts(self, remaining: int) -> None:
-        """PPO and the like make a whole rollout before they learn for the first time."""
-        length, count = getattr(self._model, "n_steps", 0), self._plan.num_envs
-        if 0 < remaining < length * count:
-            self._watch.tell(
-                f"{self._plan.algorithm} learns after every {length * count} steps (n_steps="
-                f"{length} in {count} environments) and cannot stop before: give a smaller n_steps"
+    def _require_an_update(self) -> None:
+        """Refuse a training that ends before it learns for the first time."""
+        plan = self._plan
+        between = _steps_between_updates(self._model, plan.num_envs)
+        name = "n_steps" if hasattr(self._model, "rollout_buffer") else "train_freq"
+        if between > plan.steps:
+            raise ConfigError(
+                f"{plan.algorithm} learns after every {between} steps ({name}="
+                f"{between // plan.num_envs} in {plan.num_envs} environments), more than the "
+                f"{plan.steps} of the training: give a smaller {name}, or fewer environments"
             )
 
     def close(self) -> None:
@@ -347,25 +380,38 @@ class _Training:
 
     def evaluate(self) -> None:
         """Evaluate the agent, unless that was done at this step."""
-        plan, steps = self._plan, self._steps
-        if steps == self._progress["last"] and self.scores:
+        steps = self._steps
+        if steps == self._progress["last"]:
             return
-        is_new = steps != self._progress["last"]
-        self._progress |= {"last": steps, "updates": self._model._n_updates}
+        is_first = self._progress["last"] < 0
         make_policy = partial(policy_with, self._model, self._normalization())
-        player = Player(make_policy, is_physical=False)
-        seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
-        self.scores = []
-        for name, make_env in plan.held_out.items():
-            self.scores += evaluate(
-                make_env, {name: player}, seeds, plan.most_steps, wrap=self._wrap(name)
-            )
-        mean = sum(score.mean for score in self.scores) / len(self.scores)
+        scores = self._scores(Player(make_policy, is_physical=False), self._wrap)
+        mean = sum(score.mean for score in scores) / len(scores)
+        self._progress |= {"last": steps, "updates": self._model._n_updates}
         self._watch.tell(f"{steps} steps: reward {mean:.6g} in evaluation")
-        if is_new:
-            self._note(steps, mean)
-            self._keep_if_best(steps, mean)
-            self._watch.evaluated(steps, mean)
+        warning = warning_of_one_reward(scores) if is_first else None
+        if warning is not None:
+            self._watch.tell(f"warning: {warning}")
+        self._note(steps, mean, scores)
+        if mean > self._progress["best"]:
+            self._progress["best"] = mean
+            self._keep(reward=mean)
+        self._watch.evaluated(steps, mean)
+
+    def scores_of_kept(self) -> list[Score]:
+        """Let the agent in the folder play the episodes of the evaluations once more."""
+        facts = json.loads((self._plan.folder / FACTS).read_text(encoding="utf-8"))
+        self._watch.tell(f"the agent after {facts['steps']} steps was the best, and is kept")
+        return self._scores(agent_player(self._plan.folder), lambda name: lambda env: env)
+
+    def _scores(self, player: Player, wrap: Callable[[str], Wrap]) -> list[Score]:
+        plan = self._plan
+        seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
+        return [
+            score
+            for name, make_env in plan.held_out.items()
+            for score in evaluate(make_env, {name: player}, seeds, plan.most_steps, wrap=wrap(name))
+        ]
 
     def _wrap(self, name: str) -> Wrap:
         """What wraps the environment of an evaluation."""
@@ -377,24 +423,22 @@ class _Training:
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
-    def _note(self, steps: int, mean: float) -> None:
-        names = [score.name for score in self.scores]
+    def _note(self, steps: int, mean: float, scores: list[Score]) -> None:
+        names = [score.name for score in scores]
         path = self._plan.folder / EVALUATIONS
         is_new = not path.exists()
         with path.open("a", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             if is_new:
                 writer.writerow(["steps", "reward", *names])
-            writer.writerow([steps, mean, *(score.mean for score in self.scores)])
+            writer.writerow([steps, mean, *(score.mean for score in scores)])
         if self._tracker is not None:
-            each = {f"evaluation/{score.name}": score.mean for score in self.scores}
+            each = {f"evaluation/{score.name}": score.mean for score in scores}
             self._tracker.log({"evaluation/reward": mean, **each}, steps)
 
-    def _keep_if_best(self, steps: int, mean: float) -> None:
-        if mean > self._progress["best"]:
-            self._progress["best"] = mean
-            facts = {"algorithm": self._plan.algorithm, "steps": steps, "reward": mean}
-            save(self._plan.folder, self._model, self._normalization(), facts)
+    def _keep(self, **more: float) -> None:
+        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **more}
+        save(self._plan.folder, self._model, self._normalization(), facts)
 
 
 def _writer_to(tracker: Tracker, base: Any) -> Any:

@@ -55,7 +55,9 @@ class Stage(StrEnum):
     HALFWAY = "the rehearsal of a state in the middle of an episode"
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
+    SHARED_DATA = "the search for data that steps share"
     THREADS = "the comparison with an instance in another thread"
+    THREADS_OF_COPIES = "the comparison with a copy of the library in another thread"
     TURNS = "the comparison with an instance in another thread, initialized in turn"
 
     @classmethod

@@ -7,27 +7,29 @@ of their library, or call functions that are not thread-safe.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Final
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import replace
+from typing import Final, cast
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
+from fmugym.archive.loadable import ExtractedFMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
-from fmugym.fmi.access import Access
-from fmugym.fmi.instance import Instance
-from fmugym.fmi.library import Library
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.fmi.system_library import open_library
-from fmugym.pool.base import FloatArray, Pool
-from fmugym.pool.pacing import Pacer
-from fmugym.pool.patience import licence_errors, require_licence
-from fmugym.pool.progress import INITIALIZATION, STEP, announce
-from fmugym.pool.spec import PoolSpec
+from fmugym.pool.base import FloatArray, Pool, StatusArray
+from fmugym.pool.extension import has_native_pool
+from fmugym.pool.local import local_pool
+from fmugym.pool.patience import require_licence
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.systems.description import SystemDescription
+from fmugym.systems.fmu import ExtractedSystem, SystemFMU
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs
 from fmugym.trial.pools import trial_pool
@@ -44,8 +46,12 @@ _MOST_OUTPUTS: Final = 1000
 _STEPS: Final = 30
 _EPISODES: Final = (_STEPS, 3, 3)
 """The steps of each episode. From the third one on, a saved state may be restored."""
-_ROUNDS: Final = 20
-_THREAD_SECONDS: Final = 0.2
+_CALLS: Final = 10
+_CALL_SECONDS: Final = 2e-3
+_MOST_SUBSTEPS: Final = 1024
+"""How many calls an episode in threads makes, how long each takes if steps are quick, and the most
+steps that one makes then."""
+_THREAD_SECONDS: Final = 0.3
 """The real time in seconds after which a comparison in threads ends."""
 
 
@@ -168,190 +174,112 @@ def _trajectory(
 def disturb_in_threads(
     candidate: Candidate,
     spec: PoolSpec,
+    starts: Starts | None = None,
     *,
+    step_seconds: float,
     one_initialization: bool = False,
+    private_libraries: bool = False,
     frugal: bool = False,
 ) -> bool:
-    """Compare a lone instance with instances that are made and stepped at the same time.
+    """Compare two instances in two threads with the same instances in one.
 
     Args:
         candidate: The FMU.
         spec: What to do in a step.
+        starts: The start values of the two instances; by default those of the FMU.
+        step_seconds: How long a step takes; a call makes many quick ones, so that threads meet.
         one_initialization: Whether instances are made, initialized and freed in turn, so that only
             steps run at the same time as other calls.
+        private_libraries: Whether each instance has a copy of the library.
         frugal: Whether to do with as few initializations as possible.
 
     Returns:
         Whether an instance gave different outputs, or failed, while another thread ran.
 
     Raises:
-        FMULoadError: If FMPy cannot load the FMU.
-        SimulationError: If an instance alone fails.
+        FMULoadError: If the FMU cannot be loaded.
+        LicenceError: If an instance gets no licence.
     """
-    library = open_library(candidate.open(), logger, spec.solving, spec.inputs, spec.outputs)
-    try:
-        lives = _two_lives(library, spec)
-        if lives[0]() != lives[0].outputs:
-            return False  # a lone instance does not repeat its outputs: nothing to compare
-        company = _Turns() if one_initialization else _Crowd()
-        rounds = 1 if frugal and not one_initialization else 2
-        return not _Race(lives, company, rounds).is_undisturbed()
-    finally:
-        library.close()
+    if not has_native_pool() or candidate.open().in_wine:
+        return False  # one thread steps all instances
+    spec = replace(
+        _with_long_calls(spec, step_seconds),
+        reset_method=ResetMethod.INSTANCE,
+        component_resets=(),
+        one_initialization=one_initialization,
+    )
+    fmus = [candidate.open() for _ in range(2 if private_libraries else 1)]
+    with ExitStack() as stack:
+        for fmu in fmus:
+            stack.callback(fmu.close)
+        pair = [_Life(fmus[-i], spec, starts or Starts(), i) for i in range(2)]
+        for life in pair:
+            stack.callback(life.end)
+        return _differ_in_threads(pair, frugal)
 
 
-def _two_lives(library: Library, spec: PoolSpec) -> list[_Life]:
-    """Let two instances live one after the other, with inputs that differ if the FMU bears it."""
-    pacer = Pacer(spec)
-    try:
-        return [_Life(library, spec, inputs, pacer) for inputs in _inputs_of_two(spec, 1.0)]
-    except LicenceError:
-        raise
-    except SimulationError:
-        return [_Life(library, spec, _inputs_of_two(spec, 0.0)[0], pacer)] * 2
+def _with_long_calls(spec: PoolSpec, step_seconds: float) -> PoolSpec:
+    """Let each call take long enough for another thread, and its outputs tell of all its steps.
 
-
-class _Company:
-    """What an instance waits for in the course of its life; a lone one waits for nothing."""
-
-    turn: AbstractContextManager[Any] = nullcontext()
-    """Held while an instance is made, initialized or freed."""
-
-    def before_initialization(self) -> None:
-        """Wait until the other instance is about to be initialized, too."""
-
-    def before_steps(self) -> None:
-        """Wait until the other instance is about to be stepped, too."""
-
-    def leave(self) -> None:
-        """Let nobody wait any more."""
-
-
-class _Crowd(_Company):
-    """Two instances are initialized at the same moment."""
-
-    def __init__(self) -> None:
-        self._barrier = threading.Barrier(2)
-
-    def before_initialization(self) -> None:
-        self._barrier.wait()
-
-    def leave(self) -> None:
-        self._barrier.abort()
-
-
-class _Turns(_Crowd):
-    """Two instances are initialized in turn.
-
-    In every other round they step at the same moment. In the rounds between, the first one steps
-    while the second one is initialized.
+    Powers of two leave the step size that the FMU sees alone.
     """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.turn = threading.Lock()
-        self._rounds = threading.local()
-
-    def before_steps(self) -> None:
-        count = getattr(self._rounds, "count", 0)
-        self._rounds.count = count + 1
-        if count % 2:
-            self._barrier.wait()
+    wanted = _CALL_SECONDS / max(step_seconds, 1e-9)
+    factor = 2 ** int(math.log2(min(max(wanted, 1.0), _MOST_SUBSTEPS)))
+    return replace(
+        spec,
+        time_step=spec.time_step * factor,
+        substeps=spec.substeps * factor,
+        samplings=tuple("last" if v.kind == "string" else "mean" for v in spec.outputs),
+        warm_up_steps=0,
+    )
 
 
-class _Race:
-    """Two threads that each make, run and free an instance at the same time, several times."""
-
-    def __init__(self, lives: Sequence[_Life], company: _Company, least_rounds: int) -> None:
-        self._lives, self._company, self._least_rounds = lives, company, least_rounds
-        self._refusal: LicenceError | None = None
-        self._deadline = time.perf_counter() + _THREAD_SECONDS
-        self._disturbed = False
-
-    def is_undisturbed(self) -> bool:
-        threads = [threading.Thread(target=self._run, args=[life]) for life in self._lives]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if self._refusal is not None:
-            raise self._refusal
-        return not self._disturbed
-
-    def _run(self, life: _Life) -> None:
-        try:
-            for number in range(1, _ROUNDS + 1):
-                if life(self._company) != life.outputs:
-                    self._disturbed = True
-                is_late = number >= self._least_rounds and time.perf_counter() > self._deadline
-                if self._disturbed or is_late:
-                    break
-        except LicenceError as error:
-            self._refusal = error
-        except (FMULoadError, SimulationError) as error:
-            logger.info("an instance fails beside another thread: %s", error)
-            self._disturbed = True
-        except threading.BrokenBarrierError:  # the other thread has ended
-            pass
-        finally:
-            self._company.leave()
+def _differ_in_threads(pair: Sequence[_Life], frugal: bool) -> bool:
+    """Let both play at the same time, one episode or as many as there is time for."""
+    alone = [life.play() for life in pair]
+    deadline = time.perf_counter() + _THREAD_SECONDS
+    barrier = threading.Barrier(len(pair))
+    with ThreadPoolExecutor(len(pair)) as threads:
+        while True:
+            together = list(threads.map(_Life.play, pair, [barrier] * len(pair)))
+            if together != alone:
+                return [life.play() for life in pair] == alone  # or they never repeat it
+            if frugal or time.perf_counter() > deadline:
+                return False
 
 
 class _Life:
-    """The life of an instance with given inputs; calling it makes another instance.
+    """An instance that begins the same episode again and again, each time made anew.
 
     Args:
-        library: The FMU's library.
+        fmu: The FMU, whose library it shares with other instances.
         spec: What to do in a step.
-        inputs: Shape (steps, inputs).
-        pacer: Waits before an instance is made or initialized.
-
-    Attributes:
-        outputs: All outputs of a lone instance.
+        starts: The start values of two instances.
+        index: Which of the two it is.
     """
 
-    def __init__(self, library: Library, spec: PoolSpec, inputs: FloatArray, pacer: Pacer) -> None:
-        self._library, self._spec, self._inputs, self._pacer = library, spec, inputs, pacer
-        self.outputs = self()
+    def __init__(self, fmu: FMU, spec: PoolSpec, starts: Starts, index: int) -> None:
+        self._variables, self._values = starts.variables, starts.apart().column(index)
+        self._inputs = _inputs_of_two(spec, 1.0)[index, :_CALLS]
+        self._pool = local_pool(_lent(fmu), spec, 1, logger, native=True, threads=1)
+        self.end = self._pool.close
 
-    def __call__(self, company: _Company | None = None) -> bytes:
-        """Make, initialize, step and free an instance; return all outputs."""
-        company = company or _Company()
-        spec = self._spec
-        announce(INITIALIZATION)
-        with company.turn, licence_errors():
-            self._pacer.wait()
-            instance = self._library.instantiate()
-        try:
-            company.before_initialization()
-            with company.turn, licence_errors():
-                self._pacer.wait()
-                instance.initialize(
-                    spec.start_time, spec.stop_time, spec.tolerance, _no_start_values
-                )
-            company.before_steps()
-            announce(STEP)
-            return _steps(instance, spec, self._inputs)
-        finally:
-            with company.turn:
-                self._library.discard(instance)
+    def play(self, barrier: threading.Barrier | None = None) -> bytes:
+        """Play an episode; returns all outputs and statuses."""
+        if barrier is not None:
+            barrier.wait()
+        seen = [_copy_of(*self._pool.reset(self._variables, self._values))]
+        require_licence(self._pool)
+        seen += [_copy_of(*self._pool.step(row[:, None])) for row in self._inputs]
+        return b"".join(seen)
 
 
-def _steps(instance: Instance, spec: PoolSpec, inputs: FloatArray) -> bytes:
-    writer, reader = Access(instance, spec.inputs), Access(instance, spec.outputs)
-    if not spec.blind_start:
-        instance.check("reading the outputs", reader.get())
-    values = reader.values.tobytes()
-    for step, row in enumerate(inputs):
-        writer.values[:] = row
-        instance.check("setting the inputs", writer.set())
-        time_ = spec.communication_point(step)
-        if instance.step(time_, spec.communication_step_size) > Status.WARNING:
-            break
-        instance.check("reading the outputs", reader.get())
-        values += reader.values.tobytes()
-    return values
+def _lent(fmu: FMU) -> ExtractedFMU:
+    """The FMU for a pool that must not remove its files."""
+    if isinstance(fmu, SystemFMU):
+        return ExtractedSystem(fmu.path, cast("SystemDescription", fmu.description), fmu.extract())
+    return ExtractedFMU(fmu.path, fmu.description, fmu.preload, fmu.extract())
 
 
-def _no_start_values() -> None:
-    """Keep the FMU's start values."""
+def _copy_of(outputs: FloatArray, statuses: StatusArray) -> bytes:
+    return outputs.tobytes() + statuses.tobytes()

@@ -9,6 +9,7 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, unknown_name
+from fmugym.pool.base import first_of
 from fmugym.pool.spec import ISOLATIONS, ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.trial.candidate import Candidate
@@ -223,8 +224,8 @@ def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
     """Log the reset methods that the FMU offers but that do not work correctly."""
     wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
     if not verdict.deterministic:
-        text = "%s gives other outputs each time, even if it begins afresh"
-        log.log(_level_of(fmu, "outputs"), text, fmu.path.name)
+        text = "%s gives other values of %s each time, even if it begins afresh"
+        log.log(_level_of(fmu, "outputs"), text, fmu.path.name, first_of(verdict.noisy))
     if ResetMethod.RESET in wrong:
         log.log(
             _level_of(fmu, str(verdict.reset_method)),

@@ -138,7 +138,7 @@ class Rehearsal:
         sample: The reference, if another process has made it.
 
     Attributes:
-        deterministic: Whether two fresh instances give the same outputs.
+        noisy: The names of the outputs that two fresh instances give differently, as far as known.
         is_frugal: Whether fewer episodes are played, because initializations are slow or need
             licences.
         reason: The FMU's message if even a fresh instance cannot play an episode, otherwise "".
@@ -153,11 +153,12 @@ class Rehearsal:
     ) -> None:
         self._candidate, self._starts = candidate, starts
         self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
-        self.deterministic, self.reason = True, ""
+        self.noisy: tuple[str, ...] = ()
+        self.reason = ""
         self.is_frugal = spec.initialization_interval > 0.0 or spec.licence_wait > 0.0
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
-        self._tolerance, self._knows_noise = tolerance_of(spec), False
+        self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance_of(spec)), False
         self._sample = sample
         if sample is None:
             self._find_reference()
@@ -196,9 +197,11 @@ class Rehearsal:
         self._knows_noise = True
         again = self._play_fresh(0)
         if not _same(again, self._references[0]):
-            self.deterministic = False
             noise = difference(again.rows, self._references[0].rows)
-            self._tolerance = max(self._tolerance, _SLACK * noise)
+            names = [variable.name for variable in self._spec.outputs]
+            found = [name for name, own in zip(names, noise, strict=True) if own > 0.0]
+            self.noisy = tuple(found or names)
+            self._tolerances = np.maximum(self._tolerances, _SLACK * noise)
 
     def _play_fresh(self, start: int, *, measured: bool = False) -> _Run:
         pool = self._open(ResetMethod.RESET)
@@ -330,7 +333,7 @@ class Rehearsal:
         if not self._knows_noise:
             self._compare_fresh_instances()
         close = len(run.rows) == len(reference.rows) and run.status == reference.status
-        if close and difference(run.rows, reference.rows) <= self._tolerance:
+        if close and np.all(difference(run.rows, reference.rows) <= self._tolerances):
             return Grade.TOLERANCE
         return Grade.WRONG
 
@@ -344,8 +347,8 @@ def tolerance_of(spec: PoolSpec) -> float:
     return _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
 
 
-def difference(one: FloatArray, other: FloatArray) -> float:
-    """The largest difference of an output, as a fraction of its largest magnitude.
+def difference(one: FloatArray, other: FloatArray) -> FloatArray:
+    """The largest difference of each output, as a fraction of its largest magnitude.
 
     Args:
         one: A row of outputs for each step.
@@ -354,8 +357,8 @@ def difference(one: FloatArray, other: FloatArray) -> float:
     length = min(len(one), len(other))
     a, b = one[:length], other[:length]
     if a.size == 0:
-        return 0.0
+        return np.zeros(one.shape[1])
     scale = np.maximum(np.abs(a).max(axis=0), np.abs(b).max(axis=0))
     with np.errstate(all="ignore"):
-        relative = np.abs(a - b).max(axis=0) / np.where(scale == 0.0, 1.0, scale)
-    return float(np.nan_to_num(relative, nan=np.inf).max())
+        relative: FloatArray = np.abs(a - b).max(axis=0) / np.where(scale == 0.0, 1.0, scale)
+    return np.where(np.isnan(relative), np.inf, relative)

@@ -148,7 +148,7 @@ class Repetition:
         loose = self._verdict.resets.get(self._spec.reset_method) is Grade.TOLERANCE
         if not loose or seen.statuses != fresh.statuses:
             return False
-        return difference(seen.rows, fresh.rows) <= tolerance_of(self._spec)
+        return bool(np.all(difference(seen.rows, fresh.rows) <= tolerance_of(self._spec)))
 
     def _describe(self, seen: _Run, fresh: _Run) -> str:
         """Name the first difference: the step, and its statuses or a variable with its values."""

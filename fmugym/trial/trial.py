@@ -20,7 +20,7 @@ from fmugym.errors import FMULoadError, LicenceError
 from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
-from fmugym.trial.attempt import Outcome, Request, run
+from fmugym.trial.attempt import Outcome, Request, Stage, run
 from fmugym.trial.cache import recall, remember
 from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.known import known_verdict, with_harm
@@ -30,8 +30,11 @@ __all__ = ["examine", "meet"]
 
 logger = logging.getLogger(__name__)
 
-_ALONE: Final = {"loading and instantiation", "initialization", "the first step", "closing"}
-"""The stages of a single instance. If a worker ends there only when memory is checked, the FMU
+_ALONE: Final = {
+    *("loading and instantiation", "initialization", "the first step", "closing"),
+    *(Stage.REFERENCE, Stage.SHARED_DATA),
+}
+"""The stages of a fresh instance. If a worker ends there only when memory is checked, the FMU
 writes to memory that it must not touch."""
 
 
@@ -111,10 +114,10 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
         _require_licence(name, outcome)
         if "finished" in outcome.answer:
             break
-        if "complete" not in outcome.answer:
-            if not (request.check_memory and outcome.shows_memory_error):
-                return notes.died_alone(name, must_survive)
+        if outcome.stage in _ALONE and request.check_memory and outcome.shows_memory_error:
             request = replace(request, check_memory=False)
+        elif "complete" not in outcome.answer:
+            return notes.died_alone(name, must_survive)
         elif outcome.stage in request.skip:  # it dies outside the requested stages
             break
         else:
@@ -198,7 +201,7 @@ class _Notes:
         neighbours = answer.get("neighbours")
         return Verdict(
             complete=bool(answer.get("complete")),
-            deterministic=bool(answer.get("deterministic", True)),
+            noisy=tuple(answer.get("noisy", ())),
             resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
             components=tuple(map(ResetMethod, answer.get("components", ()))),
             neighbours=None if neighbours is None else Neighbours(neighbours),

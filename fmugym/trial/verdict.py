@@ -13,7 +13,7 @@ from fmugym.systems.plan import SystemPlan
 
 __all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 5
+_FORMAT: Final = 6
 
 FRUGAL: Final = (
     "its initializations are slow or need licences, so no episode returned to earlier start values"
@@ -56,7 +56,7 @@ class Verdict:
 
     Attributes:
         complete: Whether an instance could be made, initialized and stepped.
-        deterministic: Whether two fresh instances give the same outputs.
+        noisy: The names of the outputs that two fresh instances give differently.
         resets: The grade of each reset method that was tried.
         components: How each component of a system begins an episode; empty if all do alike.
         neighbours: What several instances need; None if only one was tried.
@@ -70,7 +70,7 @@ class Verdict:
     """
 
     complete: bool = False
-    deterministic: bool = True
+    noisy: tuple[str, ...] = ()
     resets: Mapping[ResetMethod, Grade] = field(default_factory=dict)
     components: tuple[ResetMethod, ...] = ()
     neighbours: Neighbours | None = None
@@ -81,6 +81,11 @@ class Verdict:
     instances: int = 1
     initializations: int = 0
     reasons: tuple[str, ...] = ()
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether two fresh instances give the same outputs."""
+        return not self.noisy
 
     @property
     def reset_method(self) -> ResetMethod:
@@ -104,7 +109,7 @@ class Verdict:
             {
                 "format": _FORMAT,
                 "complete": self.complete,
-                "deterministic": self.deterministic,
+                "noisy": list(self.noisy),
                 "resets": {str(method): str(grade) for method, grade in self.resets.items()},
                 "components": [str(method) for method in self.components],
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
@@ -128,25 +133,25 @@ class Verdict:
 
     @classmethod
     def _from_data(cls, data: dict[str, Any]) -> Verdict | None:
-        names = ("complete", "deterministic", "isolate", "blind_start")
+        names = ("complete", "isolate", "blind_start")
         flags = [data[name] for name in names]
-        reasons, unreadable = data["reasons"], data["unreadable"]
+        reasons, unreadable, noisy = data["reasons"], data["unreadable"], data["noisy"]
         if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
             return None
         if data["instances"] not in (1, 2):
             return None
-        if not _are_texts(reasons) or not _are_texts(unreadable):
+        if not all(map(_are_texts, (reasons, unreadable, noisy))):
             return None
         given = data["neighbours"]
         return cls(
             complete=flags[0],
-            deterministic=flags[1],
+            noisy=tuple(noisy),
             resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
             components=tuple(map(ResetMethod, data["components"])),
             neighbours=None if given is None else Neighbours(given),
-            isolate=flags[2],
+            isolate=flags[1],
             states=None if data["states"] is None else Grade(data["states"]),
-            blind_start=flags[3],
+            blind_start=flags[2],
             unreadable=tuple(unreadable),
             instances=data["instances"],
             initializations=int(data["initializations"]),

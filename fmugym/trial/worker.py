@@ -7,15 +7,18 @@ writes the FMU's messages to standard error at once, because the next call may b
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import faulthandler
 import functools
 import json
 import logging
+import math
 import os
 import pickle
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +26,7 @@ import numpy as np
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.variable import Variable
-from fmugym.errors import FMUGymError, LicenceError
+from fmugym.errors import FMUGymError, FMULoadError, LicenceError
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
@@ -40,6 +43,7 @@ from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
 from fmugym.trial.rungs import find_rungs, offers_of
+from fmugym.trial.shared_data import Steps, watch_steps
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 _NO_DIALOGUES: Final = 0x0003
@@ -221,14 +225,14 @@ def _try_resets(request: Request, notes: Notes) -> Verdict:
         notes.stage(stage)
         skipped = stage in request.skip
         grades[method] = Grade.FAILS if skipped else rehearsal.grade(method)
-        notes.answer(resets=grades, deterministic=rehearsal.deterministic)
+        notes.answer(resets=grades, noisy=rehearsal.noisy)
         if grades[method] == Grade.BITWISE:
             break
     components = _try_components(request, rehearsal, grades, notes)
     if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
         _make_sample(rehearsal, request, notes)
     blind = notes.found("blind_start")
-    return Verdict(resets=grades, components=components, blind_start=blind)
+    return Verdict(resets=grades, components=components, noisy=rehearsal.noisy, blind_start=blind)
 
 
 def _try_components(
@@ -336,46 +340,75 @@ def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
         notes: Get the answer.
         alone: The verdict on a lone instance.
     """
-    method, blind = alone.reset_method, alone.blind_start
     spec = replace(
-        request.spec,
-        reset_method=method,
+        _without(request.spec, alone.noisy),
+        reset_method=alone.reset_method,
         component_resets=alone.components,
-        blind_start=blind,
+        blind_start=alone.blind_start,
     )
     request = replace(request, spec=spec)
     notes.answer(instances=2)
     notes.answer(neighbours=_need_of_several(request, notes))
 
 
+def _without(spec: PoolSpec, noisy: tuple[str, ...]) -> PoolSpec:
+    """Leave out the outputs that tell nothing about other instances, unless all are such."""
+    kept = [i for i, variable in enumerate(spec.outputs) if variable.name not in noisy]
+    if not kept:
+        return spec
+    samplings = tuple(spec.samplings[i] for i in kept) if spec.samplings else ()
+    return replace(spec, outputs=tuple(spec.outputs[i] for i in kept), samplings=samplings)
+
+
 def _need_of_several(request: Request, notes: Notes) -> Neighbours:
     """Find the cheapest way to keep instances from disturbing each other."""
+    copies = _can_copy_libraries(request.candidate.open())
     if request.alone or _disturbed(request, notes, private_libraries=False):
-        copies = _can_copy_libraries(request.candidate.open())
         copies = copies and not _disturbed(request, notes, private_libraries=True)
         return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
-    if not _disturbed_in_threads(request, notes, Stage.THREADS):
-        return Neighbours.INDEPENDENT
-    if not _disturbed_in_threads(request, notes, Stage.TURNS):
-        return Neighbours.ONE_INITIALIZATION
+    steps = _watch_steps(request, notes)
+    race = partial(_disturbed_in_threads, request, notes, steps.seconds)
+    if steps.need is Neighbours.INDEPENDENT:
+        if not race(Stage.THREADS):
+            return Neighbours.INDEPENDENT
+        return Neighbours.ONE_THREAD if race(Stage.TURNS) else Neighbours.ONE_INITIALIZATION
+    copies = copies and steps.need is Neighbours.LIBRARIES
+    if copies and not (
+        _disturbed(request, notes, private_libraries=True) or race(Stage.THREADS_OF_COPIES)
+    ):
+        return Neighbours.LIBRARIES
     return Neighbours.ONE_THREAD
 
 
-def _disturbed_in_threads(request: Request, notes: Notes, stage: Stage) -> bool:
+def _watch_steps(request: Request, notes: Notes) -> Steps:
+    notes.stage(Stage.SHARED_DATA)
+    if Stage.SHARED_DATA not in request.skip:
+        with contextlib.suppress(FMULoadError):
+            return watch_steps(
+                request.candidate, _without_reloading(request.spec), request.starts or Starts()
+            )
+    return Steps(Neighbours.INDEPENDENT, math.inf)
+
+
+def _disturbed_in_threads(
+    request: Request, notes: Notes, step_seconds: float, stage: Stage
+) -> bool:
     notes.stage(stage)
     if stage in request.skip:
         return True
-    in_turn = stage is Stage.TURNS
     try:
         return disturb_in_threads(
             request.candidate,
             request.spec,
-            one_initialization=in_turn,
+            request.starts,
+            step_seconds=step_seconds,
+            one_initialization=stage is Stage.TURNS,
+            private_libraries=stage is Stage.THREADS_OF_COPIES,
             frugal=notes.found("frugal"),
         )
     except LicenceError:
         raise
-    except FMUGymError:  # FMPy cannot load it, or it fails without the caller's values
+    except FMUGymError:  # it fails without the caller's values
         return False
 
 

@@ -2,204 +2,140 @@
 
 #include <string.h>
 
-/* The beginning of an array of numpy, as its C interface publishes it. knows_arrays compares it with
- * what numpy says of an array; where it differs, all arrays are new ones. */
-typedef struct {
-    char *data;
-    int dimensions;
-    Py_ssize_t *shape, *strides;
-    PyObject *base, *type;
-    int flags;
-    PyObject *weak_references;
-} Fields;
+/* What is built with the headers of numpy 2 also runs with numpy 1.26. */
+#define NPY_TARGET_VERSION NPY_1_25_API_VERSION
+#define NPY_NO_DEPRECATED_API NPY_1_25_API_VERSION
+#include <numpy/arrayobject.h>
 
-typedef struct {
-    PyObject_HEAD Fields fields;
-} Array;
+#if NPY_ABI_VERSION < 0x02000000
+#error "the extension must be built with numpy 2 or newer"
+#endif
 
-static const Fields *fields_of(PyObject *array) {
-    return &((Array *)array)->fields;
-}
+/* Where objects of numpy.ndarray have the list of their weak references. */
+static Py_ssize_t weak_references;
 
-/* Looking inside of arrays */
-
-static bool has_room_for_fields(PyObject *array) {
-    PyObject *size = PyObject_GetAttrString((PyObject *)Py_TYPE(array), "__basicsize__");
-    const bool has = size != NULL && PyLong_AsSsize_t(size) >= (Py_ssize_t)sizeof(Array);
-
-    Py_XDECREF(size);
-    return has;
-}
-
-static bool equals_buffer(PyObject *array) {
-    const Fields *f = fields_of(array);
-    PyObject *type = PyObject_GetAttrString(array, "dtype");
-    Py_buffer b;
-
-    if (type == NULL || PyObject_GetBuffer(array, &b, PyBUF_STRIDES) < 0) {
-        Py_XDECREF(type);
+bool numpy_import(void) {
+    if (PyArray_ImportNumPyAPI() < 0) {
         return false;
     }
-    const size_t lengths = (size_t)b.ndim * sizeof *b.shape;
-    const bool equal = f->data == b.buf && f->dimensions == b.ndim && f->base == NULL &&
-                       f->type == type && f->weak_references == NULL &&
-                       memcmp(f->shape, b.shape, lengths) == 0 &&
-                       memcmp(f->strides, b.strides, lengths) == 0;
-    PyBuffer_Release(&b);
-    Py_DECREF(type);
-    return equal;
-}
-
-/* Whether the fields for flags and weak references show it when these change. */
-static bool shows_changes(PyObject *array) {
-    const int flags = fields_of(array)->flags;
-    PyObject *reference = PyWeakref_NewRef(array, NULL);
-    const bool shows_reference = reference != NULL && fields_of(array)->weak_references != NULL;
-    PyObject *nothing = PyObject_CallMethod(array, "setflags", "i", 0);
-    const bool shows_flags = nothing != NULL && fields_of(array)->flags != flags;
-
-    Py_XDECREF(reference);
-    Py_XDECREF(nothing);
-    return shows_reference && shows_flags;
-}
-
-static bool knows_arrays(PyObject *empty) {
-    PyObject *array = PyObject_CallFunction(empty, "((ii))", 2, 3);
-    const bool knows = array != NULL && has_room_for_fields(array) && equals_buffer(array) &&
-                       shows_changes(array);
-
-    Py_XDECREF(array);
-    PyErr_Clear();
-    return knows;
-}
-
-bool numpy_look(Numpy *numpy, PyObject *empty) {
-    PyObject *array = PyObject_CallFunction(empty, "((i))", 1);
-
-    if (array == NULL) {
-        return false;
-    }
-    numpy->empty = empty;
-    numpy->class = (PyTypeObject *)Py_NewRef((PyObject *)Py_TYPE(array));
-    numpy->looks_inside = knows_arrays(empty);
-    Py_DECREF(array);
-    return true;
-}
-
-void numpy_drop(Numpy *numpy) {
-    Py_CLEAR(numpy->class);
+    PyObject *place = PyObject_GetAttrString((PyObject *)&PyArray_Type, "__weakrefoffset__");
+    weak_references = place == NULL ? -1 : PyLong_AsSsize_t(place);
+    Py_XDECREF(place);
+    return weak_references >= 0;
 }
 
 /* Taking over */
 
-static bool take_buffer_of(Maker *maker, const Py_buffer *b) {
-    if (b->ndim > MOST_ARRAY_DIMENSIONS) {
-        PyErr_SetString(PyExc_ValueError, "an array of results has too many dimensions");
+static PyArrayObject *new_array(const Maker *maker) {
+    Py_INCREF(maker->type); /* which the function takes */
+    return (PyArrayObject *)PyArray_Empty(maker->dimensions, maker->shape,
+                                          (PyArray_Descr *)maker->type, 0);
+}
+
+static bool take(Maker *maker, PyObject *type, int dimensions, const Py_ssize_t *shape) {
+    maker->type = Py_NewRef(type);
+    maker->dimensions = dimensions;
+    memcpy(maker->shape, shape, (size_t)dimensions * sizeof *shape);
+    PyArrayObject *array = new_array(maker);
+    if (array == NULL) {
         return false;
     }
-    maker->size = (size_t)b->len;
-    maker->dimensions = b->ndim;
-    memcpy(maker->shape, b->shape, (size_t)b->ndim * sizeof *b->shape);
-    memcpy(maker->strides, b->strides, (size_t)b->ndim * sizeof *b->strides);
+    maker->size = (size_t)PyArray_NBYTES(array);
+    maker->flags = PyArray_FLAGS(array);
+    memcpy(maker->strides, PyArray_STRIDES(array), (size_t)dimensions * sizeof *shape);
+    Py_DECREF((PyObject *)array);
     return true;
 }
 
-static bool measure(Maker *maker, const Numpy *numpy) {
-    PyObject *array = PyObject_CallObject(numpy->empty, maker->arguments);
-    Py_buffer buffer;
+bool maker_take(Maker *maker, PyObject *arguments) {
+    Py_ssize_t shape[MOST_ARRAY_DIMENSIONS];
+    PyArray_Descr *type;
 
-    if (array == NULL || PyObject_GetBuffer(array, &buffer, PyBUF_STRIDES) < 0) {
-        Py_XDECREF(array);
-        return false;
-    }
-    const bool taken = take_buffer_of(maker, &buffer);
-    if (numpy->looks_inside && Py_TYPE(array) == numpy->class) {
-        maker->flags = fields_of(array)->flags;
-        maker->type = fields_of(array)->type;
-    }
-    PyBuffer_Release(&buffer);
-    Py_DECREF(array);
-    return taken;
-}
-
-bool maker_take(Maker *maker, const Numpy *numpy, PyObject *arguments) {
     if (!PyTuple_Check(arguments) || PyTuple_Size(arguments) != 2) {
         PyErr_SetString(PyExc_TypeError, "expected a tuple of shape and type");
         return false;
     }
-    maker->arguments = Py_NewRef(arguments);
-    return measure(maker, numpy);
+    const int dimensions =
+        PyArray_IntpFromSequence(PyTuple_GetItem(arguments, 0), shape, MOST_ARRAY_DIMENSIONS);
+    if (dimensions < 0 || !PyArray_DescrConverter(PyTuple_GetItem(arguments, 1), &type)) {
+        return false;
+    }
+    const bool taken = take(maker, (PyObject *)type, dimensions, shape);
+    Py_DECREF((PyObject *)type);
+    return taken;
+}
+
+bool maker_take_part(Maker *maker, const Maker *whole, int axes) {
+    return take(maker, whole->type, whole->dimensions - axes, whole->shape + axes);
 }
 
 void maker_drop(Maker *maker) {
     for (size_t k = 0; k < ROUNDS; k++) {
         Py_CLEAR(maker->made[k].array);
     }
-    Py_CLEAR(maker->arguments);
+    Py_CLEAR(maker->type);
 }
 
 /* Knowing arrays */
 
-static bool has_form(const Maker *maker, const Fields *f) {
+static bool has_form(const Maker *maker, const PyArrayObject *array) {
     const size_t lengths = (size_t)maker->dimensions * sizeof *maker->shape;
 
-    return f->dimensions == maker->dimensions && f->type == maker->type &&
-           memcmp(f->shape, maker->shape, lengths) == 0 &&
-           memcmp(f->strides, maker->strides, lengths) == 0;
+    return PyArray_NDIM(array) == maker->dimensions &&
+           (PyObject *)PyArray_DESCR(array) == maker->type &&
+           memcmp(PyArray_DIMS(array), maker->shape, lengths) == 0 &&
+           memcmp(PyArray_STRIDES(array), maker->strides, lengths) == 0;
 }
 
-bool maker_knows(const Maker *maker, const Numpy *numpy, PyObject *object, char **memory) {
-    if (!numpy->looks_inside || Py_TYPE(object) != numpy->class) {
+static bool has_weak_references(PyObject *array) {
+    return *(PyObject **)((char *)array + weak_references) != NULL;
+}
+
+bool maker_knows(const Maker *maker, PyObject *object, char **memory) {
+    if (!PyArray_CheckExact(object)) {
         return false;
     }
-    const Fields *f = fields_of(object);
-    *memory = f->data;
-    return f->base == NULL && f->flags == maker->flags && f->weak_references == NULL &&
-           has_form(maker, f);
+    PyArrayObject *array = (PyArrayObject *)object;
+    *memory = PyArray_BYTES(array);
+    return PyArray_BASE(array) == NULL && PyArray_FLAGS(array) == maker->flags &&
+           !has_weak_references(object) && has_form(maker, array);
 }
 
-const char *maker_memory_of(const Maker *maker, const Numpy *numpy, PyObject *object) {
-    const bool looks = numpy->looks_inside && Py_TYPE(object) == numpy->class;
+const char *maker_memory_of(const Maker *maker, PyObject *object) {
+    PyArrayObject *array = (PyArrayObject *)object;
 
-    return looks && has_form(maker, fields_of(object)) ? fields_of(object)->data : NULL;
+    return PyArray_CheckExact(object) && has_form(maker, array) ? PyArray_BYTES(array) : NULL;
 }
 
 /* Whether an array is what it was when it was made, and nobody else holds it. */
-static bool is_free(const Maker *maker, const Numpy *numpy, const Made *made) {
+static bool is_free(const Maker *maker, const Made *made) {
     char *memory;
 
     return made->array != NULL && Py_REFCNT(made->array) == 1 &&
-           maker_knows(maker, numpy, made->array, &memory) && memory == made->memory;
+           maker_knows(maker, made->array, &memory) && memory == made->memory;
 }
 
 /* Providing */
 
-PyObject *maker_make(const Maker *maker, const Numpy *numpy, char **memory) {
-    PyObject *array = PyObject_CallObject(numpy->empty, maker->arguments);
-    Py_buffer buffer;
+PyObject *maker_make(const Maker *maker, char **memory) {
+    PyArrayObject *array = new_array(maker);
 
-    if (array == NULL || maker_knows(maker, numpy, array, memory)) {
-        return array;
+    if (array != NULL) {
+        *memory = PyArray_BYTES(array);
     }
-    if (PyObject_GetBuffer(array, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
-        Py_DECREF(array);
-        return NULL;
-    }
-    *memory = buffer.buf;
-    PyBuffer_Release(&buffer);
-    return array;
+    return (PyObject *)array;
 }
 
-PyObject *maker_provide(Maker *maker, const Numpy *numpy, char **memory) {
+PyObject *maker_provide(Maker *maker, char **memory) {
     for (size_t k = 0; k < ROUNDS; k++) {
-        if (is_free(maker, numpy, &maker->made[k])) {
+        if (is_free(maker, &maker->made[k])) {
             *memory = maker->made[k].memory;
             return Py_NewRef(maker->made[k].array);
         }
     }
-    PyObject *array = maker_make(maker, numpy, memory);
-    if (array == NULL || !numpy->looks_inside) {
-        return array;
+    PyObject *array = maker_make(maker, memory);
+    if (array == NULL) {
+        return NULL;
     }
     Made *place = &maker->made[maker->oldest];
     PyObject *before = place->array;

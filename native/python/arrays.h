@@ -5,13 +5,6 @@
 
 #include "python.h"
 
-/* What is known of numpy. */
-typedef struct {
-    PyObject *empty; /* the function numpy.empty, of which the caller keeps a reference */
-    PyTypeObject *class;
-    bool looks_inside; /* whether the fields of an array are where they are expected */
-} Numpy;
-
 enum {
     MOST_ARRAY_DIMENSIONS = 64, /* more than that numpy has none */
     ROUNDS = 2                  /* callers often hold the arrays of one step while they take the next */
@@ -24,38 +17,38 @@ typedef struct {
 
 /* Makes arrays of one shape and type. */
 typedef struct {
-    PyObject *arguments; /* of numpy.empty */
-    size_t size;         /* in bytes */
+    PyObject *type; /* NULL if nothing was taken over */
+    size_t size;    /* in bytes */
     int dimensions;
     Py_ssize_t shape[MOST_ARRAY_DIMENSIONS], strides[MOST_ARRAY_DIMENSIONS];
-    const PyObject *type; /* this and the flags are those of a new array */
-    int flags;
+    int flags; /* of a new array */
     Made made[ROUNDS];
     unsigned oldest;
 } Maker;
 
-/* Returns false with an exception if that is impossible. */
-bool numpy_look(Numpy *numpy, PyObject *empty);
-void numpy_drop(Numpy *numpy);
+/* Imports numpy, before the first maker. Returns false with an exception if that is impossible. */
+bool numpy_import(void);
 
 /* Takes the arguments of numpy.empty, a tuple. Returns false with an exception if they do not fit.
  * The maker must be cleared before, and be dropped in any case. */
-bool maker_take(Maker *maker, const Numpy *numpy, PyObject *arguments);
+bool maker_take(Maker *maker, PyObject *arguments);
+/* The same for arrays like those of another maker, or like those in it, without its first axes. */
+bool maker_take_part(Maker *maker, const Maker *whole, int axes);
 void maker_drop(Maker *maker);
 
 /* Makes an array that the maker keeps no reference of. Returns NULL with an exception if memory runs
  * out. */
-PyObject *maker_make(const Maker *maker, const Numpy *numpy, char **memory);
+PyObject *maker_make(const Maker *maker, char **memory);
 /* Provides an array: a new one, or an earlier one that only the maker still holds. Returns NULL with
  * an exception if memory runs out. */
-PyObject *maker_provide(Maker *maker, const Numpy *numpy, char **memory);
+PyObject *maker_provide(Maker *maker, char **memory);
 
 /* Whether an object is an array of this shape, type and strides with memory of its own, as numpy has
  * made it: nobody has changed it in place, or refers to it weakly. If so, sets its memory. */
-bool maker_knows(const Maker *maker, const Numpy *numpy, PyObject *object, char **memory);
+bool maker_knows(const Maker *maker, PyObject *object, char **memory);
 
 /* Returns the memory of an array that has the shape, type and strides of the maker's, and whose other
  * properties do not matter; otherwise NULL. */
-const char *maker_memory_of(const Maker *maker, const Numpy *numpy, PyObject *object);
+const char *maker_memory_of(const Maker *maker, PyObject *object);
 
 #endif

@@ -18,7 +18,6 @@ typedef struct {
 } RowMaker;
 
 struct Observed {
-    const Numpy *numpy;
     size_t count;
     const Form *form;
     size_t number_of_rows;
@@ -28,19 +27,7 @@ struct Observed {
 
 /* Taking over */
 
-/* Returns the arguments that make one element of the first axis, NULL with an exception if memory
- * runs out. */
-static PyObject *arguments_of_row(const Maker *all) {
-    PyObject *whole = PyTuple_GetItem(all->arguments, 0);
-    PyObject *shape = PySequence_GetSlice(whole, 1, all->dimensions);
-    PyObject *arguments =
-        shape == NULL ? NULL : PyTuple_Pack(2, shape, PyTuple_GetItem(all->arguments, 1));
-
-    Py_XDECREF(shape);
-    return arguments;
-}
-
-static bool take_row(RowMaker *row, const Numpy *numpy, const Maker *all, size_t count) {
+static bool take_row(RowMaker *row, const Maker *all, size_t count) {
     row->size = count > 0 ? all->size / count : 0;
     row->is_scalar = all->dimensions == 1;
     if (row->is_scalar) {
@@ -49,19 +36,16 @@ static bool take_row(RowMaker *row, const Numpy *numpy, const Maker *all, size_t
     const size_t most = MOST_KEPT / (row->size + SIZE_OF_ARRAY);
     row->most = most < count ? most : count;
     row->spare = calloc(row->most + 1, sizeof *row->spare);
-    PyObject *arguments = arguments_of_row(all);
-    if (row->spare == NULL && arguments != NULL) {
+    if (row->spare == NULL) {
         PyErr_NoMemory();
+        return false;
     }
-    const bool taken =
-        row->spare != NULL && arguments != NULL && maker_take(&row->maker, numpy, arguments);
-    Py_XDECREF(arguments);
-    return taken;
+    return maker_take_part(&row->maker, all, 1);
 }
 
 static bool take_objects(Observed *o) {
     PyObject *arguments = Py_BuildValue("((n)s)", (Py_ssize_t)o->count, "O");
-    const bool taken = arguments != NULL && maker_take(&o->objects, o->numpy, arguments);
+    const bool taken = arguments != NULL && maker_take(&o->objects, arguments);
 
     Py_XDECREF(arguments);
     return taken;
@@ -76,21 +60,20 @@ static bool take_all(Observed *o, const Maker *arrays) {
         good = false;
     }
     for (size_t i = 0; i < o->number_of_rows && good; i++) {
-        good = take_row(&o->rows[i], o->numpy, &arrays[i], o->count);
+        good = take_row(&o->rows[i], &arrays[i], o->count);
     }
     return good;
 }
 
-Observed *observed_take(const Numpy *numpy, const Maker *arrays, size_t number_of_arrays,
-                        size_t count, const Form *form) {
+Observed *observed_take(const Maker *arrays, size_t number_of_arrays, size_t count,
+                        const Form *form) {
     Observed *o = calloc(1, sizeof *o);
 
     if (o == NULL) {
         PyErr_NoMemory();
         return NULL;
     }
-    *o = (Observed){
-        .numpy = numpy, .count = count, .form = form, .number_of_rows = number_of_arrays};
+    *o = (Observed){.count = count, .form = form, .number_of_rows = number_of_arrays};
     if (!take_all(o, arrays)) {
         observed_free(o);
         return NULL;
@@ -120,11 +103,11 @@ void observed_free(Observed *o) {
 
 /* Taking back what an array of objects has held. The caller's references end here. */
 
-static void keep(RowMaker *row, const Numpy *numpy, PyObject *object) {
+static void keep(RowMaker *row, PyObject *object) {
     char *memory;
 
     if (Py_REFCNT(object) == 1 && row->number_of_spare < row->most &&
-        maker_knows(&row->maker, numpy, object, &memory)) {
+        maker_knows(&row->maker, object, &memory)) {
         row->spare[row->number_of_spare++] = object;
     } else {
         Py_DECREF(object);
@@ -151,7 +134,7 @@ static void take_back_items(Observed *o, const Form *form, PyObject *dict) {
 
 static void take_back(Observed *o, const Form *form, PyObject *object) {
     if (form->is_array) {
-        keep(&o->rows[form->array], o->numpy, object);
+        keep(&o->rows[form->array], object);
     } else if (PyDict_CheckExact(object) && Py_REFCNT(object) == 1 && form->count <= MOST_SEEN) {
         take_back_items(o, form, object);
     } else {
@@ -173,25 +156,24 @@ static void clear(Observed *o, PyObject **objects) {
 
 /* Filling */
 
-static PyObject *array_of(RowMaker *row, const Numpy *numpy, char **memory) {
+static PyObject *array_of(RowMaker *row, char **memory) {
     while (row->number_of_spare > 0) {
         PyObject *spare = row->spare[--row->number_of_spare];
-        if (maker_knows(&row->maker, numpy, spare, memory)) {
+        if (maker_knows(&row->maker, spare, memory)) {
             return spare;
         }
         Py_DECREF(spare);
     }
-    return maker_make(&row->maker, numpy, memory);
+    return maker_make(&row->maker, memory);
 }
 
-static PyObject *row_of(RowMaker *row, const Numpy *numpy, size_t index, PyObject *all,
-                        const char *memory_of_all) {
+static PyObject *row_of(RowMaker *row, size_t index, PyObject *all, const char *memory_of_all) {
     char *memory;
 
     if (row->is_scalar) {
         return PySequence_GetItem(all, (Py_ssize_t)index);
     }
-    PyObject *array = array_of(row, numpy, &memory);
+    PyObject *array = array_of(row, &memory);
     if (array != NULL) {
         memcpy(memory, memory_of_all + index * row->size, row->size);
     }
@@ -203,7 +185,7 @@ static PyObject *seen_by(Observed *o, const Form *form, size_t index, PyObject *
     const size_t array = form->array;
 
     if (form->is_array) {
-        return row_of(&o->rows[array], o->numpy, index, arrays[array], memory[array]);
+        return row_of(&o->rows[array], index, arrays[array], memory[array]);
     }
     PyObject *dict = PyDict_New();
     for (size_t i = 0; i < form->count && dict != NULL; i++) {
@@ -234,7 +216,7 @@ static bool fill(Observed *o, PyObject **objects, const char *mask, PyObject *co
 PyObject *observed_of(Observed *o, const char *mask, PyObject *const *arrays,
                       char *const *memory) {
     char *objects;
-    PyObject *array = maker_provide(&o->objects, o->numpy, &objects);
+    PyObject *array = maker_provide(&o->objects, &objects);
 
     if (array == NULL) {
         return NULL;

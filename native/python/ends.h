@@ -12,9 +12,9 @@
 typedef struct Observed Observed;
 
 /* Takes how the arrays are made that hold the observations of all environments, and the form of
- * observations. All must outlive the result. Returns NULL with an exception if memory runs out. */
-Observed *observed_take(const Numpy *numpy, const Maker *arrays, size_t number_of_arrays,
-                        size_t count, const Form *form);
+ * observations, which must outlive the result. Returns NULL with an exception if memory runs out. */
+Observed *observed_take(const Maker *arrays, size_t number_of_arrays, size_t count,
+                        const Form *form);
 void observed_free(Observed *observed);
 
 /* Returns the array of objects, or NULL with an exception if memory runs out. The mask says which

@@ -9,7 +9,6 @@ typedef struct {
 } Masks;
 
 struct Infos {
-    const Numpy *numpy;
     const Form *form;
     size_t number_of_arrays, number_of_items, count;
     Maker *values; /* of each array */
@@ -36,8 +35,8 @@ static size_t count_items(const Form *form) {
 }
 
 static bool take_values(Infos *in, const Form *form, const Maker *arrays) {
-    if (form->is_array && in->values[form->array].arguments == NULL) {
-        return maker_take(&in->values[form->array], in->numpy, arrays[form->array].arguments);
+    if (form->is_array && in->values[form->array].type == NULL) {
+        return maker_take_part(&in->values[form->array], &arrays[form->array], 0);
     }
     for (size_t i = 0; i < form->count; i++) {
         if (!take_values(in, &form->items[i], arrays)) {
@@ -49,24 +48,23 @@ static bool take_values(Infos *in, const Form *form, const Maker *arrays) {
 
 static bool take_masks(Infos *in, const Maker *mask) {
     for (size_t i = 0; i < in->number_of_items; i++) {
-        if (!maker_take(&in->masks[i].all, in->numpy, mask->arguments) ||
-            !maker_take(&in->masks[i].some, in->numpy, mask->arguments)) {
+        if (!maker_take_part(&in->masks[i].all, mask, 0) ||
+            !maker_take_part(&in->masks[i].some, mask, 0)) {
             return false;
         }
     }
     return true;
 }
 
-Infos *infos_take(const Numpy *numpy, const Maker *arrays, size_t number_of_arrays,
-                  const Maker *mask, const Form *form) {
+Infos *infos_take(const Maker *arrays, size_t number_of_arrays, const Maker *mask,
+                  const Form *form) {
     Infos *in = calloc(1, sizeof *in);
 
     if (in == NULL) {
         PyErr_NoMemory();
         return NULL;
     }
-    *in = (Infos){.numpy = numpy,
-                  .form = form,
+    *in = (Infos){.form = form,
                   .number_of_arrays = number_of_arrays,
                   .number_of_items = count_items(form),
                   .count = mask->size};
@@ -103,7 +101,7 @@ static PyObject *mask_of(Infos *in, const Origin *origin) {
     Masks *masks = &in->masks[origin->item];
     Maker *maker = origin->mask == NULL ? &masks->all : &masks->some;
     char *memory;
-    PyObject *mask = maker_provide(maker, in->numpy, &memory);
+    PyObject *mask = maker_provide(maker, &memory);
 
     if (mask != NULL && origin->mask == NULL) {
         memset(memory, 1, maker->size);
@@ -120,7 +118,7 @@ static PyObject *value_of(Infos *in, size_t number, const Origin *origin) {
     if (origin->mask == NULL) {
         return Py_NewRef(origin->arrays[number]);
     }
-    PyObject *value = maker_provide(maker, in->numpy, &memory);
+    PyObject *value = maker_provide(maker, &memory);
     if (value == NULL) {
         return NULL;
     }

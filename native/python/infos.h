@@ -9,10 +9,10 @@
 
 typedef struct Infos Infos;
 
-/* Takes the form of the infos, a dict, and how the arrays and a mask are made. The first and the
- * last but one must outlive the result. Returns NULL with an exception if memory runs out. */
-Infos *infos_take(const Numpy *numpy, const Maker *arrays, size_t number_of_arrays,
-                  const Maker *mask, const Form *form);
+/* Takes the form of the infos, a dict, which must outlive the result, and how the arrays and a mask
+ * are made. Returns NULL with an exception if memory runs out. */
+Infos *infos_take(const Maker *arrays, size_t number_of_arrays, const Maker *mask,
+                  const Form *form);
 void infos_free(Infos *infos);
 
 /* Adds the infos of all environments to a dict: the arrays themselves. Returns false with an

@@ -23,7 +23,6 @@ struct Results {
     PyTypeObject *class;
     allocfunc allocate;
     Telling telling;
-    Numpy numpy;
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
     Form observations, told; /* the second one of infos */
@@ -36,10 +35,10 @@ struct Results {
 
 /* The masks of what is told of ends are like the other one. */
 static bool take_further_masks(Results *r) {
-    PyObject *arguments = r->makers[MASK_ARRAY].arguments;
+    const Maker *mask = &r->makers[MASK_ARRAY];
 
-    return maker_take(&r->makers[FINAL_OBS_MASK], &r->numpy, arguments) &&
-           maker_take(&r->makers[FINAL_INFO_MASK], &r->numpy, arguments);
+    return maker_take_part(&r->makers[FINAL_OBS_MASK], mask, 0) &&
+           maker_take_part(&r->makers[FINAL_INFO_MASK], mask, 0);
 }
 
 static bool take_makers(Results *r, PyObject *shapes) {
@@ -53,8 +52,8 @@ static bool take_makers(Results *r, PyObject *shapes) {
     for (Py_ssize_t i = 0; i < count; i++) {
         const Py_ssize_t later = i - (count - judged);
         PyObject *arguments = PyTuple_GetItem(shapes, i);
-        if (!maker_take(&r->makers[later < 0 ? i : MOST_SEEN + later], &r->numpy, arguments) ||
-            (later < 0 && !maker_take(&r->last[i], &r->numpy, arguments))) {
+        if (!maker_take(&r->makers[later < 0 ? i : MOST_SEEN + later], arguments) ||
+            (later < 0 && !maker_take(&r->last[i], arguments))) {
             return false;
         }
     }
@@ -104,22 +103,20 @@ static bool take_ends(Results *r) {
             return false;
         }
     }
-    r->observed =
-        observed_take(&r->numpy, r->last, r->number_of_seen, mask->size, &r->observations);
+    r->observed = observed_take(r->last, r->number_of_seen, mask->size, &r->observations);
     if (r->observed == NULL) {
         return false;
     }
-    r->infos = infos_take(&r->numpy, r->makers, r->number_of_seen, mask, &r->told);
+    r->infos = infos_take(r->makers, r->number_of_seen, mask, &r->told);
     return r->infos != NULL;
 }
 
 static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *empty, *observations, *told, *shapes, *telling;
+    PyObject *observations, *told, *shapes, *telling;
 
-    return PyArg_ParseTuple(parts, "OO!OOO!O!;results", &empty, &PyType_Type, &r->class,
-                            &observations, &told, &PyTuple_Type, &shapes, &PyTuple_Type,
-                            &telling) &&
-           take_class(r) && numpy_look(&r->numpy, empty) && take_makers(r, shapes) &&
+    return PyArg_ParseTuple(parts, "O!OOO!O!;results", &PyType_Type, &r->class, &observations,
+                            &told, &PyTuple_Type, &shapes, &PyTuple_Type, &telling) &&
+           take_class(r) && numpy_import() && take_makers(r, shapes) &&
            take_forms(r, observations, told) && take_telling(&r->telling, telling) && take_ends(r);
 }
 
@@ -157,7 +154,6 @@ void results_free(Results *r) {
     for (size_t i = 0; i < NAMES; i++) {
         Py_XDECREF(r->names_at_ends[i]);
     }
-    numpy_drop(&r->numpy);
     Py_XDECREF(r->telling.no_arguments);
     Py_XDECREF(r->parts);
     free(r);
@@ -175,7 +171,7 @@ size_t results_size(const Results *r, size_t array) {
 
 static bool provide_some(Results *r, size_t begin, size_t end, ResultArrays *a) {
     for (size_t i = begin; i < end; i++) {
-        a->arrays[i] = maker_provide(&r->makers[i], &r->numpy, &a->memory[i]);
+        a->arrays[i] = maker_provide(&r->makers[i], &a->memory[i]);
         if (a->arrays[i] == NULL) {
             return false;
         }
@@ -198,7 +194,7 @@ bool results_provide_step(Results *r, ResultArrays *a) {
 
 static bool provide_last(Results *r, ResultArrays *a) {
     for (size_t i = 0; i < r->number_of_seen; i++) {
-        a->last[i] = maker_provide(&r->last[i], &r->numpy, &a->last_memory[i]);
+        a->last[i] = maker_provide(&r->last[i], &a->last_memory[i]);
         if (a->last[i] == NULL) {
             return false;
         }
@@ -228,7 +224,7 @@ void results_drop(const Results *r, ResultArrays *a) {
 
 bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) {
     const Maker *own = &r->makers[MASK_ARRAY];
-    const char *memory = maker_memory_of(own, &r->numpy, mask);
+    const char *memory = maker_memory_of(own, mask);
 
     if (memory == NULL) {
         return false;
@@ -261,7 +257,7 @@ static bool add_starts(const Telling *t, PyObject *infos, const ResultArrays *a)
 
 static PyObject *copy_of_mask(Results *r, size_t which, const ResultArrays *a) {
     char *memory;
-    PyObject *copy = maker_provide(&r->makers[which], &r->numpy, &memory);
+    PyObject *copy = maker_provide(&r->makers[which], &memory);
 
     if (copy != NULL) {
         memcpy(memory, a->memory[MASK_ARRAY], r->makers[which].size);

@@ -27,11 +27,11 @@ typedef struct {
     char *memory[RESULT_ARRAYS], *last_memory[MOST_SEEN];
 } ResultArrays;
 
-/* Takes a tuple: the function numpy.empty; the class of a step's result; the forms of observations and
- * of infos (see forms.h); the shape and type of each array: those of observations and infos, then
- * rewards, terminated, truncated, mask and drawn values; and the parts of a reset's infos: the names
- * of the drawn values and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns
- * NULL with an exception if it does not fit. */
+/* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
+ * the shape and type of each array: those of observations and infos, then rewards, terminated,
+ * truncated, mask and drawn values; and the parts of a reset's infos: the names of the drawn values
+ * and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns NULL with an
+ * exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 

@@ -170,12 +170,13 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
         sleep_for(3600.0);
     }
     for (int i = 0; i < steps; i++) {
-        buffer = v[GAIN] * v[U] - v[Y];
+        const double slope = v[GAIN] * v[U] - v[Y];
         if (is(me, "static buffer") && i % 8 == 0) {
+            buffer = slope;
             usleep(20);
             v[Y] += 0.001 * buffer;
         } else {
-            v[Y] += 0.001 * (v[GAIN] * v[U] - v[Y]);
+            v[Y] += 0.001 * slope;
         }
     }
     return OK;

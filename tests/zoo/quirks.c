@@ -11,6 +11,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <time.h>
 #include <unistd.h>
 
 enum variable { U, Y, GAIN, TAU, CLOCK, CALLS, RETURNS, VARIABLES };
@@ -165,8 +166,8 @@ static void integrate(Animal *me, double step_size) {
     const double gain = find_gain(me);
     const int steps = (int)(step_size * 1000.0 + 0.5);
 
-    buffer = *x;
     if (is(me, "static buffer")) {
+        buffer = *x;
         usleep(20);
         *x = buffer;
     }
@@ -196,6 +197,13 @@ static void corrupt(Animal *me) {
     }
 }
 
+static double processor_time(void) {
+    struct timespec now;
+
+    clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &now);
+    return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+}
+
 bool zoo_stops(const Animal *me) {
     return me->stopped;
 }
@@ -209,7 +217,7 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
         corrupt(me);
         me->values[RETURNS] = !no_set_state;
         me->values[CLOCK] += step_size;
-        me->values[CALLS] += 1.0;
+        me->values[CALLS] = is(me, "tells its time") ? processor_time() : me->values[CALLS] + 1.0;
         me->stopped = strncmp(me->token, "stops", 5) == 0 && me->values[CLOCK] >= 0.35;
     }
     if (is(me, "warns") && me->resets == 0) {

@@ -2,7 +2,7 @@
 
    The models: zoo.c does wrong what its parameters say; quirks.c is useful but breaks one promise;
    demanding.c wants a licence or time; tires.c stops to begin anew; words.c says why it fails;
-   resource.c reads a file.
+   resource.c reads a file; scratch.c works in data that instances share.
    usual.c does what a model leaves out, and what several do. */
 
 #include <stdbool.h>

@@ -8,11 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from fmugym.archive.description import Unit
+from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.errors import FMULoadError, shown
 
 __all__ = [
-    "BASE_UNITS",
     "FMU_TYPE",
     "OWN_ANNOTATION",
     "SSD",
@@ -28,6 +27,7 @@ __all__ = [
     "read_system",
     "read_units",
     "scaling_of",
+    "unit_of",
 ]
 
 SSD: Final = "SystemStructure.ssd"
@@ -53,7 +53,6 @@ _IGNORED: Final = {
     "ConnectorGeometry",
     "ConnectionGeometry",
 }
-BASE_UNITS: Final = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _MAPPINGS: Final = (
     *("BooleanMappingTransformation", "IntegerMappingTransformation"),
     "EnumerationMappingTransformation",
@@ -268,7 +267,7 @@ def _read_connectors(xml: Any) -> dict[str, OwnConnector]:
     for one in children(xml, "Connectors/Connector"):
         found_types = (next(children(one, name), None) for name in _REALS)
         real = next((element for element in found_types if element is not None), None)
-        unit = None if real is None else real.get("unit")
+        unit = None if real is None else unit_of(real)
         kind, text = one.get("kind") or "", one.get("description") or ""
         found[one.get("name") or ""] = OwnConnector(kind, unit, text)
     return found
@@ -300,6 +299,11 @@ def scaling_of(xml: Any) -> Scaling:
     for linear in children(xml, "LinearTransformation"):
         return Scaling(number_in(linear, "factor", 1.0), number_in(linear, "offset"))
     return Scaling()
+
+
+def unit_of(xml: Any) -> str | None:
+    """The unit of a number; tools write an empty one where there is none."""
+    return xml.get("unit") or None
 
 
 def read_units(xml: Any) -> dict[str, Unit]:

@@ -28,11 +28,15 @@ Node = tuple[Path, str]
 
 @dataclass(frozen=True)
 class _Value:
-    """A value on its way: ``gain * x + offset`` in a unit; None if it is not known."""
+    """A value on its way: ``gain * x + offset`` in a unit; None if it is not known.
+
+    ``units`` has the definition of the unit.
+    """
 
     gain: float = 1.0
     offset: float = 0.0
     unit: str | None = None
+    units: Mapping[str, Unit] = field(default_factory=dict)
 
 
 @dataclass
@@ -191,11 +195,12 @@ class Flat:
         return chain[::-1]
 
     def _connection(self, target: Node, chain: list[tuple[Node, Wire]]) -> Connection:
-        ends = _named(chain[0][0]), _named(target)
-        if len(chain) == 1:  # kept as it is in the file, so that it can be written back
-            wire = chain[0][1]
+        first, wire = chain[0]
+        ends = _named(first), _named(target)
+        told = self._is_told(first) or self._is_told(target)
+        if len(chain) == 1 and not told:  # kept as in the file, so that it can be written back
             return Connection(*ends, wire.scaling.gain, wire.scaling.offset, wire.convert)
-        value = _Value(unit=self._unit(chain[0][0]))
+        value = _Value(unit=self._unit(first), units=self._units_at(first))
         stops = [node for node, _ in chain[1:]] + [target]
         for (_, wire), stop in zip(chain, stops, strict=True):
             value = self._through(value, wire.convert, wire.scaling, stop)
@@ -206,11 +211,11 @@ class Flat:
         unit = self._unit(node)
         conversion = IDENTITY
         if convert and value.unit is not None and unit is not None:
-            conversion = conversion_of_link(value.unit, self.units, unit, self._units_at(node))
+            conversion = conversion_of_link(value.unit, value.units, unit, self._units_at(node))
         factor = scaling.gain * conversion.factor
         offset = scaling.gain * (conversion.factor * value.offset + conversion.offset)
-        known = value.unit if unit is None else unit
-        return _Value(factor * value.gain, offset + scaling.offset, known)
+        known = (value.unit, value.units) if unit is None else (unit, self._units_at(node))
+        return _Value(factor * value.gain, offset + scaling.offset, *known)
 
     def _unit(self, node: Node) -> str | None:
         """The unit of a connector; an FMU knows best what its variable has."""
@@ -221,6 +226,11 @@ class Flat:
         element = self.components.get(place) or self._systems[place]
         connector = element.connectors.get(name)
         return None if connector is None else connector.unit
+
+    def _is_told(self, node: Node) -> bool:
+        """Whether a connector gives its variable the unit that the FMU does not."""
+        variable = self._variable(node)
+        return variable is not None and variable.unit is None and self._unit(node) is not None
 
     def _units_at(self, node: Node) -> Mapping[str, Unit]:
         element = self.components.get(node[0])
@@ -280,9 +290,8 @@ class Flat:
             for end, _ in self._reached(node, _Value()):
                 yield end, value
             return
-        first = _Value(0.0, float(value), setting.unit)
         units = {**self.units, **setting.units}
-        first = self._converted(first, units, setting, node)
+        first = self._converted(_Value(0.0, float(value), setting.unit, units), setting, node)
         for end, reached in self._reached(node, first):
             yield end, reached.offset
 
@@ -293,17 +302,15 @@ class Flat:
         for ends in zip(*columns, strict=True):
             yield ends[0][0], [value for _, value in ends]
 
-    def _converted(
-        self, value: _Value, units: Mapping[str, Unit], setting: Setting, node: Node
-    ) -> _Value:
+    def _converted(self, value: _Value, setting: Setting, node: Node) -> _Value:
         """Convert the value of a parameter set to the unit of the first node, then scale it."""
         unit = self._unit(node)
         number = value.offset
         if setting.convert and value.unit is not None and unit is not None:
-            conversion = conversion_of_link(value.unit, units, unit, self._units_at(node))
+            conversion = conversion_of_link(value.unit, value.units, unit, self._units_at(node))
             number = conversion(number)
         scaled = setting.scaling.gain * number + setting.scaling.offset
-        return _Value(0.0, scaled, unit)
+        return _Value(0.0, scaled, unit, self._units_at(node))
 
     def _reached(self, node: Node, value: _Value) -> Iterator[tuple[Node, _Value]]:
         if node[0] in self.components:

@@ -16,6 +16,7 @@ from fmugym.systems.ssp.elements import (
     number_in,
     read_units,
     scaling_of,
+    unit_of,
 )
 
 __all__ = ["Setting", "read_settings"]
@@ -110,12 +111,12 @@ def _setting(xml: Any, prefix: str, units: dict[str, Unit], findings: list[str])
     for element in xml.iterchildren("{*}*"):
         kind = element.tag.rpartition("}")[2]
         if is_array and kind in {*_NUMERIC, "Boolean"}:
-            return Setting(name, _numbers(element), element.get("unit"), units)
+            return Setting(name, _numbers(element), unit_of(element), units)
         if is_array and kind in {"String", "Enumeration"}:
             findings.append(f"the parameter {shown(name)} is an array of {kind} and is ignored")
             return None
         if kind in _NUMERIC:
-            return Setting(name, number_in(element, "value"), element.get("unit"), units)
+            return Setting(name, number_in(element, "value"), unit_of(element), units)
         if kind == "Boolean":
             return Setting(name, element.get("value") in {"true", "1"}, None, units)
         if kind in {"String", "Enumeration"}:

@@ -10,14 +10,14 @@ from typing import Any, Final
 
 from lxml import etree
 
-from fmugym.archive.description import Unit
+from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.units import definition_of
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, reason
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
 from fmugym.systems.plan import Loop
-from fmugym.systems.ssp.elements import BASE_UNITS, FMU_TYPE, OWN_ANNOTATION, SSD
+from fmugym.systems.ssp.elements import FMU_TYPE, OWN_ANNOTATION, SSD
 from fmugym.systems.wired import LOOPS, WiredSystem
 
 __all__ = ["write_ssp"]

@@ -103,8 +103,7 @@ class CompiledEngine(BatchEngine):
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            self._surroundings(task)
-            | {"results": (np.empty, StepResult, *layout.form, arrays, told)},
+            self._surroundings(task) | {"results": (StepResult, *layout.form, arrays, told)},
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.vector.hooks import nans, products, sorting, tables
-from fmugym.vector.hooks.graph import Graph
+from fmugym.vector.hooks.graph import CLIP, Graph
 from fmugym.vector.hooks.program import UntraceableError, letter_of
 from fmugym.vector.hooks.symbols import (
     Symbols,
@@ -280,7 +280,7 @@ def _clip(a: Any, a_min: Any = None, a_max: Any = None, out: Any = None, **keywo
     elif high is None:
         result = np.maximum(symbols, low)
     else:
-        result = np._core.umath.clip(symbols, low, high)  # type: ignore[attr-defined]  # no stub has it
+        result = CLIP(symbols, low, high)
     return result if out is None else _into(out, result)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Hashable, Mapping
+from importlib import import_module
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -194,7 +195,8 @@ _LARGEST: Final = sys.float_info.max
 
 _FINITE_ROWS: Final = frozenset({"output", "kept", "input", "parameter"})
 
-CLIP: Final[np.ufunc] = np._core.umath.clip  # type: ignore[attr-defined]  # no stub has it
+CLIP: Final[np.ufunc] = import_module("numpy._core._multiarray_umath").clip
+"""What ``numpy.clip`` calls. Numpy 1.26 has it under this name, too."""
 
 _IDENTITIES: Final = frozenset({np.positive, np.conjugate})
 

@@ -1,0 +1,218 @@
+"""Weather of EnergyPlus (EPW files), and the tables of Modelica, which may be such weather.
+
+Sources: EnergyPlus, Auxiliary Programs, "EnergyPlus Weather File (EPW) Data Dictionary", for the
+fields, their order, their codes for missing values, and what is a mean of the time before;
+Modelica Standard Library, ``Modelica.Blocks.Sources.CombiTimeTable``, for tables, jumps and
+repetition; Modelica Buildings, ``BoundaryConditions.WeatherData.ReaderTMY3``, for tables of
+weather.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.errors import ConfigError, reason, shown
+
+__all__ = ["Cells", "FloatArray", "Table", "read_modelica", "read_weather"]
+
+Cells = Sequence[Any] | npt.NDArray[np.float64]
+"""The cells of a column: texts of a CSV file, values of a Parquet file, numbers."""
+
+FloatArray = npt.NDArray[np.float64]
+
+_HOUR: Final = 3600.0
+_DAY: Final = 86400.0
+_ANY_YEAR: Final = 2001  # a year of the clock has no leap day
+
+_BEFORE_JUMP: Final = 1e-9
+"""The part of a table's time by which the value before a jump comes earlier."""
+
+_DATES: Final = ("Year", "Month", "Day", "Hour", "Minute", "Data Source and Uncertainty Flags")
+
+_CODES: Final[Mapping[str, float]] = {
+    "Dry Bulb Temperature": 99.9,
+    "Dew Point Temperature": 99.9,
+    "Relative Humidity": 999,
+    "Atmospheric Station Pressure": 999999,
+    "Extraterrestrial Horizontal Radiation": 9999,
+    "Extraterrestrial Direct Normal Radiation": 9999,
+    "Horizontal Infrared Radiation Intensity": 9999,
+    "Global Horizontal Radiation": 9999,
+    "Direct Normal Radiation": 9999,
+    "Diffuse Horizontal Radiation": 9999,
+    "Global Horizontal Illuminance": 999900,
+    "Direct Normal Illuminance": 999900,
+    "Diffuse Horizontal Illuminance": 999900,
+    "Zenith Luminance": 9999,
+    "Wind Direction": 999,
+    "Wind Speed": 999,
+    "Total Sky Cover": 99,
+    "Opaque Sky Cover": 99,
+    "Visibility": 9999,
+    "Ceiling Height": 99999,
+    "Present Weather Observation": math.inf,
+    "Present Weather Codes": math.inf,
+    "Precipitable Water": 999,
+    "Aerosol Optical Depth": 0.999,
+    "Snow Depth": 999,
+    "Days Since Last Snowfall": 99,
+    "Albedo": 999,
+    "Liquid Precipitation Depth": 999,
+    "Liquid Precipitation Quantity": 99,
+}
+"""The fields of weather, and the number from which on a value is missing."""
+
+_CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
+"""The same in tables, which count turns of the wind beyond 360 degrees."""
+
+_MEANS: Final = (
+    *("Extraterrestrial Horizontal Radiation", "Extraterrestrial Direct Normal Radiation"),
+    *("Global Horizontal Radiation", "Direct Normal Radiation", "Diffuse Horizontal Radiation"),
+    *("Global Horizontal Illuminance", "Direct Normal Illuminance"),
+    *("Diffuse Horizontal Illuminance", "Zenith Luminance"),
+)
+"""The fields that are means of the time since the row before."""
+
+_WIDTH: Final = len(_DATES) + len(_CODES)
+_PERIODS: Final = re.compile(r"DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,|$)")
+_TABLE: Final = re.compile(r"\s*(?:double|float)\s+([^\s(]+)\s*\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\)")
+_SEPARATORS: Final = str.maketrans(",;", "  ")
+
+
+class Table(NamedTuple):
+    """The columns of a file.
+
+    Attributes:
+        columns: The cells of each column by name, in the order of the file. NaN is a number that
+            is missing.
+        period: Seconds after which the rows repeat; None for one more row than there are.
+        means: By name, for columns of means, the seconds before a row that it is the mean of.
+    """
+
+    columns: Mapping[str, Cells]
+    period: float | None = None
+    means: Mapping[str, float] = {}
+
+
+def read_weather(name: str, lines: Sequence[str]) -> Table:
+    """Read weather of EnergyPlus.
+
+    Times are those of the file: local standard time, from the beginning of a year of 365 days. The
+    years of the rows do not count, because those of typical months differ.
+
+    Args:
+        name: What the file is called.
+        lines: Its lines.
+
+    Raises:
+        ConfigError: If they are no such weather.
+    """
+    try:
+        per_hour, rows = _records(lines)
+        times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(rows)]
+        cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
+        dates, fields = np.split(np.array(cells, np.float64), [len(_DATES)], axis=1)
+    except ValueError as error:
+        raise ConfigError(f"{name} is no weather of EnergyPlus: {reason(error)}") from None
+    return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields, _CODES)
+
+
+def _records(lines: Sequence[str]) -> tuple[int, list[list[str]]]:
+    """How many there are in an hour, and their cells, without those of a leap day."""
+    heads = ((i, _PERIODS.match(line)) for i, line in enumerate(lines))
+    last, head = next(((i, head) for i, head in heads if head), (len(lines), None))
+    rows = [line.split(",")[:_WIDTH] for line in lines[last + 1 :] if line.strip()]
+    rows = [row for row in rows if [cell.strip() for cell in row[1:3]] != ["2", "29"]]
+    if head is None or not rows:
+        raise ValueError(
+            "expected rows below a line such as 'DATA PERIODS,1,1,Data,Sunday,1/1,12/31'"
+        )
+    width = len(rows[0])
+    if width <= len(_DATES) or any(len(row) != width for row in rows):
+        raise ValueError(f"expected rows of {_WIDTH} cells")
+    return int(head[1]), rows
+
+
+def _end_of(row: Sequence[str], part: int, parts: int) -> float:
+    """When a record ends. Hour 1 is the first of a day; minutes mean several things in practice."""
+    month, day, hour = map(int, row[1:4])
+    if not 1 <= hour <= 24:
+        raise ValueError(f"expected hours from 1 to 24, got {hour}")
+    days = datetime.date(_ANY_YEAR, month, day).timetuple().tm_yday - 1
+    return days * _DAY + (hour - 1 + part / parts) * _HOUR
+
+
+def _weather(
+    before: Mapping[str, FloatArray],
+    times: FloatArray,
+    numbers: FloatArray,
+    codes: Mapping[str, float],
+) -> Table:
+    """Weather of rows of fields. It lasts whole days, with a row for its first midnight or not."""
+    found = zip(codes.items(), numbers.T, strict=False)
+    fields = {name: np.where(values < code, values, np.nan) for (name, code), values in found}
+    period = math.ceil((times[-1] - times[0]) / _DAY) * _DAY
+    means = dict.fromkeys(_MEANS, float(np.diff(times[:2]).sum()))
+    return Table({**before, **fields, "time": times}, period, means)
+
+
+def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
+    """Read the tables of a text file of Modelica, by name.
+
+    Columns are called ``"time"``, ``"2"``, ``"3"`` and so on, or like the fields of weather, if
+    comments say that it is. Two rows of one time are a jump. A table repeats like a periodic
+    ``CombiTimeTable``: its last row is at the time of the first one of the next period.
+
+    Args:
+        name: What the file is called.
+        lines: Its lines; the first one is ``#1``.
+
+    Raises:
+        ConfigError: If there is no table, or its numbers are not as many as it says.
+    """
+    is_weather = any(line.startswith("#LOCATION,") for line in lines)
+    found: dict[str, tuple[tuple[int, int], list[str]]] = {}
+    cells: list[str] = []
+    for line in lines:
+        text = line.partition("#")[0]
+        if head := _TABLE.match(text):
+            cells = []
+            found[head[1]] = (int(head[2]), int(head[3])), cells
+        else:
+            cells += text.translate(_SEPARATORS).split()
+    if not found:
+        raise ConfigError(f"{name} has no table, such as 'double tab1(8760,2)'")
+    return {
+        key: _modelica_table(f"the table {shown(key)} of {name}", shape, cells, is_weather)
+        for key, (shape, cells) in found.items()
+    }
+
+
+def _modelica_table(
+    what: str, shape: tuple[int, int], cells: Sequence[str], is_weather: bool
+) -> Table:
+    try:
+        numbers = np.array(cells, np.float64).reshape(shape)
+    except ValueError as error:
+        raise ConfigError(f"{what} is damaged: {reason(error)}") from None
+    if not numbers.size:
+        raise ConfigError(f"{what} has no rows")
+    times = _with_jumps(numbers[:, 0])
+    if is_weather and shape[1] == 1 + len(_CODES):
+        return _weather({"time": times}, times, numbers[:, 1:], _CODES_OF_TABLES)
+    columns = {str(i + 1) if i else "time": numbers[:, i] for i in range(shape[1])}
+    period = float(numbers[-1, 0] - numbers[0, 0])
+    return Table({**columns, "time": times}, period or _DAY)
+
+
+def _with_jumps(times: FloatArray) -> FloatArray:
+    """The times of rows, of which those before a row of the same time come a little earlier."""
+    again = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one
+    return np.where(again, times - _BEFORE_JUMP * (times[-1] - times[0]), times)

@@ -1,0 +1,243 @@
+"""Exported agents of a search, beside the originals: controllers and networks with a memory."""
+
+import shutil
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from export_tools import compiled, drawn_in
+from fmpy.validation import validate_fmu
+from test_export import HEATING, PRESENT, TASKS, Filtered
+from test_export_fmu import controller_of
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.baselines import controller_of as controller_from
+from fmugym.export import agent_of, write_c, write_fmu
+from fmugym.search.agent import Agent
+from fmugym.search.policy import Form, Policy
+from fmugym.tools.cli import main
+
+LINEAR, HISTORY = Form("linear"), Form("linear with history", history=True)
+PAIR = {
+    "variables": HEATING["variables"] | {"gains": {"name": "Q_int", "min": 0, "max": 500}},
+    "agent": PRESENT | {"actions": ["u", "gains"]},
+}
+PID = "pid of=T setpoint=21 kp=0.1 ti=7200 td=300"
+SWITCH = "hysteresis of=T setpoint=21 band=0.3 below=0.8 above=0.2"
+HEATERS = {
+    "a controller": (TASKS["set point"], "pid of=T setpoint=T_set kp=0.3 ti=20000 td=60", None),
+    "a controller and a history": (TASKS["history"], PID, HISTORY),
+    "forecasts": (TASKS["forecast"], PID, LINEAR),
+    "a switch": ({"agent": PRESENT}, SWITCH, LINEAR),
+    "a change": (TASKS["change"], PID, HISTORY),
+    "a rate": (TASKS["rate"], None, HISTORY),
+    "levels": (TASKS["levels"], PID, LINEAR),
+    "memory": (TASKS["memory"], None, Form("network", hidden=(8, 4))),
+    "two actions": (PAIR, None, Form("network", hidden=(16,), history=True)),
+}  # fmt: skip
+
+
+def heater(task):
+    variables = HEATING["variables"] | task.get("variables", {})
+    return fmugym.load(HEATING | task | {"variables": variables}, physical=True)
+
+
+def agent_for(env, text, form, seed=0):
+    """An agent with random weights, which sees values around those at the beginning."""
+    known, rng = Policy(None).bind(env), np.random.default_rng(seed)
+    sizes = len(known.names), known.acting
+    if form is None:
+        return Agent("by hand", text)
+    values = gymnasium.spaces.flatten(env.observation_space, env.reset(seed=seed)[0])
+    count = form.features(*sizes)
+    mean = np.concatenate([values, 0 * values, values, np.zeros(sizes[1])])[:count]
+    scale = mean + rng.normal(size=count), rng.uniform(0.5, 2, count)
+    weights = rng.normal(size=form.size(*sizes)) / 2
+    return Agent("by hand", text, form, weights, scale, known.names, str(env.action_space))
+
+
+def played(env, agent, step, steps=300, seed=1):
+    """Play an episode, and ask the exported agent beside the original.
+
+    Args:
+        env, agent: The originals.
+        step: Takes the measurements, and gives the actions of the exported agent.
+
+    Returns:
+        The inputs of the plant that both want, shape (2, steps, m).
+    """
+    logic, policy = agent_of(env, agent).logic, agent.policy().bind(env)
+    written = [env._interface.inputs.index(one) for one in logic.inputs]
+    observation, _ = env.reset(seed=seed)
+    rows, is_over = [], False
+    while not is_over and len(rows) < steps:
+        actions = step([env.out[one.name] for one in logic.measurements])
+        observation, _, terminated, truncated, _ = env.step(policy.act(observation))
+        rows.append([actions, np.array(env.inputs)[written]])
+        is_over = terminated or truncated
+    return np.moveaxis(np.array(rows), 1, 0)
+
+
+def require_same(both, different=8):
+    own, wanted = both
+    assert len(np.unique(wanted.round(6))) >= different
+    np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=1e-12)
+
+
+class TestInC:
+    """The agent in C, beside its Python policy in an episode."""
+
+    @pytest.mark.parametrize("task", HEATERS)
+    def test_of_task_files(self, task, tmp_path):
+        document, text, form = HEATERS[task]
+        env = heater(document)
+        agent = agent_for(env, text, form)
+        exported = agent_of(env, agent)
+        controller = compiled(exported, tmp_path)
+        env.reset(seed=1)
+        controller.begin(**drawn_in(env, exported.logic))
+        both = played(env, agent, controller.step)
+        assert both.shape[1] == 192
+        require_same(both, different=2 if task == "levels" else 8)
+        env.close()
+
+    @pytest.mark.parametrize(
+        ("text", "form"),
+        [
+            (None, HISTORY),
+            (None, Form("network", hidden=(8,))),
+            ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", None),
+            ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", HISTORY),
+        ],
+    )
+    def test_of_choices(self, text, form, tmp_path):
+        env = gymnasium.make("fmugym/CartPole-v0").unwrapped
+        agent = agent_for(env, text, form)
+        exported = agent_of(env, agent)
+        controller = compiled(exported, tmp_path)
+        controller.begin()
+        policy, rows = agent.policy().bind(env), np.random.default_rng(0).normal(size=(200, 4))
+        chosen = [policy.act(row) for row in rows.astype(np.float32)]
+        seen = rows[:, [env._interface.outputs.index(v) for v in exported.logic.measurements]]
+        assert 5 < np.sum(chosen) < 195
+        assert [controller.step(row) for row in seen] == [[-10.0 + 20.0 * one] for one in chosen]
+        env.close()
+
+    def test_of_hooks_by_hand_with_several_choices(self, tmp_path):
+        env = Filtered()
+        agent = agent_for(env, None, HISTORY)
+        env.reset(seed=1)
+        controller = compiled(agent_of(env, agent), tmp_path, "C++")
+        controller.begin(goal=env.variables["goal"])
+        require_same(played(env, agent, controller.step), different=3)
+        env.close()
+
+    @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
+    def test_of_a_constant(self, text, tmp_path):
+        env = heater({"agent": PRESENT})
+        agent = agent_for(env, text, Form("constant", blind=True))
+        exported = agent_of(env, agent)
+        assert exported.network is None
+        assert [one.name for one in exported.logic.measurements] == ["T_op"] * (text is not None)
+        controller = compiled(exported, tmp_path)
+        controller.begin()
+        require_same(played(env, agent, controller.step), different=1)
+        env.close()
+
+    def test_of_a_controller_in_python(self, tmp_path):
+        env, texts = heater({"agent": PRESENT}), []
+        policy = Agent("by hand", PID).policy().bind(env)
+        policy.act(np.array([20.0, 1.0]))
+        for model in (policy, controller_from(PID), Agent("by hand", PID)):
+            folder = tmp_path / str(len(texts))
+            folder.mkdir()
+            texts.append(write_c(agent_of(env, model), folder)[1].read_text())
+        assert texts[0] == texts[1] == texts[2]
+        assert policy.baseline._state[1] == 20.0  # it is as before
+        env.close()
+
+    def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
+        env = heater(TASKS["history"])
+        agent = agent_for(env, PID, HISTORY)
+        controller = compiled(agent_of(env, agent), tmp_path)
+        runs = []
+        for _ in range(2):
+            controller.begin()
+            runs.append(played(env, agent, controller.step))
+        assert np.array_equal(*runs)
+        require_same(runs[1])
+        env.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+@pytest.mark.parametrize("task", ["a controller", "a controller and a history"])
+def test_as_an_fmu(version, task, tmp_path):
+    document, text, form = HEATERS[task]
+    env = heater(document)
+    agent = agent_for(env, text, form)
+    exported = agent_of(env, agent)
+    path = write_fmu(exported, tmp_path / "heater.fmu", fmi_version=version)
+    assert validate_fmu(str(path)) == []
+    env.reset(seed=1)
+    names = [one.name for one in exported.logic.measurements]
+    with controller_of(path, tmp_path) as controller:
+        controller.begin(**drawn_in(env, exported.logic))
+        taken = []
+
+        def step(measurements):
+            controller.set(dict(zip(names, measurements, strict=True)))
+            controller.step(len(taken) * 900.0, 900.0)
+            taken.append(measurements)
+            return controller.get(["u"])
+
+        require_same(played(env, agent, step))
+    env.close()
+
+
+class TestRefused:
+    def test_a_schedule(self):
+        env = heater({"agent": PRESENT})
+        with pytest.raises(ConfigError, match=r"Schedule.*PID"):
+            agent_of(env, agent_for(env, "schedule 06:00=1 22:00=0", None))
+        env.close()
+
+    def test_a_task_in_the_form_for_agents(self):
+        env = fmugym.load(HEATING | {"agent": PRESENT})
+        with pytest.raises(ConfigError, match=r"physical"):
+            agent_of(env, Agent("by hand", PID))
+        env.close()
+
+    def test_another_task(self):
+        env, other = heater({"agent": PRESENT}), heater(TASKS["forecast"])
+        agent = agent_for(other, PID, HISTORY)
+        with pytest.raises(ConfigError, match=r"another task.*price\[\+"):
+            agent_of(env, agent)
+        env.close()
+        other.close()
+
+    def test_what_is_no_box(self):
+        class Choosing(Filtered):
+            def _get_observation_space(self):
+                return gymnasium.spaces.Discrete(2)
+
+            def _get_observation(self):
+                return np.int64(self.state[0] > 0)
+
+        env = Choosing()
+        agent = agent_for(env, None, LINEAR)
+        with pytest.raises(ConfigError, match=r"Discrete\(2\).*Box"):
+            agent_of(env, agent)
+        env.close()
+
+
+def test_by_the_command_line(tmp_path, capsys):
+    task = "examples/cart_pole.toml"
+    env = fmugym.load(task, physical=True)
+    agent_for(env, "pid of=phi setpoint=0 kp=-100 td=0.1", HISTORY).save(tmp_path)
+    env.close()
+    main(["export", str(tmp_path), "--task", task, "--output", str(tmp_path / "agent.c")])
+    assert "measurement phi rad" in capsys.readouterr().out
+    assert "agent_controller[2]" in (tmp_path / "agent.h").read_text()

@@ -1,0 +1,681 @@
+"""The search for policies: its steps against known optima, and what policies and arenas do."""
+
+import itertools
+from contextlib import closing, suppress
+from functools import partial
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.baselines import PID, controller_of
+from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
+from fmugym.baselines.cma import CMA
+from fmugym.baselines.parsing import search_of
+from fmugym.search.agent import AGENT, Agent
+from fmugym.search.entrants import merits_of
+from fmugym.search.flattening import require_numbers, rows_of, width_of
+from fmugym.search.guessing import guessed_controllers
+from fmugym.search.policy import LIMIT, Form, Policy, Scale
+
+AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
+STRETCH = 10.0 ** np.linspace(0, 2, 6)  # lengths of axes, so that variances differ by 1e4
+OPTIMUM = np.array([1.0, -2.0, 0.5, 3.0, 0.0, -1.0])
+
+
+def sphere(points):
+    return ((points - OPTIMUM) ** 2).sum(axis=1)
+
+
+def ellipsoid(points):
+    return (((points - OPTIMUM) * STRETCH) ** 2).sum(axis=1)
+
+
+def turned_ellipsoid(points):
+    return (((points - OPTIMUM) @ AXES * STRETCH) ** 2).sum(axis=1)
+
+
+def rosenbrock(points):
+    """Its minimum is where all numbers are 1."""
+    head, tail = points[:, :-1], points[:, 1:]
+    return (100 * (tail - head**2) ** 2 + (1 - head) ** 2).sum(axis=1)
+
+
+def made(separable=False, seed=0):
+    return CMA(np.zeros(6), 0.5, 12, np.random.default_rng(seed), separable=separable)
+
+
+def minimized(function, rounds, separable=False):
+    cma = made(separable)
+    for _ in range(rounds):
+        cma.tell(np.argsort(function(cma.ask())))
+    return cma
+
+
+class Other:
+    """The implementation of the package ``cmaes``, with the methods of ours."""
+
+    def __init__(self, separable=False, seed=0):
+        cmaes = pytest.importorskip("cmaes", reason="needs cmaes: the extra test")
+        kind = cmaes.SepCMA if separable else cmaes.CMA
+        self.cma = kind(mean=np.zeros(6), sigma=0.5, population_size=12, seed=seed)
+
+    def ask(self):
+        self.points = np.array([self.cma.ask() for _ in range(12)])
+        return self.points
+
+    def tell(self, order):
+        self.cma.tell([(self.points[i], float(rank)) for rank, i in enumerate(order)])
+
+
+class TestCMA:
+    @pytest.mark.parametrize(
+        ("function", "separable", "rounds"),
+        [
+            (sphere, False, 150),
+            (turned_ellipsoid, False, 400),
+            (rosenbrock, False, 800),
+            (sphere, True, 150),
+            (ellipsoid, True, 400),
+        ],
+    )
+    def test_finds_known_minima(self, function, separable, rounds):
+        cma = minimized(function, rounds, separable=separable)
+        expected = np.ones(6) if function is rosenbrock else OPTIMUM
+        assert cma.mean == pytest.approx(expected, abs=1e-6)
+        assert cma.sigma < 1e-5
+
+    @pytest.mark.parametrize("function", [sphere, turned_ellipsoid, rosenbrock, ellipsoid])
+    def test_is_about_as_fast_as_another_implementation(self, function):
+        """The other one has negative weights too, with which it needs a few rounds less."""
+        separable = function is ellipsoid
+        ours = [rounds_of(function, made(separable, seed)) for seed in range(3)]
+        others = [rounds_of(function, Other(separable, seed)) for seed in range(3)]
+        assert 0.6 < np.median(ours) / np.median(others) < 1.5
+
+    def test_its_first_step_is_that_of_another_implementation(self):
+        cma, other = made(), Other()
+        other.points = cma.ask()
+        order = np.argsort(rosenbrock(other.points))
+        cma.tell(order)
+        other.tell(order)
+        assert cma.mean == pytest.approx(other.cma.mean, rel=1e-12)
+
+    @pytest.mark.parametrize("separable", [False, True])
+    def test_its_limits_hold(self, separable):
+        """A slope without an end would let mean and steps grow for ever."""
+        limits = {"largest": 3.0, "largest_sigma": 2.0}
+        rng = np.random.default_rng(0)
+        cma = CMA(np.zeros(5), 0.5, 32, rng, separable=separable, **limits)
+        sizes, steps = [], []
+        for _ in range(200):
+            points = cma.ask()
+            steps.append(np.sqrt(np.mean((points - cma.mean) ** 2)))
+            cma.tell(np.argsort(points[:, 0]))
+            sizes.append(np.sqrt(np.mean(cma.mean**2)))
+        assert max(sizes) == pytest.approx(3.0)
+        assert 1.0 < max(steps) < 3.0
+        assert cma.sigma == 2.0
+
+    def test_only_the_order_counts(self):
+        """Not how much better a candidate is."""
+        logarithm = minimized(lambda points: np.log(1e-300 + rosenbrock(points)), 50)
+        assert minimized(rosenbrock, 50).mean.tolist() == logarithm.mean.tolist()
+
+
+def rounds_of(function, cma):
+    """How many rounds it takes until one candidate is as good as the minimum."""
+    for rounds in range(1, 1000):
+        values = function(cma.ask())
+        if values.min() < 1e-9:
+            return rounds
+        cma.tell(np.argsort(values))
+    raise AssertionError("not found")
+
+
+FALLING = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "2s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["theta", "theta_dot"]},
+    "parameters": {"q_0": "pi", "theta_0": {"distribution": "uniform", "low": 0.1, "high": 1}},
+    "reward": "-theta**2 - 0.1 * theta_dot**2",
+    "costs": {"effort": {"expr": "abs(tau)", "limit": 1.0}, "turns": "abs(theta_dot)"},
+    "terminated": "abs(theta) > 1.45",
+}
+
+
+def load(document=FALLING, **changes):
+    task = {key: value for key, value in (document | changes).items() if value is not None}
+    return partial(fmugym.load, fmugym.Task.from_dict(task))
+
+
+def pid(rows):
+    return PID("theta", 0.0, kp=rows[:, 0], td=0.2)
+
+
+GAINS = np.array([[-0.3], [0.0], [0.05], [0.2], [1.0]])
+SEEDS = [3, 700_000, 41]
+
+
+def played(make_env, make=pid, numbers=GAINS, seeds=SEEDS, **arguments):
+    with closing(Arena(make_env, **arguments)) as arena:
+        return arena.play(make, numbers, seeds), arena
+
+
+class TestArena:
+    def test_its_results_are_those_of_single_environments(self):
+        costs = ["turns", "effort"]
+        outcome, _ = played(load(), costs=costs)
+        assert outcome.returns.shape == (5, 3)
+        assert outcome.costs.shape == (5, 3, 2)
+        lengths = set()
+        with closing(load()()) as env:
+            for row, (gain,) in enumerate(GAINS):
+                controller = PID("theta", 0.0, kp=gain, td=0.2).bind(env)
+                for column, seed in enumerate(SEEDS):
+                    controller.reset()
+                    total, cost, length = episode(env, controller, seed, costs)
+                    lengths.add(length)
+                    assert outcome.returns[row, column] == total
+                    assert outcome.costs[row, column].tolist() == cost
+        assert len(lengths) > 3  # some have ended before others
+
+    @pytest.mark.parametrize("most_envs", [1, 4, 7, 14, 15, 512])
+    def test_groups_change_nothing(self, most_envs):
+        expected, _ = played(load(), costs=["effort"])
+        outcome, _ = played(load(), costs=["effort"], most_envs=most_envs)
+        assert outcome.returns.tolist() == expected.returns.tolist()
+        assert outcome.costs.tolist() == expected.costs.tolist()
+
+    def test_a_second_play_is_like_the_first(self):
+        with closing(Arena(load())) as arena:
+            first = arena.play(pid, GAINS, SEEDS)
+            arena.play(pid, GAINS[:1], [1])
+            assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
+
+    def test_its_steps_are_counted(self):
+        """Nobody ends an episode of 40 steps here."""
+        _, arena = played(load(terminated=None))
+        assert arena.steps == 40 * 15
+
+    def test_the_ceiling_holds(self):
+        with closing(Arena(load(terminated=None))) as arena:
+            arena.ceiling = 15 * 40 + 70
+            arena.play(pid, GAINS, SEEDS)
+            with pytest.raises(CeilingError, match="670"):
+                arena.play(pid, GAINS, SEEDS)
+            assert arena.steps == 15 * 44
+
+    def test_episodes_without_an_end_are_stopped(self):
+        endless = load(terminated=None, episode_length=None, reward=1, costs=None)
+        outcome, _ = played(endless, numbers=GAINS[:1], seeds=[0])
+        assert outcome.returns.item() == MOST_STEPS == 10_000
+        outcome, arena = played(endless, numbers=GAINS[:2], seeds=[0], most_steps=7)
+        assert (outcome.returns.ravel().tolist(), arena.steps) == ([7, 7], 14)
+
+
+def episode(env, controller, seed, costs=()):
+    """The return of an episode in a single environment, its costs, and how long it was."""
+    observation, info = env.reset(seed=seed)
+    total, cost, steps, over = 0.0, [0.0] * len(costs), 0, False
+    while not over:
+        action = controller.act(observation, info)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, over = total + reward, terminated or truncated
+        cost = [before + info["costs"][name] for before, name in zip(cost, costs, strict=True)]
+        steps += 1
+    return total, cost, steps
+
+
+def test_costs_beyond_their_limits_come_first():
+    """Returns 5, 9, 7, 1; two costs, of which the second has no room at all."""
+    costs = np.array([[[1.0, 0.0]], [[4.0, 0.0]], [[2.0, 0.5]], [[2.0, -1.0]]])
+    returns = np.array([[5.0], [9.0], [7.0], [1.0]])
+    merits = merits_of(Outcome(returns, costs), [2.0, 0.0])
+    assert merits == [(0.0, 5.0), (-1.0, 9.0), (-0.5, 7.0), (0.0, 1.0)]
+    assert sorted(range(4), key=merits.__getitem__, reverse=True) == [0, 3, 2, 1]
+    without = merits_of(Outcome(returns, np.empty((4, 1, 0))), [])
+    assert [merit for _, merit in without] == [5, 9, 7, 1]
+
+
+class Stub:
+    """An environment, or N of them, of which only the spaces are there."""
+
+    unphysical_keys = ()
+    observation_names = None
+    config = SimpleNamespace(time_step=0.1)
+
+    def __init__(self, observed, acting, count=None, names=None):
+        self.observation_names = names
+        if count is None:
+            self.observation_space, self.action_space = observed, acting
+        else:
+            self.single_observation_space, self.single_action_space = observed, acting
+            self.num_envs = count
+
+    @property
+    def unwrapped(self):
+        return self
+
+
+NUMBERS = spaces.Box(-2.0, 2.0, (3,), np.float32)
+GOAL = spaces.Dict(
+    {
+        "observation": NUMBERS,
+        "achieved_goal": spaces.Box(-1, 1, (1,), np.float32),
+        "desired_goal": spaces.Box(-1, 1, (1,), np.float32),
+    }
+)
+OBSERVED = [
+    NUMBERS,
+    spaces.Box(0, 1, (), np.float64),
+    spaces.Discrete(4),
+    spaces.Discrete(3, start=-1),
+    spaces.MultiDiscrete([2, 3], start=[5, 0]),
+    spaces.MultiBinary(3),
+    spaces.Tuple((spaces.Discrete(2, start=1), NUMBERS)),
+    GOAL,
+    spaces.Dict({"b": spaces.Tuple((NUMBERS, spaces.Discrete(3))), "a": spaces.MultiBinary(2)}),
+]
+
+
+@pytest.mark.parametrize("space", OBSERVED, ids=repr)
+def test_rows_are_those_of_gymnasium(space):
+    batch = gym.vector.utils.batch_space(space, 5)
+    batch.seed(1)
+    observations = batch.sample()
+    singles = list(gym.vector.utils.iterate(batch, observations))
+    expected = [spaces.flatten(space, one).astype(float).tolist() for one in singles]
+    assert rows_of(space, observations, 5).tolist() == expected
+    assert [rows_of(space, one, 1)[0].tolist() for one in singles] == expected
+    assert {len(row) for row in expected} == {width_of(space)}
+    require_numbers(space, NUMBERS)
+
+
+@pytest.mark.parametrize(
+    ("observed", "acting", "facts"),
+    [
+        (spaces.Box(0, 255, (8, 8, 3), np.uint8), NUMBERS, ["(8, 8, 3)", "--algorithm"]),
+        (spaces.Dict({"a": NUMBERS, "b": spaces.Text(5)}), NUMBERS, ["Text", "--algorithm"]),
+        (spaces.Tuple((spaces.Sequence(NUMBERS),)), NUMBERS, ["Sequence", "--algorithm"]),
+        (NUMBERS, spaces.Box(-np.inf, np.inf, (1,)), ["inf", "limits", "'min'", "'bounds'"]),
+        (NUMBERS, spaces.Box(0, np.inf, (1,)), ["inf", "limits"]),
+        (NUMBERS, spaces.Dict({"a": NUMBERS}), ["Dict", "Box"]),
+    ],
+    ids=["image", "text", "sequence", "unbounded", "half bounded", "dict"],
+)
+def test_spaces_without_a_search(observed, acting, facts):
+    with pytest.raises(ConfigError) as caught:
+        require_numbers(observed, acting)
+    for fact in facts:
+        assert fact in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+FORMS = [
+    Form("linear"),
+    Form("linear with history", history=True),
+    Form("network", hidden=(5, 4)),
+    Form("network with history", hidden=(4,), history=True),
+    Form("constant action", blind=True),
+]
+ACTING = [
+    spaces.Box(np.array([-2.0, 10.0]), np.array([4.0, 30.0]), dtype=np.float64),
+    spaces.Discrete(3, start=2),
+    spaces.MultiDiscrete([2, 4], start=[0, -1]),
+    spaces.MultiBinary(2),
+]
+
+
+def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
+    """One with random weights, for one environment or for ``rows``."""
+    bare = Policy(None).bind(env_of_one)
+    sizes = len(bare.names), bare.acting
+    rng = np.random.default_rng(seed)
+    shape = (form.size(*sizes),) if rows is None else (rows, form.size(*sizes))
+    count = form.features(*sizes)
+    scale = rng.normal(size=count), rng.uniform(0.5, 2.0, count)
+    return Policy(baseline, form, rng.normal(size=shape), scale)
+
+
+class TestPolicy:
+    def test_without_weights_it_is_the_controller(self):
+        with closing(load()()) as env:
+            policy, controller = Policy(pid(GAINS[3:4])).bind(env), pid(GAINS[3:4]).bind(env)
+            assert episode(env, policy, 4) == episode(env, controller, 4)
+            assert Policy(None).bind(env).act(np.zeros(2)) == 0.0
+
+    def test_corrections_are_halves_of_the_range_and_end_at_its_limits(self):
+        env = Stub(NUMBERS, ACTING[0])
+        form = Form("linear")
+        weights = np.zeros((4, 2))
+        weights[3] = 2.0 * np.array([0.5, -0.25])  # constants; 2 is the root of 4 inputs
+        policy = Policy(None, form, weights.ravel(), (np.zeros(3), np.ones(3))).bind(env)
+        assert policy.act(np.zeros(3)).tolist() == [1.0 + 0.5 * 3, 20.0 - 0.25 * 10]
+        weights[0] = [2.0, 2.0]
+        policy = Policy(None, form, weights.ravel(), (np.zeros(3), np.ones(3))).bind(env)
+        assert policy.act(np.array([0.3, 0, 0])).tolist() == pytest.approx([3.4, 20.5])
+        assert policy.act(np.array([9.0, 0, 0])).tolist() == [4.0, 30.0]
+        assert policy.act(np.array([-9.0, 0, 0])).tolist() == [-2.0, 10.0]
+
+    def test_a_controller_is_corrected_within_the_limits(self):
+        """It asks for more than there is; the correction begins at the limit."""
+        env = Stub(spaces.Box(-9, 9, (1,)), spaces.Box(0.0, 2.0, (1,), np.float64), names=("T",))
+        weights = np.array([0.0, -0.25 * np.sqrt(2)])
+        scale = np.zeros(1), np.ones(1)
+        policy = Policy(PID("T", 8.0, kp=1.0), Form("linear"), weights, scale).bind(env)
+        assert policy.act(np.zeros(1)) == pytest.approx(2.0 - 0.25)
+        assert policy.act(np.array([7.5])) == pytest.approx(0.5 - 0.25)
+        assert policy.act(np.array([7.9])) == 0.0
+
+    def test_scaled_features_have_a_limit(self):
+        env = Stub(spaces.Box(-1e9, 1e9, (1,)), spaces.Box(-1e3, 1e3, (1,), np.float64))
+        scale = np.array([5.0]), np.array([2.0])
+        weights = np.array([np.sqrt(2) / 1e3, 0.0])
+        policy = Policy(None, Form("linear"), weights, scale).bind(env)
+        seen = [policy.act(np.array([value])).item() for value in (8.0, 1e9, -1e9)]
+        assert seen == pytest.approx([1.5, LIMIT, -LIMIT])
+
+    @pytest.mark.parametrize("form", [form for form in FORMS if form.history])
+    def test_history_by_hand(self, form):
+        """The network gets each number, its change, its leaky mean, and the last action."""
+        env, seen = Stub(NUMBERS, ACTING[0]), []
+        policy = policy_with(form, env).bind(env)
+        policy._network = recording(policy._network, seen)
+        observations = np.random.default_rng(2).uniform(-2, 2, (4, 3))
+        actions = [policy.act(row) for row in observations]
+        leaky, before, last = observations[0], observations[0], np.zeros(2)
+        for row, action, features in zip(observations, actions, seen, strict=True):
+            leaky = leaky + 0.05 * (row - leaky)
+            expected = np.concatenate([row, row - before, leaky, last])
+            assert features[:, 0] == pytest.approx(expected, rel=1e-12)
+            before, last = row, (action - [1.0, 20.0]) / [3.0, 10.0]
+        policy.reset()
+        policy.act(observations[3])
+        assert seen[-1][:, 0].tolist() == [*observations[3], 0, 0, 0, *observations[3], 0, 0]
+
+    def test_history_of_choices_is_one_hot(self):
+        env, seen = Stub(NUMBERS, ACTING[2]), []
+        policy = policy_with(FORMS[1], env).bind(env)
+        policy._network = recording(policy._network, seen)
+        action = policy.act(np.ones(3))
+        policy.act(np.ones(3))
+        told = [float(action[0] == n) for n in (0, 1)] + [
+            float(action[1] == n) for n in range(-1, 3)
+        ]
+        assert [one[-6:, 0].tolist() for one in seen] == [[0.0] * 6, told]
+
+    def test_a_network_by_hand(self):
+        env = Stub(NUMBERS, ACTING[0])
+        form = FORMS[2]
+        policy = policy_with(form, env).bind(env)
+        mean, divisor = policy.scale
+        observation = np.array([0.5, -1.0, 1.5])
+        values = np.clip((observation - mean) / divisor, -LIMIT, LIMIT)
+        weights, widths = policy.weights, [3, 5, 4, 2]
+        for before, after in itertools.pairwise(widths):
+            part, weights = np.split(weights, [(before + 1) * after])
+            layer = part.reshape(before + 1, after) / np.sqrt(before + 1)
+            values = np.append(values, 1.0) @ layer
+            values = np.tanh(values) if weights.size else values
+        expected = np.clip([1.0, 20.0] + values * [3.0, 10.0], [-2, 10], [4, 30])
+        assert policy.act(observation) == pytest.approx(expected, rel=1e-12)
+
+    @pytest.mark.parametrize("acting", ACTING, ids=repr)
+    @pytest.mark.parametrize("form", FORMS, ids=lambda form: form.name)
+    def test_many_environments_are_as_single_ones(self, form, acting):
+        """Bit for bit, also if episodes begin at different times."""
+        one, many = Stub(GOAL, acting), Stub(GOAL, acting, 6)
+        together = policy_with(form, one, rows=6).bind(many)
+        batch = gym.vector.utils.batch_space(GOAL, 6)
+        batch.seed(3)
+        steps = [batch.sample() for _ in range(7)]
+        begins = np.random.default_rng(0).random((7, 6)) < 0.2
+        actions = []
+        for observations, mask in zip(steps, begins, strict=True):
+            together.reset(mask)
+            actions.append(together.act(observations))
+        for i in range(6):
+            alone = Policy(None, form, together.weights[i], together.scale).bind(one)
+            for observations, mask, expected in zip(steps, begins, actions, strict=True):
+                if mask[i]:
+                    alone.reset()
+                action = alone.act({name: rows[i] for name, rows in observations.items()})
+                assert action.tolist() == expected[i].tolist()
+                assert acting.contains(action.astype(acting.dtype)) or acting.shape == ()
+        shared = policy_with(form, one).bind(many)
+        alone = policy_with(form, one).bind(one)
+        first = shared.act(steps[0])
+        for i in range(6):
+            alone.reset()
+            action = alone.act({name: rows[i] for name, rows in steps[0].items()})
+            assert action.tolist() == first[i].tolist()
+
+    def test_all_choices_can_be_made(self):
+        """The largest output of each part chooses; constants alone decide here."""
+        env = Stub(NUMBERS, ACTING[2])
+        chosen = set()
+        for seed in range(40):
+            chosen.add(tuple(policy_with(FORMS[4], env, seed).bind(env).act(np.zeros(3)).tolist()))
+        assert chosen == {(a, b) for a in (0, 1) for b in (-1, 0, 1, 2)}
+
+
+def recording(network, seen):
+    def call(features):
+        seen.append(features.copy())
+        return network(features)
+
+    return call
+
+
+def test_a_scale_is_mean_and_deviation():
+    scale, rng = Scale(3), np.random.default_rng(0)
+    features = rng.normal([[5.0], [-3.0], [0.0]], [[2.0], [0.1], [0.0]], (3, 1000))
+    features[2] = -7.0
+    assert [scale(part) for part in np.split(features, 4, axis=1)] == [(0.0, 1.0)] * 4
+    mean, divisor = scale.fixed()
+    assert mean == pytest.approx(features.mean(axis=1))
+    assert divisor[:2] == pytest.approx(features.std(axis=1)[:2])
+    assert divisor[2] == 7.0  # a constant is not made larger
+
+
+class TestAgent:
+    NAMES = "theta", "theta_dot"
+
+    @pytest.fixture(params=FORMS, ids=lambda form: form.name)
+    def agent(self, request):
+        with closing(load()()) as env:
+            policy, space = policy_with(request.param, env), str(env.action_space)
+        text = "pid of=theta setpoint=0 kp=0.2 td=0.2"
+        return Agent("own", text, request.param, policy.weights, policy.scale, self.NAMES, space)
+
+    def test_saved_and_loaded_it_acts_as_before(self, agent, tmp_path):
+        agent.save(tmp_path)
+        loaded = Agent.load(tmp_path)
+        assert (loaded.name, loaded.text, loaded.form) == (agent.name, agent.text, agent.form)
+        with closing(Arena(load())) as arena:
+            expected = agent.play(arena, SEEDS)
+            assert loaded.play(arena, SEEDS).returns.tolist() == expected.returns.tolist()
+
+    def test_damaged_files(self, agent, tmp_path):
+        """Shorter ones, others, and those with one wrong byte, which may be where nobody looks."""
+        agent.save(tmp_path)
+        path = tmp_path / AGENT
+        content = path.read_bytes()
+        rng = np.random.default_rng(0)
+        lengths = rng.integers(len(content), size=40)
+        for damaged in (b"", b"PK", b"text", bytes(len(content)), *(content[:n] for n in lengths)):
+            path.write_bytes(damaged)
+            with pytest.raises(ConfigError, match=str(tmp_path)):
+                Agent.load(tmp_path)
+        for place in rng.integers(len(content), size=60):
+            wrong = bytes([content[place] ^ 255])
+            path.write_bytes(content[:place] + wrong + content[place + 1 :])
+            with suppress(ConfigError):
+                Agent.load(tmp_path)
+
+    @pytest.mark.parametrize(
+        "change", [{"weights": np.ones(2)}, {"scale": (np.ones(1), np.ones(1))}], ids=str
+    )
+    def test_arrays_of_another_size(self, change, tmp_path):
+        with closing(load()()) as env:
+            policy, space = policy_with(FORMS[0], env), str(env.action_space)
+            facts = {"weights": policy.weights, "scale": policy.scale} | change
+            Agent("own", None, FORMS[0], names=self.NAMES, actions=space, **facts).save(tmp_path)
+            with pytest.raises(
+                ConfigError, match=r"a linear needs [23] (weights|scales) here, got [12]"
+            ):
+                Agent.load(tmp_path).policy().bind(env)
+
+    def test_a_missing_one(self, tmp_path):
+        with pytest.raises(ConfigError, match=str(tmp_path)):
+            Agent.load(tmp_path)
+
+    @pytest.mark.parametrize(
+        ("names", "actions", "facts"),
+        [
+            (("theta", "speed"), None, ["observes speed", "also gives theta_dot"]),
+            (("theta", "theta_dot", "T"), None, ["observes T"]),
+            (("theta_dot", "theta"), None, ["order"]),
+            (NAMES, "Discrete(2)", ["Discrete(2)", "Box(-0.1, 0.1"]),
+        ],
+    )
+    def test_another_task_is_told_by_what_differs(self, names, actions, facts):
+        with closing(load()()) as env:
+            agent = Agent("own", None, names=names, actions=actions or str(env.action_space))
+            with pytest.raises(ConfigError, match="another task") as caught:
+                agent.policy().bind(env)
+        for fact in facts:
+            assert fact in str(caught.value)
+
+
+class TestRanges:
+    def test_of_negative_numbers(self):
+        """They are searched on a logarithmic scale, too, and texts have their sign."""
+        search = search_of("pid of=T setpoint=-3..-1 kp=-5..-0.05 ti=10..2000 offset=-1..1")
+        assert search.ranges == {
+            "setpoint": fmugym.Uniform(1, 3),
+            "kp": fmugym.LogUniform(0.05, 5),
+            "ti": fmugym.LogUniform(10, 2000),
+            "offset": fmugym.Uniform(-1, 1),
+        }
+        found = {"setpoint": 2.0, "kp": 0.25, "ti": 100.0, "offset": -0.5}
+        assert search.text(found) == "pid of=T setpoint=-2 kp=-0.25 ti=100 offset=-0.5"
+        controller = controller_of(search.text(found))
+        assert vars(controller) == vars(search.make(**found))
+        assert (controller.kp, controller.setpoint) == (-0.25, -2.0)
+        made = search.make(**{name: np.array([value] * 2) for name, value in found.items()})
+        assert made.kp.tolist() == [-0.25, -0.25]
+        assert search.at_an_end(found | {"kp": 4.99}) == ["kp"]
+
+    @pytest.mark.parametrize(
+        ("word", "fact"), [("kp=-0.05..-5", "lower"), ("kp=5..1", "lower"), ("kp=a..1", "a..1")]
+    )
+    def test_that_are_none(self, word, fact):
+        with pytest.raises(ConfigError, match=fact):
+            search_of(f"pid of=T setpoint=1 {word}")
+
+    def test_where_a_number_is_needed(self):
+        text = "pid of=theta setpoint=0 kp=-5..-0.05"
+        with pytest.raises(ConfigError, match=r"kp=-5\.\.-0\.05 is a range"):
+            controller_of(text)
+        with closing(load(controllers={"pi": text})()) as env:
+            assert env.task.document["controllers"] == {"pi": text}
+        warm_up = {"period": "1s", "controller": "pi"}
+        with pytest.raises(ConfigError, match=r"controllers.pi.*kp=-5\.\.-0\.05 is a range"):
+            load(controllers={"pi": text}, warm_up=warm_up)()
+
+    @pytest.mark.parametrize(
+        "text", ["pid of=T setpoint=0 kp=5..1", "pid of=T kp=1..2", "pit kp=1..2"]
+    )
+    def test_in_a_task_are_checked(self, text):
+        with pytest.raises(ConfigError, match="controllers"):
+            load(controllers={"pi": text})()
+
+
+CONTROLLED = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "10s",
+    "variables": {
+        "tau": {"min": -0.1, "max": 0.3},
+        "q": {"min": -2, "max": 2},
+    },
+    "agent": {"actions": ["tau"], "observations": ["q", "q_dot", "goal"]},
+    "setpoints": {"goal": 1.0},
+}
+
+
+class TestGuesses:
+    @pytest.mark.parametrize(
+        ("changes", "pairs"),
+        [
+            ({"reward": "-abs(q - goal)"}, {("q", "goal")}),
+            ({"reward": "-(goal - q)**2"}, {("q", "goal")}),
+            (
+                {
+                    "reward": {
+                        "a": "-(q - 0.5)**2",
+                        "b": {"expr": "-abs(q_dot - goal)", "weight": 2},
+                    }
+                },
+                {("q", "0.5"), ("q_dot", "goal")},
+            ),
+            ({"reward": "-error**2", "expressions": {"error": "0.25 - q"}}, {("q", "0.25")}),
+            ({"reward": "-tau**2", "costs": {"far": {"expr": "max(q - 1, 0)"}}}, {("q", "1.0")}),
+            ({"reward": "-tau**2 - q * goal - q_dot"}, set()),
+            ({"reward": "1 - goal"}, set()),
+            ({"reward": "-abs(q - phi)", "variables": {"phi": {"name": "theta"}}}, set()),
+            (
+                {
+                    "reward": 1,
+                    "setpoints": {"goal": {"value": 1.0, "of": "q"}},
+                },
+                {("q", "goal")},
+            ),
+        ],
+        ids=[
+            "reward",
+            "reversed",
+            "terms",
+            "expression",
+            "costs",
+            "none",
+            "set point",
+            "unseen",
+            "of",
+        ],
+    )
+    def test_come_from_differences(self, changes, pairs):
+        changes = {"variables": CONTROLLED["variables"] | changes.pop("variables", {})} | changes
+        texts = guesses(**changes)
+        found = [(search_of(text).fixed["of"], search_of(text).fixed["setpoint"]) for text in texts]
+        assert {(of, str(setpoint)) for of, setpoint in found} == pairs
+        assert len(texts) == 2 * len(pairs)
+
+    def test_have_both_signs_and_ranges_of_the_task(self):
+        """The action has 0.4 Nm, and what is measured 4 rad, so that 0.1 Nm/rad is usual."""
+        first, second = map(search_of, guesses(reward="-abs(q - goal)"))
+        assert first.ranges == second.ranges
+        assert {first.negative, second.negative} == {frozenset(), frozenset({"kp"})}
+        gain, time = first.ranges["kp"], first.ranges["ti"]
+        assert (gain.low, gain.high) == pytest.approx((0.001, 10.0))
+        assert (time.low, time.high) == pytest.approx((0.05, 10.0))
+
+    def test_need_one_box_action(self):
+        levels = CONTROLLED["variables"] | {"tau": {"levels": [-0.1, 0.1]}}
+        assert guesses(reward="-abs(q - goal)", variables=levels, physical=False) == []
+        with closing(fmugym.envs.CartPoleEnv()) as env:
+            assert guessed_controllers({"reward": "x - 1"}, env) == []
+
+
+def guesses(physical=True, **changes):
+    document = CONTROLLED | changes
+    with closing(fmugym.load(fmugym.Task.from_dict(document), physical=physical)) as env:
+        return guessed_controllers(env.task.document, env)
