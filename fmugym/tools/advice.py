@@ -20,7 +20,7 @@ from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_
 from fmugym.tools.overview import plain
 from fmugym.trial.known import known_verdict
 
-__all__ = ["Advice", "Doubt", "advise", "lines_of"]
+__all__ = ["Advice", "Doubt", "advise", "lines_of", "rounded_down"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -74,10 +74,12 @@ class Doubt:
     Attributes:
         text: What it is.
         cure: What to do about it.
+        check: What was checked.
     """
 
     text: str
     cure: str
+    check: str = "accuracy"
 
 
 def lines_of(advices: Iterable[Advice]) -> list[str]:
@@ -207,7 +209,7 @@ def _time_step(replay: Replay) -> Advice | None:
     longest, what = min(_longest(eigenvalues))
     if replay.spec.time_step <= _MUCH * longest:
         return None
-    step = _rounded_down(longest)
+    step = rounded_down(longest)
     return Advice("", "time_step", step, f"{what}, where the FMU starts")
 
 
@@ -247,7 +249,7 @@ def _longest(eigenvalues: ComplexArray) -> Iterator[tuple[float, str]]:
     yield math.inf, ""
 
 
-def _rounded_down(value: float) -> float:
+def rounded_down(value: float) -> float:
     """The largest number of the form 1, 2 or 5 times a power of ten that is not greater."""
     power = 10.0 ** math.floor(math.log10(value))
     return float(f"{max(n * power for n in (1, 2, 5) if n * power <= value * (1 + 1e-12)):.3g}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import json
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -15,13 +16,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
 from fmugym.errors import ConfigError, FMULoadError
+from fmugym.search.guessing import guessed_controller
 from fmugym.systems.description import SystemDescription
-from fmugym.tools.overview import plain
-from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
+from fmugym.tools.overview import plain, start_value
+from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, reach, remark
 from fmugym.tools.stand_in import replaceable
 
 __all__ = ["Proposal", "preload_line"]
@@ -30,19 +34,37 @@ _HEAD: Final = """\
 # A task for the FMU {file}. Decide what is marked with TODO, then try
 #   fmugym validate FILE       (what is wrong with this task?)
 #   fmugym simulate FILE       (what happens in an episode?)
+#   fmugym train FILE --output agent
 # Every key is described in docs/task-file.md.
 fmu = {path}
 time_step = {step}  # s{note}
-episode_length = {length}  # s
-reward = "0"  # TODO: what is there to learn? For example: "-abs({output} - 1)"
-# terminated = "abs({output}) > 10"  # TODO: does the task have an end?
+episode_length = {length}  # s{note_of_length}
+reward = "-abs({goal} - {setpoint})"  # TODO: a guess: {goal} is to follow {setpoint}
+# terminated = "abs({goal}) > 10"  # TODO: does the task have an end?
 """
 
 _MOST_RESULTS: Final = 30
 """Locals that are listed, at most."""
 
-_UNITS_OF_RESULTS: Final = frozenset({"K", "degC", "degF", "W", "kW", "MW", "J", "kJ", "Wh", "kWh"})
-"""Units of temperatures, powers and energies, which rewards and agents often need."""
+_TEMPERATURES: Final = frozenset({"K", "degC", "degF"})
+_POWERS: Final = frozenset({"W", "kW", "MW", "J", "kJ", "Wh", "kWh"})
+"""Units of powers and energies; rewards and agents often need these and temperatures."""
+
+_DEGREES: Final = 5.0
+"""A set point of a temperature is this near to its start; zero of its unit means nothing."""
+
+_GOAL: Final = re.compile(
+    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\bx\b|\[(m|rad|deg|m/s|rad/s)\]",
+    re.IGNORECASE,
+)
+"""What is often controlled, in names, descriptions and units."""
+
+_OUTSIDE: Final = re.compile(
+    r"\b(t ?(out|amb|ext)|amb|ambient|out(door|side)s?|weather|sol|solar|sun|irradi\w+|wind"
+    r"|disturbances?|occupan\w+|people|internal gains?|load torque|tau load)\b",
+    re.IGNORECASE,
+)
+"""Names and descriptions of inputs that no agent acts on."""
 
 
 class Proposal:
@@ -68,10 +90,27 @@ class Proposal:
 
     @cached_property
     def _actions(self) -> list[Variable]:
-        """The inputs, or some tunable parameters if there are none."""
+        """The inputs that an agent may act on, or a tunable parameter if there are none."""
         variables = self._fmu.description.variables.values()
         tunable = [v for v in variables if v.numeric and v.settable_in_step]
-        return self._skeleton.inputs or tunable[:1]
+        inputs = self._skeleton.inputs
+        return [v for v in inputs if not _is_outside(v)] or inputs or tunable[:1]
+
+    @cached_property
+    def _others(self) -> list[Variable]:
+        """The inputs that look like weather, loads or people."""
+        return [v for v in self._skeleton.inputs if v not in self._actions]
+
+    @cached_property
+    def _goal(self) -> Variable:
+        """The output that is probably to be controlled."""
+        return min(self._skeleton.outputs, key=_unlikeliness)
+
+    @cached_property
+    def _setpoint(self) -> str:
+        """The name of its set point."""
+        taken = {*self._fmu.description.variables, *self._aliases.values()}
+        return _free_alias(f"{self._aliases[self._goal.name]}_set", taken)
 
     @cached_property
     def _aliases(self) -> dict[str, str]:
@@ -84,13 +123,18 @@ class Proposal:
 
     def notes(self) -> Iterator[str]:
         """What the user has to decide before the task is useful."""
-        yield 'the reward is "0": say what there is to learn'
+        goal, ends = self._goal, " to ".join(f"{end:g}" for end in _ends_of_setpoint(self._goal))
+        yield f"the reward is a guess: {goal.name!r} is to follow a set point from {ends}"
+        for variable in self._others:
+            yield f"input {variable.name!r} looks like a disturbance: no action writes it"
         for variable in filter(needs_bounds, self._actions):
             yield (
                 f"the FMU gives no limits of input {variable.name!r}: those in the file are a guess"
             )
         if not self._skeleton.has_step_size:
             yield "the FMU gives no step size that fits its default experiment; check 'time_step'"
+        if not self._skeleton.has_duration:
+            yield "the FMU does not say how long it takes: 'episode_length' is a guess"
         if self._skeleton.left_out:
             yield f"{self._skeleton.left_out} parameters are left out; 'fmugym info' lists them"
         for obstacle in self._fmu.obstacles:
@@ -105,11 +149,14 @@ class Proposal:
             step=repr(skeleton.time_step),
             note="" if skeleton.has_step_size else "; TODO: the FMU gives none that fits",
             length=repr(self._length()),
-            output=self._aliases[skeleton.outputs[0].name],
+            note_of_length="" if skeleton.has_duration else "; TODO: a guess",
+            goal=self._aliases[self._goal.name],
+            setpoint=self._setpoint,
         )
         return "\n".join(
             [
-                *(head, *self._variables(), *self._results(), "", *self._agent(), ""),
+                *(head, *self._variables(), *self._results(), "", *self._setpoints(), ""),
+                *(*self._agent(), "", *self._controllers(), ""),
                 *(*self._parameters(), *self._config(), ""),
             ]
         )
@@ -159,14 +206,39 @@ class Proposal:
 
     def _agent(self) -> Iterator[str]:
         yield "[agent]"
-        yield from self._listing("actions", self._actions)
-        yield from self._listing("observations", self._skeleton.outputs)
+        others = [
+            f"    # {_quoted(v.name)} looks like a disturbance: [data]?" for v in self._others
+        ]
+        yield from self._listing("actions", self._actions, others)
+        seen = f'    "{self._setpoint}",  # what {self._aliases[self._goal.name]} is to follow'
+        yield from self._listing("observations", self._skeleton.outputs, [seen])
 
-    def _listing(self, key: str, variables: list[Variable]) -> Iterator[str]:
+    def _listing(self, key: str, variables: list[Variable], more: list[str]) -> Iterator[str]:
         yield f"{key} = ["
         for variable in variables:
             yield f'    "{self._aliases[variable.name]}",{remark(variable)}'
-        yield "]"
+        yield from [*more, "]"]
+
+    def _setpoints(self) -> Iterator[str]:
+        low, high = _ends_of_setpoint(self._goal)
+        drawn = f'{{ distribution = "uniform", low = {low!r}, high = {high!r} }}'
+        unit = f" [{plain(self._goal.unit)}]" if self._goal.unit else ""
+        yield "[setpoints]"
+        yield f"{self._setpoint} = {drawn}  # TODO: a guess{unit}; a number, if it is constant"
+
+    def _controllers(self) -> Iterator[str]:
+        """PI controllers of a single action, with both signs."""
+        yield "[controllers]"
+        if len(self._actions) > 1:
+            yield "# None: each gives one action, but there are several."
+            return
+        (action,), of = self._actions, self._aliases[self._goal.name]
+        gain = np.ptp(guessed_bounds(action)) / (np.ptp(_ends_of_setpoint(self._goal)) or 1.0)
+        times = self._skeleton.time_step, self._length()
+        yield f"# Guesses: the first one if more of the action raises {of}, or else the second."
+        for name, sign in (("pi", ""), ("pi_reversed", "-")):
+            text = guessed_controller(of, self._setpoint, float(gain), times, sign)
+            yield f"{name} = {_quoted(text)}"
 
     def _parameters(self) -> Iterator[str]:
         """Parameters as comments: a task need not set any."""
@@ -200,7 +272,40 @@ def preload_line(paths: Sequence[str]) -> str:
 def _is_result(variable: Variable) -> bool:
     """Whether a local looks like something that a model is made to compute."""
     is_local = variable.causality == "local" and variable.variability == "continuous"
-    return is_local and variable.numeric and variable.unit in _UNITS_OF_RESULTS
+    return is_local and variable.numeric and variable.unit in _TEMPERATURES | _POWERS
+
+
+def _words(variable: Variable) -> str:
+    """The name, the unit and the description of a variable."""
+    name = re.sub(r"[\W_]+", " ", variable.name)
+    return f"{name} [{variable.unit or ''}] {variable.description}"
+
+
+def _is_outside(variable: Variable) -> bool:
+    """Whether an input looks like weather, a load or people."""
+    return _OUTSIDE.search(_words(variable)) is not None
+
+
+def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
+    """What speaks against an output as what is to be controlled, the strongest doubt first."""
+    return (
+        variable.kind != "real",
+        variable.unit not in _TEMPERATURES,
+        _is_outside(variable),
+        _GOAL.search(_words(variable)) is None,
+        variable.unit in _POWERS,
+    )
+
+
+def _ends_of_setpoint(variable: Variable) -> tuple[float, float]:
+    """The middle of the range of an output, or values near its start or nominal value."""
+    low, high = variable.limits
+    if math.isfinite(high - low):
+        return low + (high - low) / 4, high - (high - low) / 4
+    start = variable.nominal if variable.start is None else start_value(variable)
+    middle = float(start) if isinstance(start, int | float) else 0.0
+    down, up = reach(variable) if variable.unit not in _TEMPERATURES else (_DEGREES, _DEGREES)
+    return max(middle - down, low), min(middle + up, high)
 
 
 def _free_alias(name: str, taken: set[str]) -> str:

@@ -21,7 +21,7 @@ from fmugym.errors import ConfigError
 from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value
 
-__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
+__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "reach", "remark"]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -240,8 +240,7 @@ class Skeleton:
     @property
     def episode_steps(self) -> int:
         """As many steps as the default experiment has, unless that is no episode."""
-        steps = self._duration / self.time_step
-        return round(steps) if 1 <= steps <= MOST_STEPS else 200
+        return round(self._duration / self.time_step) if self.has_duration else 200
 
     @property
     def _duration(self) -> float:
@@ -249,6 +248,11 @@ class Skeleton:
         description = self._description
         seconds = 0.0 if description.stop_time is None else description.stop_time
         return max(seconds - description.start_time, 0.0) if seconds else 0.0
+
+    @property
+    def has_duration(self) -> bool:
+        """Whether an episode takes as long as the FMU's default experiment."""
+        return 1 <= self._duration / self.time_step <= MOST_STEPS
 
     @property
     def has_step_size(self) -> bool:
@@ -297,7 +301,7 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
     A model often fails far away from its start value.
     """
     low, high = variable.limits
-    down, up = _reach(variable)
+    down, up = reach(variable)
     start = _start(variable)
     if not math.isfinite(low):
         low = min(start, high) - down
@@ -311,7 +315,7 @@ def _start(variable: Variable) -> float:
     return float(value) if isinstance(value, int | float) else 0.0
 
 
-def _reach(variable: Variable) -> tuple[float, float]:
+def reach(variable: Variable) -> tuple[float, float]:
     """How far below and above its start value an input without limits may move.
 
     A tenth of a start value, and at most the nominal value. Without both, nothing is known; a model

@@ -37,7 +37,7 @@ def maker_of(
         scenario: A scenario of the task file; None for any episodes.
         master: Of a system, in the place of what its archive or task says.
         takes_fmu: Whether the path of an FMU or an SSP archive will do, too. It stands for the task
-            that ``fmugym new`` proposes, whose reward is 0: nothing can be learned or judged in it.
+            that ``fmugym new`` proposes, whose reward is a guess that somebody has to look at.
 
     Returns:
         A function that makes the environment. It takes arguments of the environment, and
@@ -53,8 +53,8 @@ def maker_of(
     if path.suffix.lower() in _MODELS:
         if path.is_file() and not takes_fmu:
             raise ConfigError(
-                f"{shown(target)} has no reward, so that nothing can be played for: "
-                f"'fmugym new {path.name} --output task.toml' writes a task file to say one in"
+                f"{shown(target)} does not say what there is to learn: "
+                f"'fmugym new {path.name} --output task.toml' writes a task file with a guess"
             )
         task = Task.from_dict(tomllib.loads(Proposal(open_model(path)).text()))
         return partial(load, task, **own)

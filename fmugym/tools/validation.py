@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -25,8 +25,9 @@ from fmugym.series.choice import quantities_of
 from fmugym.systems.fmu import SystemFMU
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
-from fmugym.tools.advice import Advice, Doubt, advise
+from fmugym.tools.advice import Advice, Doubt, advise, rounded_down
 from fmugym.tools.findings import Finding, Report
+from fmugym.tools.response import advise_episodes
 from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
 
@@ -45,6 +46,12 @@ _FEWEST_ENVS: Final = 8
 
 _WIDE: Final = 100.0
 """An observation that is larger by this factor than another one hides it from most networks."""
+
+_TINY: Final = 1e-5
+"""Algorithms with gradients take smaller rewards for noise."""
+
+_EXPLORED: Final = (0.1, 10.0)
+"""Between these sizes are actions that they find by steps of about 1."""
 
 _UNEVEN: Final = "of very different sizes"
 """How the finding about such observations begins, for which ``normalize`` is recommended."""
@@ -89,19 +96,22 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         }
         hooks = _hooks(make_env)
         recommended = _recommended(env, first.step_time, hooks, findings)
-        reset_method, replay = env.reset_method, Replay.of(env)
+        reset_method, replay, steps = env.reset_method, Replay.of(env), env.config.max_episode_steps
         others = tuple(_other_advices(env, recommended))
     finally:
         env.close()
-    return _advised(Report(findings, costs, hooks, reset_method, recommended, others), replay)
+    report = Report(findings, costs, hooks, reset_method, recommended, others)
+    return _advised(report, replay, steps)
 
 
-def _advised(report: Report, replay: Replay) -> Report:
+def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
     """Add what repetitions of an episode tell."""
     found = list(advise(replay))
+    if steps is not None and not any(getattr(one, "key", "") == "time_step" for one in found):
+        found += advise_episodes(replay, steps)
     advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
     doubts = (one for one in found if isinstance(one, Doubt))
-    findings = (Finding("warning", "accuracy", one.text, one.cure) for one in doubts)
+    findings = (Finding("warning", one.check, one.text, one.cure) for one in doubts)
     recommended = {**report.recommended, **{one.key: one.value for one in advices}}
     return replace(
         report,
@@ -121,6 +131,12 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
     """Lines for what other checks have found."""
     if recommended.get("normalize") and _has_limits(env.observation_space):
         yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
+    space = env.action_space
+    if isinstance(space, spaces.Box) and isinstance(getattr(env, "task", None), Task):
+        size = float(np.abs([space.low, space.high]).max())
+        if not _EXPLORED[0] <= size <= _EXPLORED[1]:
+            why = f"actions reach {size:.3g}, but --algorithm explores by steps of about 1"
+            yield Advice("agent", "rescale", True, why)
     if "isolation" in recommended:
         yield Advice("config", "isolation", "process", "instances disturb each other, or crash")
 
@@ -193,10 +209,14 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_faults(first)
     yield from _of_components(env.fmu)
     yield _of_repetition(env, first)
-    yield from _of_actions(env)
+    pairs = {
+        name: [_play(env, _always(value)) for value in ends]
+        for name, *ends in _extremes(env.action_space, env._interface.input_names)
+    }
+    yield from _of_actions(env, pairs)
     yield from _of_parameters(env)
     yield from _of_inputs(env)
-    yield _of_reward(first)
+    yield _of_reward([first, *(episode for pair in pairs.values() for episode in pair)])
     yield from _of_observations(env, first)
     yield _of_length(env)
     yield _of_export(env)
@@ -244,14 +264,10 @@ def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
     )
 
 
-def _of_actions(env: FMUEnv) -> Iterator[Finding]:
+def _of_actions(env: FMUEnv, pairs: Mapping[str, Sequence[_Episode]]) -> Iterator[Finding]:
     """Compare episodes in which one action is at its lowest and its highest value."""
-    space = env.action_space
-    useless = []
-    for name, low, high in _extremes(space, env._interface.input_names):
-        episodes = [_play(env, _always(value)) for value in (low, high)]
-        if not _differ(*episodes):
-            useless.append(name)
+    useless = [name for name, pair in pairs.items() if not _differ(*pair)]
+    unseen = [name for name, pair in pairs.items() if name not in useless and _look_same(*pair)]
     if useless:
         yield Finding(
             "warning",
@@ -259,7 +275,14 @@ def _of_actions(env: FMUEnv) -> Iterator[Finding]:
             f"no effect on observations or reward: {', '.join(useless)}",
             "leave them out, or observe what they change",
         )
-    elif _is_simple(space):
+    if unseen:
+        yield Finding(
+            "warning",
+            "actions",
+            f"no effect on observations: {', '.join(unseen)}",
+            "name what they change in observations under [agent]",
+        )
+    if _is_simple(env.action_space) and not useless and not unseen:
         yield Finding("ok", "actions", "each action has an effect")
 
 
@@ -293,9 +316,12 @@ def _always(action: Any) -> Callable[[], Any]:
     return lambda: action
 
 
+def _look_same(first: _Episode, second: _Episode) -> bool:
+    return np.array_equal(first.observations, second.observations)
+
+
 def _differ(first: _Episode, second: _Episode) -> bool:
-    same = np.array_equal(first.observations, second.observations)
-    return not same or not np.array_equal(first.rewards, second.rewards)
+    return not (_look_same(first, second) and np.array_equal(first.rewards, second.rewards))
 
 
 def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
@@ -375,16 +401,21 @@ def _middle(space: Any) -> Any:
     return space.sample()
 
 
-def _of_reward(first: _Episode) -> Finding:
-    if len(np.unique(first.rewards)) > 1:
-        low, high = first.rewards.min(), first.rewards.max()
+def _of_reward(episodes: Sequence[_Episode]) -> Finding:
+    rewards, fault = episodes[0].rewards, episodes[0].fault
+    low, high = rewards.min(), rewards.max()
+    if low == high:
+        text = f"always {low:g} with random actions"
+        cure = "an agent learns from differences; that is fine only if episodes end early"
+    elif fault is None and all(np.array_equal(rewards, one.rewards) for one in episodes[1:]):
+        text = "the same whatever the actions"
+        cure = "name what the actions change in reward"
+    elif max(-low, high) < _TINY:
+        text = f"from {low:.4g} to {high:.4g} with random actions"
+        cure = f"multiply it by {rounded_down(1 / max(-low, high)):g}; only --algorithm minds"
+    else:
         return Finding("ok", "reward", f"from {low:.4g} to {high:.4g} with random actions")
-    return Finding(
-        "warning",
-        "reward",
-        f"always {first.rewards[0]:g} with random actions",
-        "an agent learns from differences; that is fine only if episodes end early",
-    )
+    return Finding("warning", "reward", text, cure)
 
 
 def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:

@@ -1,0 +1,129 @@
+"""The tasks that ``fmugym new`` proposes: what they guess, and that they can be learned."""
+
+import json
+
+import pytest
+import test_cli
+from fmu_tools import probe_fmu
+from makers import MADE
+from test_cli import INPUT, OUTPUT, variable
+
+import fmugym
+from fmugym.archive.bundled import BUNDLED
+from fmugym.tools.cli import main
+
+make_fmu = test_cli.make_fmu
+
+
+def proposed(capsys, fmu):
+    """The task and the notes."""
+    assert main(["new", str(fmu), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    return told["task"], "\n".join(told["notes"])
+
+
+@pytest.fixture
+def new(capsys):
+    return lambda fmu: proposed(capsys, fmu)
+
+
+def trained(folder, capsys, fmu, candidates=4):
+    """The facts of the agent that a newcomer gets by two commands."""
+    path, agent = folder / "task.toml", folder / "agent"
+    assert main(["new", str(fmu), "--output", str(path)]) == 0
+    options = "--rounds", "30", "--candidates", str(candidates), "--episodes", "2"
+    code = main(["train", str(path), "--output", str(agent), *options])
+    assert code == 0, capsys.readouterr().err
+    return json.loads((agent / "agent.json").read_text())
+
+
+@pytest.mark.parametrize("maker", MADE)
+def test_foreign_fmus_train_without_editing(maker, tmp_path, capsys):
+    (tmp_path / "made").mkdir()
+    facts = trained(tmp_path, capsys, MADE[maker].build(tmp_path / "made"))
+    assert facts["rounds"] == 30
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_types_of_every_kind_train_without_editing(version, tmp_path, capsys):
+    assert trained(tmp_path, capsys, probe_fmu(tmp_path, version))["rounds"] == 30
+
+
+@pytest.mark.parametrize("model", sorted({model for model, _ in BUNDLED}))
+def test_bundled_fmus_train_without_editing(model, tmp_path, capsys):
+    assert trained(tmp_path, capsys, fmugym.bundled_fmu(model))["rounds"] == 30
+
+
+def test_weather_and_people_are_no_actions(new):
+    task, notes = new(fmugym.bundled_fmu("House"))
+    assert task["agent"]["actions"] == ["u"]
+    assert all(f"input {name!r} looks like" in notes for name in ("T_out", "I_sol", "Q_int"))
+
+
+def test_an_output_follows_a_set_point_that_the_agent_sees(new):
+    task, notes = new(fmugym.bundled_fmu("House"))
+    assert task["reward"] == "-abs(T_air - T_air_set)"
+    assert "T_air_set" in task["agent"]["observations"]
+    drawn = task["setpoints"]["T_air_set"]
+    assert (drawn["low"], drawn["high"]) == (295.0, 305.0)  # 5 K around the nominal value
+    assert "the reward is a guess: 'T_air'" in notes
+
+
+def test_a_controller_of_one_action_has_both_signs(new):
+    one, _ = new(fmugym.bundled_fmu("CartPole"))
+    starts = [text.split("ti=")[0] for text in one["controllers"].values()]
+    assert starts == [
+        "pid of=x setpoint=x_set kp=10..1e+05 ",
+        "pid of=x setpoint=x_set kp=-1e+05..-10 ",
+    ]
+    two, _ = new(fmugym.bundled_fmu("DoublePendulum"))
+    assert two["controllers"] == {}
+
+
+@pytest.mark.parametrize(
+    ("inner", "low", "high"),
+    [
+        ('<Real min="0" max="8"/>', 2.0, 6.0),
+        ('<Real start="5"/>', 4.5, 5.5),
+        ('<Real start="5" max="5.2"/>', 4.5, 5.2),
+        ('<Real start="293.15" unit="K" min="0"/>', 288.15, 298.15),
+        ('<Real nominal="300" unit="K" min="0"/>', 295.0, 305.0),
+        ("<Real/>", 0.0, 1.0),
+        ("<Boolean/>", 0.0, 1.0),
+    ],
+)
+def test_a_set_point_is_near_to_what_is_known(inner, low, high, make_fmu, new):
+    start = "exact" if "start" in inner else "calculated"
+    output = variable("y", inner, "output", initial=start)
+    task, _ = new(make_fmu(INPUT, output))
+    assert (task["setpoints"]["y_set"]["low"], task["setpoints"]["y_set"]["high"]) == (low, high)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "goal"),
+    [
+        ([("P", "W", "power"), ("T_room", "K", "")], "T_room"),
+        ([("i", "A", "current"), ("w", "rad/s", "")], "w"),
+        ([("flow", "kg/s", ""), ("h", "", "Level of the tank")], "h"),
+        ([("T_amb", "K", ""), ("T_room", "K", "")], "T_room"),
+        ([("a", "", ""), ("b", "", "")], "a"),
+    ],
+)
+def test_names_and_units_tell_what_is_controlled(outputs, goal, make_fmu, new):
+    made = [
+        variable(name, f'<Real unit="{unit}"/>', "output", initial="calculated", description=text)
+        for name, unit, text in outputs
+    ]
+    assert new(make_fmu(INPUT, *made))[0]["reward"] == f"-abs({goal} - {goal}_set)"
+
+
+def test_a_length_that_nobody_gives_is_a_guess(make_fmu, new):
+    _, notes = new(make_fmu(INPUT, OUTPUT))
+    assert "'episode_length' is a guess" in notes
+    assert "episode_length" not in new(fmugym.bundled_fmu("CartPole"))[1]
+
+
+def test_guesses_are_marked_in_the_file(capsys):
+    assert main(["new", str(fmugym.bundled_fmu("House"))]) == 0
+    marked = [line for line in capsys.readouterr().out.splitlines() if "TODO: a guess" in line]
+    assert [line.split(" =")[0] for line in marked] == ["reward", "T_air_set"]
