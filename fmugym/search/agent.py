@@ -15,6 +15,7 @@ from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.base import FloatArray
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.policy import CONSTANT, Form, Policy
+from fmugym.signals import ordinary
 
 __all__ = ["AGENT", "Agent"]
 
@@ -101,7 +102,7 @@ class Agent:
             return cls(
                 *told, numbers[0], tuple(numbers[1:]), tuple(facts["names"]), facts["actions"]
             )
-        except Exception as error:  # a damaged file may raise anything
+        except ordinary(Exception) as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"the agent in {shown(str(folder))} cannot be read: {reason(error)}"
             ) from None

@@ -20,8 +20,9 @@ from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import imported
+from fmugym.search.agent import AGENT, Agent
 from fmugym.signals import ordinary
-from fmugym.tools.simulation import Player, Policy
+from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
 __all__ = [
     "FACTS",

@@ -23,6 +23,7 @@ from fmugym.search.entrants import NO_MERIT
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.probe import Probe
 from fmugym.search.search import EPISODES, POPULATION, Search
+from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
 from fmugym.tools.diary import EVALUATIONS
 from fmugym.tools.judging import Verdict, judge
@@ -336,7 +337,7 @@ def _resumed(folder: Path) -> _Course:
         course = pickle.loads((folder / STATE).read_bytes())
     except FileNotFoundError:
         raise ConfigError(f"{shown(str(folder))} has no search to resume") from None
-    except Exception as error:  # a damaged file may raise anything
+    except ordinary(Exception) as error:  # a damaged file may raise anything
         raise ConfigError(
             f"the search in {shown(str(folder))} cannot be resumed: {reason(error)}"
         ) from None
