@@ -17,7 +17,7 @@ from fmugym.search.flattening import require_numbers, rows_of
 from fmugym.search.policy import Policy
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Probe"]
+__all__ = ["Probe", "document_of"]
 
 _ENVS: Final = 8
 _QUICK: Final = 2e-3
@@ -76,7 +76,7 @@ class Probe:
             limit = env.spec.max_episode_steps if env.spec is not None else None
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
-            document = env.task.document if hasattr(env, "task") else {}
+            document = document_of(env)
         with closing(FMUVectorEnv(make_env, min(envs, _ENVS))) as many:
             is_same, seconds, only_reward = _steps(many)
         if seconds < _QUICK:
@@ -103,6 +103,11 @@ class Probe:
     def round_time(self, candidates: int, episodes: int) -> float:
         """About how many seconds a round takes."""
         return self.seconds * self.most_steps * candidates * episodes
+
+
+def document_of(env: Any) -> Mapping[str, Any]:
+    """What the task of an environment declares; empty if it is no declared one."""
+    return env.task.document if hasattr(env, "task") else {}
 
 
 def _steps(envs: FMUVectorEnv) -> tuple[bool, float, float | None]:
