@@ -4,7 +4,7 @@ The agent runs the heat pump of the house and charges the battery. The sun shine
 noon, electricity is dear in the evening. Cross-entropy search finds a linear policy in seconds; a
 thermostat that leaves the battery alone is the measure.
 
-    pip install 'fmugym-toolbox[examples]' pythonfmu
+    pip install '.[examples]' pythonfmu
     python examples/train_system.py --folder results
 
 writes the FMUs, the system as an SSP archive and as a picture, and the learning curve.

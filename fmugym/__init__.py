@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fmugym.recording import Recorder, Recording, replay
     from fmugym.systems import Component, Connection, FMUSystem
     from fmugym.task.snapshot import Snapshot
+    from fmugym.tools.agents import load_agent
     from fmugym.vector import FMUVectorEnv
     from fmugym.vector.sensitivities import derivatives
     from fmugym.vector.trajectories import linearize_along
@@ -78,6 +79,7 @@ __all__ = [
     "linearize",
     "linearize_along",
     "load",
+    "load_agent",
     "register",
     "replay",
 ]
@@ -102,6 +104,7 @@ _MODULES = {
     "recording": ["Recorder", "Recording", "replay"],
     "systems": ["Component", "Connection", "FMUSystem"],
     "task.snapshot": ["Snapshot"],
+    "tools.agents": ["load_agent"],
     "linearization": ["LinearModel", "linearize"],
     "vector": ["FMUVectorEnv"],
     "vector.sensitivities": ["derivatives"],

@@ -17,6 +17,7 @@ def main() -> int:
     """
     try:
         end_as_after_ctrl_c()
+        sys.path.append("")  # module:Class may be in the working directory
         from fmugym.tools import cli
 
         return cli.main()

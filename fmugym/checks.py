@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.errors import ConfigError, shown, unknown_argument, unknown_name
+from fmugym.errors import ArgumentError, ConfigError, shown, unknown_argument, unknown_name
 
 __all__ = [
     "LARGEST_COUNT",
@@ -28,6 +28,7 @@ __all__ = [
     "check_flag",
     "check_integer",
     "check_mapping",
+    "check_misplaced",
     "check_number",
     "check_option",
     "check_path",
@@ -172,6 +173,16 @@ def check_integer(what: str, value: Any, minimum: int, maximum: int) -> int:
             f"{what} must be an integer from {minimum} to {maximum}, got {shown(value)}"
         )
     return number
+
+
+def check_misplaced(given: tuple[object, ...]) -> None:
+    """Refuse arguments of ``reset`` that are given without their names.
+
+    Raises:
+        ArgumentError: If there are some.
+    """
+    if given:
+        raise ArgumentError(f"reset takes its arguments by name: reset(seed={shown(given[0])})")
 
 
 def check_seed(value: Any) -> int | None:

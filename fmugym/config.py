@@ -103,8 +103,8 @@ class EnvConfig:
             episodes still begin as they should.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
-        preload: Shared libraries to load before the FMU's; a relative path is relative to the
-            class's file.
+        preload: Shared libraries to load before the FMU's; a relative path is relative to the file
+            of the class or of the task.
         probe_timeout: Seconds of real time that a call of an unknown FMU may take in its trial in a
             process of its own. An initialization may take ten times as long. None to skip the
             trial.
@@ -225,7 +225,7 @@ class EnvConfig:
             raise ConfigError(
                 f"keep_initial_states must be True or False, got {shown(self.keep_initial_states)}"
             )
-        if isinstance(self.archive_limits, Mapping):
+        if self.archive_limits is not None:
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()
 
@@ -386,8 +386,12 @@ def _number(what: str, value: Any, *, may_be_boolean: bool = False) -> Any:
     return check_number(what, value, may_be_boolean=may_be_boolean)
 
 
-def _archive_limits(limits: Mapping[str, Any]) -> ArchiveLimits:
+def _archive_limits(limits: Any) -> ArchiveLimits:
+    if isinstance(limits, ArchiveLimits):
+        return limits
     known = [f.name for f in fields(ArchiveLimits)]
+    if not isinstance(limits, Mapping):
+        raise ConfigError(f"archive_limits must be ArchiveLimits or a dict, got {shown(limits)}")
     items = check_mapping("archive_limits", limits)
     for name in items:
         if name not in known:

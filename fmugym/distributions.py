@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
@@ -326,7 +326,9 @@ def as_distribution(what: str, value: Any) -> Any:
     try:
         return kind(**arguments)
     except TypeError:
-        raise ConfigError(f"{what}: {kind.__name__} needs more than {sorted(arguments)}") from None
+        missing = [one.name for one in fields(kind) if one.default is MISSING]
+        needed = ", ".join(repr(name) for name in missing if name not in arguments)
+        raise ConfigError(f"{what}: {kind.__name__} needs {needed}, too") from None
 
 
 def is_distribution(value: object) -> bool:

@@ -14,9 +14,16 @@ import numpy as np
 from gymnasium import logger as gymnasium_logger
 
 from fmugym.archive.texts import text_of
-from fmugym.checks import check_option, check_seed
+from fmugym.checks import check_misplaced, check_option, check_seed
 from fmugym.config import EnvConfig
-from fmugym.errors import ConfigError, FMUGymError, SimulationError, shown, unknown_argument
+from fmugym.errors import (
+    ConfigError,
+    FMUGymError,
+    SimulationError,
+    shortened,
+    shown,
+    unknown_argument,
+)
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool import Pool
 from fmugym.pool.health import fault_rates
@@ -160,8 +167,20 @@ class FMUEnv(Constructed):
 
     # Gymnasium's interface.
 
+    def __repr__(self) -> str:
+        if "_spec" not in vars(self):  # the constructor has not come that far
+            return object.__repr__(self)
+        inputs, outputs = self.config.model_input_names, self.config.model_output_names
+        return (
+            f"<{type(self).__name__} of {self.fmu.path.name}: {shortened(inputs)} -> "
+            f"{shortened(outputs)} every {self._spec.time_step:g} s>"
+        )
+
     def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+        self,
+        *misplaced: object,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Start a new episode with the FMU instance at hand.
 
@@ -170,6 +189,7 @@ class FMUEnv(Constructed):
         episode variables.
 
         Args:
+            misplaced: None: the others are given by name.
             seed: Seeds the generator, an integer of at least 0; None goes on with the generator.
             options: ``{"model_parameters": {name: value or distribution}}`` overrides parameters
                 for this episode; an environment may take more, see its ``reset_options``.
@@ -183,6 +203,7 @@ class FMUEnv(Constructed):
             SimulationError: If the FMU cannot be initialized, the first observation is not finite,
                 or the environment is closed.
         """
+        check_misplaced(misplaced)
         pool = self._open_pool("reset")
         if not self._was_reset:
             self._prepare_hooks()  # the constructor of the class may have set some as attributes

@@ -36,6 +36,7 @@ __all__ = [
     "nearest_name",
     "printable",
     "reason",
+    "shortened",
     "shown",
     "unknown_argument",
     "unknown_name",
@@ -135,6 +136,12 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
+def shortened(names: Sequence[str], most: int = 6) -> str:
+    """Return names as text; the first of many, and how many there are."""
+    more = f", ... ({len(names)} in all)" if len(names) > most else ""
+    return printable(", ".join(names[:most]) + more) or "nothing"
+
+
 def reason(error: Exception) -> str:
     """Return the text of an error of another library, which may quote any amount of a file."""
     text = str(error)
@@ -175,7 +182,7 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentErr
 
 def _in_order(names: Iterable[str]) -> list[str]:
     """The names as a list; sets have another order in each process."""
-    return sorted(names) if isinstance(names, set | frozenset) else list(names)
+    return sorted(names) if isinstance(names, set | frozenset) else list(dict.fromkeys(names))
 
 
 def nearest_name(name: object, known: Sequence[str]) -> str | None:

@@ -43,5 +43,6 @@ def scipy_module(name: str) -> Any:
         return import_module(f"scipy.{name}")
     except ImportError:
         raise ImportError(
-            'this needs SciPy: pip install "fmugym-toolbox[identification]"'
+            "this needs SciPy, which cannot be imported; install the extra 'identification'; in a "
+            "clone of fmugym: pip install '.[identification]'"
         ) from None

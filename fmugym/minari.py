@@ -18,6 +18,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array,
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.extras import lacking
 from fmugym.recording import FACTS, Recording, element_from, flat_element
 from fmugym.task.snapshot import require_scope
 
@@ -25,10 +26,7 @@ try:
     import minari
     from minari.data_collector import EpisodeBuffer
 except ImportError as error:
-    raise ImportError(
-        "fmugym.minari needs Minari, which cannot be imported; install the extra 'minari', for "
-        "example with: pip install 'fmugym-toolbox[minari]'"
-    ) from error
+    raise ImportError(lacking("fmugym.minari", "Minari", "minari"), name=error.name) from error
 
 __all__ = ["read_dataset", "write_dataset"]
 

@@ -17,14 +17,14 @@ from fmugym.checks import check_mapping, check_text
 from fmugym.declared import TaskEnv
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.extras import lacking
 from fmugym.systems.description import SystemDescription
 
 try:
     from pettingzoo import ParallelEnv
 except ImportError as error:
     raise ImportError(
-        "fmugym.pettingzoo needs PettingZoo, which cannot be imported; install the extra "
-        "'pettingzoo', for example with: pip install 'fmugym-toolbox[pettingzoo]'"
+        lacking("fmugym.pettingzoo", "PettingZoo", "pettingzoo"), name=error.name
     ) from error
 
 __all__ = ["Agent", "FMUParallelEnv"]

@@ -24,16 +24,14 @@ from fmugym.checks import check_text
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.extras import lacking
 from fmugym.vector.libraries import make_vector_env
 
 try:
     import ray
     from ray.tune.registry import register_env
 except ImportError as error:
-    raise ImportError(
-        "fmugym.rllib needs RLlib, which cannot be imported; install the extra 'rllib', for "
-        "example with: pip install 'fmugym-toolbox[rllib]'"
-    ) from error
+    raise ImportError(lacking("fmugym.rllib", "RLlib", "rllib"), name=error.name) from error
 
 __all__ = ["RunnerVectorEnv", "register_task"]
 

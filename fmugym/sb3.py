@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorWrapper
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.extras import lacking
 from fmugym.pool.base import MaskArray
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
@@ -25,10 +26,7 @@ from fmugym.vector.libraries import make_vector_env
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 except ImportError as error:
-    raise ImportError(
-        "fmugym.sb3 needs Stable-Baselines3, which cannot be imported; install the extra 'sb3', "
-        "for example with: pip install 'fmugym-toolbox[sb3]'"
-    ) from error
+    raise ImportError(lacking("fmugym.sb3", "Stable-Baselines3", "sb3"), name=error.name) from error
 
 __all__ = ["FMUVecEnv", "make_sb3_env"]
 

@@ -16,6 +16,7 @@ from gymnasium.vector import AutoresetMode
 from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
+from fmugym.extras import lacking
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.libraries import make_vector_env
 
@@ -33,10 +34,7 @@ try:
     )
     from torchrl.envs import EnvBase
 except ImportError as error:
-    raise ImportError(
-        "fmugym.torchrl needs TorchRL, which cannot be imported; install the extra 'torchrl', "
-        "for example with: pip install 'fmugym-toolbox[torchrl]'"
-    ) from error
+    raise ImportError(lacking("fmugym.torchrl", "TorchRL", "torchrl"), name=error.name) from error
 
 __all__ = ["FMUTorchEnv", "make_torchrl_env"]
 

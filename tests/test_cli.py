@@ -1,10 +1,13 @@
 """The command line: what it says of FMUs, and that the skeletons it writes run."""
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 import zlib
 
@@ -12,11 +15,12 @@ import makers
 import pytest
 import quirk_table
 import zoo_tools
-from fmu_tools import library_name, probe_fmu, read_fmu
+from fmu_tools import HERE, library_name, probe_fmu, read_fmu
 
 import fmugym
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 from fmugym.tools.cli import main
+from fmugym.tools.options import EXAMPLES
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">
@@ -39,6 +43,7 @@ def variable(name, inner, causality="input", variability="continuous", **attribu
     return f"<ScalarVariable {listing}>{inner}</ScalarVariable>"
 
 
+PROGRAM = "import sys; from fmugym.__main__ import main; sys.exit(main())"
 INPUT = variable("u", '<Real start="0"/>')
 OUTPUT = variable("y", "<Real/>", "output", initial="calculated")
 
@@ -382,6 +387,30 @@ class TestSkeleton:
         assert "DecayEnv keeps the contract" in done.stdout, done.stderr
 
 
+class TestNew:
+    def test_what_it_leaves_out_is_counted(self, make_fmu, capsys):
+        rows = [parameter(f"p{n}", f'<Real start="{n}"/>') for n in range(47)]
+        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
+        made = capsys.readouterr()
+        assert [f"# p{n} = {n}.0" in made.out for n in (39, 40)] == [True, False]
+        assert "# 7 more are listed by: fmugym info" in made.out
+        assert "7 parameters are left out; 'fmugym info' lists them" in made.err
+
+    def test_locals_that_look_like_results_are_listed(self, make_fmu, capsys):
+        """As comments: each is a line of [variables] once its # is gone."""
+        real = '<Real unit="{}"/>'
+        wanted = {"room.T[1]": "degC", "P": "W", "E.total": "kWh"}
+        rows = [variable(name, real.format(unit), "local") for name, unit in wanted.items()]
+        rows += [variable("room.T_start", real.format("K"), "local", "fixed")]
+        rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
+        assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
+        text = capsys.readouterr().out
+        table = text[text.index("# These locals") :].partition("\n[agent]")[0]
+        table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
+        assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
+        assert tomllib.loads(text)["variables"].keys() == {"u"}
+
+
 def assert_skeleton_runs(path):
     """Write a skeleton beside an FMU and run it."""
     program = path.with_suffix(".py")
@@ -436,6 +465,60 @@ class TestCommand:
         assert caught.value.code == 2
         assert "error" in capsys.readouterr().err
 
+    @pytest.mark.parametrize("name", EXAMPLES)
+    def test_help_has_examples_that_the_documents_run(self, name, capsys):
+        with pytest.raises(SystemExit):
+            main([name, "--help"])
+        said = capsys.readouterr().out
+        pages = " ".join(page.read_text() for page in (HERE.parent / "docs").glob("*.md"))
+        documents = " ".join(pages.replace("\\\n", " ").split())
+        for example in EXAMPLES[name]:
+            assert f"\n  {example}\n" in said
+            assert example.replace("skeleton", "new --class") in documents
+
+    def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, capsys):
+        fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
+        file.write_text("precious")
+        assert main(["new", fmu, "--output", str(file)]) == 1
+        assert (
+            "a.toml exists; name a new file, or replace it with --force" in capsys.readouterr().err
+        )
+        assert main(["new", fmu + "x", "--output", str(file), "--force"]) == 1
+        assert file.read_text() == "precious"
+        assert main(["new", fmu, "--output", str(file), "--force"]) == 0
+        assert "time_step" in file.read_text()
+        assert list(tmp_path.iterdir()) == [file]
+
+    def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, capsys):
+        file = tmp_path / "run.csv"
+        file.write_text("precious")
+        assert main(["simulate", "absent.toml", "--output", str(file)]) == 1
+        assert "run.csv exists" in capsys.readouterr().err
+
+    def test_quiet_leaves_out_notes_and_warnings(self, make_fmu, capsys):
+        fmu = str(make_fmu(INPUT, OUTPUT))
+        for options, notes in (([], True), (["-q"], False)):
+            assert main(["new", fmu, *options]) == 0
+            printed = capsys.readouterr()
+            assert "time_step" in printed.out
+            assert bool(printed.err) is notes
+
+    def test_verbose_shows_the_log_of_this_command_only(self, capsys):
+        before = logging.getLogger("fmugym").handlers[:]
+        arguments = ["simulate", "fmugym/Pendulum-v0", "--steps", "1"]
+        assert main([*arguments, "-v"]) == 0
+        assert logging.getLogger("fmugym").handlers == before
+
+    @pytest.mark.parametrize("program", [["-m", "fmugym"], ["-c", PROGRAM]])
+    def test_classes_in_the_working_directory_are_found(self, tmp_path, program):
+        """The program ``fmugym`` has its own folder in front, not the working directory."""
+        text = "from fmugym.envs import CartPoleEnv\n\n\nclass Drive(CartPoleEnv):\n    pass\n"
+        (tmp_path / "drive.py").write_text(text)
+        command = [sys.executable, "-P" if "-c" in program else "-B", *program]
+        command += ["simulate", "drive:Drive", "--steps", "3"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+        assert "reward 3 in 3 steps" in done.stdout, done.stderr
+
     def test_version(self, capsys):
         with pytest.raises(SystemExit) as caught:
             main(["--version"])
@@ -474,13 +557,3 @@ class TestCommand:
             made = tmp_path / f"made{len(kind)}"
             assert main(["new", str(path), *kind, "--output", str(made)]) == 0
             assert "# Außentemperatur 温度" in made.read_text(encoding="utf-8")
-
-
-def test_a_misspelt_command_names_the_nearest(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["trian", "model.toml"])
-    assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert "'trian'" in said
-    assert "'train'" in said
-    assert "'dataset'" not in said

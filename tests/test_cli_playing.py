@@ -126,7 +126,7 @@ class TestRecord:
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         code, _, err = run(capsys, "record", CART_POLE, "--output", tmp_path / "a.html")
         assert code == 1
-        assert "fmugym-toolbox[plot]" in err
+        assert ".[plot]" in err
 
 
 class TestEvaluate:
@@ -360,7 +360,6 @@ class TestInterruption:
         (["simulate", "FOLDER/plant.tml"], "FOLDER/plant.toml'"),
         (["simulate", "fmugym/Hause-v0"], "'fmugym/House-v0'"),
         (["new", "FOLDER/a.fmu", "--output", "FOLDER/plant.toml"], "plant.toml exists"),
-        (["new", "FOLDER/a.fmu", "--output", "FOLDER/no/b.toml"], "b.toml: No such file"),
     ],
 )
 def test_wrong_names_are_told_without_numbers_of_the_system(arguments, fact, tmp_path, capsys):

@@ -127,7 +127,7 @@ def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "fmugym.sb3", None)
     code, out, err = run(capsys, "train", CART_POLE, "--output", tmp_path / "agent")
     assert (code, out) == (1, "")
-    assert "pip install 'fmugym-toolbox[sb3]'" in err
+    assert "pip install '.[sb3]'" in err
     assert not (tmp_path / "agent").exists()
 
 

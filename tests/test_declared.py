@@ -310,6 +310,20 @@ class TestFiles:
         assert 'fmu = "base/pendulum.fmu"' in (tmp_path / "whole.toml").read_text()
         env.close()
 
+    def test_libraries_to_load_first_are_found_beside_the_file_that_names_them(self, tmp_path):
+        (tmp_path / "base").mkdir()
+        config = '\n[config]\npreload = ["./a.so", "lib/b.so", "libm.so.6"]\n'
+        write(tmp_path / "base", "base.toml", textwrap.dedent(SMALL) + config)
+        task = Task.read(write(tmp_path, "own.toml", 'extends = "base/base.toml"\n'))
+        found = [str(tmp_path / "base" / name) for name in ("a.so", "lib/b.so")] + ["libm.so.6"]
+        assert task.document["config"]["preload"] == found
+        task.write(tmp_path / "base" / "copy.toml")
+        written = tomllib.loads((tmp_path / "base" / "copy.toml").read_text())
+        assert written["config"]["preload"] == ["./a.so", "lib/b.so", "libm.so.6"]
+        assert Task.read(tmp_path / "base" / "copy.toml") == task
+        with pytest.raises(fmugym.FMULoadError, match=re.escape(found[0])):
+            fmugym.load(task)
+
     def test_a_mistake_in_the_extended_file_is_found_there(self, tmp_path):
         write(tmp_path, "base.toml", SMALL.replace('"-abs(q)"', '"-abs(qq)"'))
         path = write(tmp_path, "own.toml", 'extends = "base.toml"\n')
@@ -391,7 +405,7 @@ MISTAKES = {
         "0.02",
     ),
     "tiny step": ('"20ms"', '1e-320\nepisode_length = "1s"', "line 3", "multiple"),
-    "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "math:Pie"),
+    "class": ("[variables]", "class = 'math:Pie'\n[variables]", "line 4", "class of math 'Pie'"),
     "previous of memory": ('"-abs(q)"', '"previous(time)"', "line 3", "'time'"),
     "arguments": ('"-abs(q)"', '"hypot(q)"', "line 3", "2 arguments, got 1"),
     "upper case": ('["tau"]', '["TAU"]', "line 7", "'tau'"),

@@ -11,7 +11,7 @@ PACKAGE = Path(fmugym.__file__).parent
 
 STOREYS = [
     {"errors", "caching", "lazy", "signals", "_native"},
-    {"checks", "extras", "wine"},
+    {"checks", "extras", "figures", "wine"},
     {"archive", "distributions", "rendering"},
     {"systems"},
     {"fmi"},

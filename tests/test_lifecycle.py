@@ -366,15 +366,21 @@ def test_a_library_beside_the_fmu_is_found(tmp_path):
     assert not folder.exists()
 
 
-def test_relative_paths_of_a_class_without_a_file(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "made",
+    [
+        "class Mine(fmugym.FMI2CSEnv):\n    def _is_done(self): return False\n",
+        "Mine = type('Mine', (fmugym.FMI2CSEnv,), {'_is_done': lambda self: False})\n",
+    ],
+)
+def test_relative_paths_of_a_class_without_a_file(made, tmp_path, monkeypatch):
     """As in a notebook, where classes have no file: the working directory counts."""
     probe_fmu(tmp_path, 2)
     monkeypatch.chdir(tmp_path)
     out, _ = run(
         "import fmugym\n"
-        "class Mine(fmugym.FMI2CSEnv):\n"
-        "    def _is_done(self): return False\n"
-        "config = {'model_input_names': 'a', 'model_output_names': 'sum', 'time_step': 0.1}\n"
+        + made
+        + "config = {'model_input_names': 'a', 'model_output_names': 'sum', 'time_step': 0.1}\n"
         "env = Mine('Probe.fmu', config)\n"
         "env.reset(); print(env.state); env.close()"
     )

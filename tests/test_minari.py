@@ -24,7 +24,7 @@ def test_without_minari_the_import_names_the_extra():
     command = [sys.executable, "-c", WITHOUT_MINARI]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
-    assert "pip install 'fmugym-toolbox[minari]'" in done.stderr
+    assert "pip install '.[minari]'" in done.stderr
 
 
 minari = pytest.importorskip("minari", reason="needs Minari: the extra minari")

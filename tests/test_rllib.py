@@ -28,7 +28,7 @@ import fmugym.rllib
 def test_without_ray_the_import_names_the_extra():
     done = subprocess.run([sys.executable, "-c", WITHOUT_RAY], capture_output=True, text=True)
     assert done.returncode == 1
-    assert "pip install 'fmugym-toolbox[rllib]'" in done.stderr
+    assert "pip install '.[rllib]'" in done.stderr
 
 
 pytest.importorskip("ray.rllib", reason="needs RLlib: the extra rllib")

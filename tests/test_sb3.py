@@ -28,7 +28,7 @@ import fmugym.sb3
 def test_without_sb3_the_import_names_the_extra():
     done = subprocess.run([sys.executable, "-c", WITHOUT_SB3], capture_output=True, text=True)
     assert done.returncode == 1
-    assert "pip install 'fmugym-toolbox[sb3]'" in done.stderr
+    assert "pip install '.[sb3]'" in done.stderr
 
 
 sb3 = pytest.importorskip("stable_baselines3", reason=WHY)

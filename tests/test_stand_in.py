@@ -6,11 +6,12 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 
 import pytest
 from fmu_tools import HERE, edited_fmu, library_name
 
-from fmugym import FMU, ConfigError
+from fmugym import FMU, ConfigError, Task
 from fmugym.archive.dependencies import missing_libraries
 from fmugym.archive.loader import ask, ask_in_a_child
 from fmugym.archive.packages import source_of
@@ -99,7 +100,8 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
     said = capsys.readouterr().out
     assert "without _gfortran_matmul_r8" in said
     preload = [str(tmp_path / name)]
-    assert f'"preload": {preload}' in said
+    assert f'"preload": {json.dumps(preload)}' in said
+    assert f"preload = {json.dumps(preload)}" in said
     assert FMU(fmu_path, preload=preload).runs_here
     for backend in ("native", "python"):
         assert play(fmu_path, backend, preload=preload) == STEPPED
@@ -116,7 +118,8 @@ def test_what_the_stand_in_lacks_ends_the_trial_with_its_name(fmu_path, tmp_path
     assert "has no function _gfortran_matmul_r8, which the FMU calls" in said
 
 
-def test_info_tells_before_anything_is_loaded(fmu_path, capsys):
+def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))  # nobody has met it
     assert main(["info", str(fmu_path)]) == 0
     (name,) = FMU(fmu_path).missing_libraries
     out = capsys.readouterr().out
@@ -136,6 +139,40 @@ def test_info_tells_before_anything_is_loaded(fmu_path, capsys):
     )
 
 
+def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatch, capsys):
+    """From the FMU to an episode: ``new`` names the library, once it is there in earnest."""
+    (name,) = FMU(fmu_path).missing_libraries
+    task = tmp_path / "task.toml"
+    assert main(["new", str(fmu_path), "--output", str(task)]) == 0
+    assert f"\n[config]\n# The FMU needs this: fmugym stand-in {fmu_path.name}" in task.read_text()
+    assert f'\n# preload = ["./{name}"]' in task.read_text()
+    assert main(["stand-in", str(fmu_path), "--folder", str(tmp_path)]) == 0
+    task.unlink()
+    assert main(["new", str(fmu_path), "--output", str(task)]) == 0
+    assert f'\npreload = ["./{name}"]' in task.read_text()
+    monkeypatch.setenv("FMUGYM_PROBE", "on")
+    assert main(["simulate", str(task), "--steps", "2"]) == 0
+    capsys.readouterr()
+    assert main(["info", str(task)]) == 0
+    said = capsys.readouterr().out
+    assert "linux64: runs here" in said
+    assert "reset is right" in said
+    Task.read(task).write(tmp_path / "copy.toml")
+    assert tomllib.loads((tmp_path / "copy.toml").read_text())["config"]["preload"] == [f"./{name}"]
+
+
+def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, capsys):
+    (name,) = FMU(fmu_path).missing_libraries
+    (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
+    assert play(fmu_path, "native", preload=[str(built.path)]) == STEPPED
+    assert main(["info", str(fmu_path)]) == 0
+    said = capsys.readouterr().out
+    assert "restore is right" in said
+    assert "does NOT run here" not in said
+    assert "has run here, but not like this: Probe.fmu needs" in said
+    assert name in said
+
+
 def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
     fmu_path, probe, tmp_path, capsys
 ):
@@ -153,7 +190,7 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
     (name,) = FMU(fmu_path).missing_libraries
     monkeypatch.chdir(tmp_path)
     assert main(["stand-in", str(fmu_path)]) == 0
-    assert f'"preload": {[str(tmp_path / name)]}' in capsys.readouterr().out
+    assert f'preload = ["{tmp_path / name}"]' in capsys.readouterr().out
     assert main(["stand-in", str(fmu_path), "--folder", "a/b"]) == 0
     assert (tmp_path / "a" / "b" / name).is_file()
     with pytest.raises(ConfigError, match="cannot hold libraries"):

@@ -24,7 +24,7 @@ import fmugym.torchrl
 def test_without_torchrl_the_import_names_the_extra():
     done = subprocess.run([sys.executable, "-c", WITHOUT_TORCHRL], capture_output=True, text=True)
     assert done.returncode == 1
-    assert "pip install 'fmugym-toolbox[torchrl]'" in done.stderr
+    assert "pip install '.[torchrl]'" in done.stderr
 
 
 pytest.importorskip("torchrl", reason="needs TorchRL: the extra torchrl")

@@ -6,6 +6,7 @@ An FMU is native code that runs with all the rights of the process that loads it
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections import Counter
 from pathlib import Path
 
 import fmpy
@@ -41,7 +42,13 @@ class LoadableFMU(ABC):
         self.preload = preload
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({str(self.path)!r})"
+        about = self.description
+        counts = Counter(variable.causality for variable in about.variables.values())
+        told = ", ".join(f"{counts[kind]} {kind}s" for kind in ("input", "output", "parameter"))
+        return (
+            f"{type(self).__name__}({str(self.path)!r}: {about.model_name}, FMI "
+            f"{about.fmi_version}, {told})"
+        )
 
     @property
     def parts(self) -> tuple[LoadableFMU, ...]:

@@ -168,5 +168,5 @@ def _parsed(name: str) -> Any:
         return _pint()[1].Unit(text)
     except Exception as error:  # pint passes on errors of the parsers that it uses
         raise ConfigError(
-            f"{shown(name)} is no unit that is known ({type(error).__name__})"
-        ) from None
+            f"{shown(name)} is no unit that is known; write units as FMI ('W/(m2.K)') or Pint does"
+        ) from error

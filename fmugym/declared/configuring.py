@@ -6,6 +6,7 @@ from dataclasses import fields
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
+from fmugym.checks import check_count
 from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
@@ -17,13 +18,20 @@ from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["bounds_of", "clock_of", "own_config", "samplings_of", "time_step_of", "times_of"]
 
-_OF_SECTIONS: Final = frozenset(
-    {"model_input_names", "model_output_names", "model_parameters", "monitor_names"}
-    | {"samplings"}
-    | {"episode_variables", "bounds", "time_step", "substeps", "max_episode_steps", "warm_up"}
-    | {"start_time", "positive_reward", "negative_reward"}
-)
-"""Keys of a config that other sections of a task determine."""
+_OF_SECTIONS: Final = {
+    **dict.fromkeys(("time_step", "substeps", "warm_up", "start_time"), "it stands above [config]"),
+    "model_input_names": "name the inputs in 'actions' of [agent]",
+    "model_output_names": "name the outputs in 'observations' of [agent]",
+    "model_parameters": "give them in [parameters]",
+    "monitor_names": "a name in an expression is read from the FMU",
+    "samplings": "give variables the key 'sample' in [variables]",
+    "episode_variables": "give them in [memory] or [setpoints]",
+    "bounds": "give variables 'min' and 'max' in [variables]",
+    "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
+    "positive_reward": "give an expression for 'reward'",
+    "negative_reward": "give an expression for 'reward'",
+}
+"""Keys of a config that other sections of a task determine, and how."""
 
 _OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
 
@@ -52,6 +60,9 @@ def own_config(root: Entry) -> dict[str, Any]:
         ConfigError: If there is no such key, or a value does not fit it.
     """
     section = root.child("config")
+    for key, entry in {} if section.value is None else section.items().items():
+        if key in _OF_SECTIONS:
+            raise entry.error(f"{key!r} is no key of [config]: {_OF_SECTIONS[key]}")
     own = {} if section.value is None else section.table(_OF_CONFIG)
     for key, entry in own.items():
         with entry.placing():
@@ -70,7 +81,7 @@ def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
     if declared.warm_up.period:
         times["warm_up"] = declared.warm_up.period
     if substeps.value is not None:
-        times["substeps"] = substeps.value
+        times["substeps"] = substeps.check(check_count)
     if length.value is not None:
         times["max_episode_steps"] = _episode_steps(length, time_step)
     if start.value is not None:

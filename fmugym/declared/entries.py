@@ -145,6 +145,8 @@ class Entry:
             ConfigError: If this is no table.
         """
         what = self.name if self.keys else "a task"
+        if not isinstance(self.value, Mapping):
+            raise self.error(f"{what} must be a table, got {shown(self.value)}")
         with self.placing():
             items = check_mapping(what, self.value)
         return {key: self.child(key) for key in items}

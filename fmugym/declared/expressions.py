@@ -198,10 +198,20 @@ def _parsed(text: str) -> ast.expr:
             warnings.simplefilter("ignore")  # of Python's own grammar
             return ast.parse(text.strip(), mode="eval").body
     except SyntaxError as error:
-        column = _column(text, max(0, (error.offset or 1) - 1))
-        raise ConfigError(f"{shown(text)} is no expression: column {column} does not fit") from None
+        raise ConfigError(f"{shown(text)} is no expression: {_misfit(text, error)}") from None
     except (ValueError, MemoryError, RecursionError):
         raise ConfigError(f"{shown(text)} is no expression") from None
+
+
+def _misfit(text: str, error: SyntaxError) -> str:
+    """Say what is wrong, and where."""
+    if not error.offset:
+        return "it ends too early" if text.strip() else "it is empty"
+    column = _column(text, error.offset - 1)
+    if error.msg != "invalid syntax":  # such as "'(' was never closed"
+        return f"{error.msg} (column {column})"
+    hint = "; comparisons are == != < <= > >=" if text[column - 1 : column] == "=" else ""
+    return f"column {column} does not fit{hint}"
 
 
 def _column(text: str, offset: int) -> int:
@@ -240,6 +250,13 @@ class _Writer:
     def write(self, node: ast.expr) -> Code:
         """Make code of a node and its operands."""
         method = getattr(self, f"_write_{type(node).__name__.lower()}", None)
+        if isinstance(node, ast.Attribute | ast.Subscript):
+            name = ast.get_source_segment(self._text.strip(), node)
+            raise self._error(
+                node,
+                f"{shown(name)} cannot stand in an expression; a variable of this name needs an "
+                f'alias in [variables]: alias = {{ name = "{name}" }}',
+            )
         if method is None:
             what = type(node).__name__.lower()
             raise self._error(node, f"{what} is not allowed here")
@@ -282,9 +299,11 @@ class _Writer:
     def _write_binop(self, node: ast.BinOp) -> Code:
         template = _BINARY.get(type(node.op))
         if template is None:
-            what = type(node.op).__name__
+            what = shown(ast.get_source_segment(self._text.strip(), node))
             raise self._error(
-                node, f"the operator {what} is not allowed here; there are + - * / % ** and or not"
+                node,
+                f"the operator in {what} is not allowed here; there are + - * / % ** (power) and "
+                "or not",
             )
         return _folded(template, [self.write(node.left).number, self.write(node.right).number])
 

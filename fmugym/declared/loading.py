@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from fmugym.checks import check_flag
+from fmugym.declared.entries import Entry
 from fmugym.declared.env import TaskEnv
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
-from fmugym.errors import ArgumentError, shown
+from fmugym.errors import ArgumentError, reason, shown, unknown_name
 
 __all__ = ["load"]
 
@@ -59,16 +61,31 @@ def load(
 
 def _class_of(task: Task) -> type[FMUEnv]:
     entry = task.root.child("class")
-    found = entry.value
-    if isinstance(found, str):
-        module, _, name = found.partition(":")
-        try:
-            found = getattr(import_module(module), name)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise entry.error(f"{shown(entry.value)} cannot be imported: {error}") from None
+    found = _imported(entry) if isinstance(entry.value, str) else entry.value
     if not isinstance(found, type) or not issubclass(found, FMUEnv):
         raise entry.error(f"expected 'module:Class' of an environment, got {shown(found)}")
     return found
+
+
+def _imported(entry: Entry) -> Any:
+    """What ``"module:name"`` stands for."""
+    module, separator, name = entry.value.partition(":")
+    if not (separator and module and name):
+        raise entry.error(f"expected 'module:Class' of an environment, got {shown(entry.value)}")
+    try:
+        found = import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise entry.error(f"{shown(module)} cannot be imported: {error}") from error
+        near = unknown_name("module", module, (path.stem for path in sorted(Path().glob("*.py"))))
+        raise entry.error(f"{near} (looked in {shown(str(Path.cwd()))}, too)") from None
+    except Exception as error:  # a module may do anything
+        what = f"{type(error).__name__}: {reason(error)}"
+        raise entry.error(f"{shown(module)} cannot be imported: {what}") from error
+    if not hasattr(found, name):
+        known = [key for key, value in vars(found).items() if isinstance(value, type)]
+        raise entry.error(unknown_name(f"class of {module}", name, known))
+    return getattr(found, name)
 
 
 def _require_no_more(task: Task, env_class: type[FMUEnv]) -> None:

@@ -14,6 +14,7 @@ from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
+from fmugym.errors import unknown_name
 from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
@@ -203,13 +204,15 @@ class Naming:
         finally:
             self._ahead = 0.0
         if code is None or code.value is not None:
-            raise entry.error(f"{name!r} is nothing that changes with time")
+            if name not in (known := self._known()):
+                raise entry.error(unknown_name("name to forecast", name, known))
+            raise entry.error(_no_forecast(name))
         return code.number.text
 
     def _code_of_memory(self, name: str, moment: Moment) -> Code:
         memory = self._declared.memory[name]
         if moment is Moment.FORECAST and memory.update is not None:
-            raise memory.entry.error(f"{name!r} depends on the course of the episode: no forecast")
+            raise memory.entry.error(_no_forecast(name))
         return Code(f"env.variables[{name!r}]")
 
     def _code_of_series(self, name: str, moment: Moment) -> str:
@@ -285,7 +288,7 @@ class Naming:
     def _code_of_record(self, name: str, record: Record, moment: Moment) -> str:
         declared = self._declared
         if moment is Moment.FORECAST:
-            raise record.entry.error(f"there is no forecast of {name!r}: no function of time")
+            raise record.entry.error(_no_forecast(name))
         if record in declared.actions and record.variable is None:
             return self.action_code(record, "action")
         if record in declared.actions and moment is Moment.BEFORE:
@@ -448,3 +451,7 @@ class Naming:
         if record.variable is None:
             return now, self.action_code(record, "previous_action")
         return now, self._start_of_input(record)
+
+
+def _no_forecast(name: str) -> str:
+    return f"there is no forecast of {name!r}: it needs data, a set point or an expression of time"

@@ -12,6 +12,7 @@ from fmugym.errors import ConfigError, shown
 __all__ = ["duration"]
 
 _SECONDS: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+_NEGATIVE: Final = re.compile(r"\s*-\s*\d")
 _PART: Final = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)\s*(ms|s|min|h|d)(?![A-Za-z])")
 
 
@@ -28,6 +29,8 @@ def duration(what: str, value: Any) -> float:
     """
     if not isinstance(value, str):
         return check_number(what, value, minimum=0)
+    if _NEGATIVE.match(value):
+        raise ConfigError(f"{what} must not be negative, got {shown(value)}")
     total, place = 0.0, 0
     while match := _PART.match(value, place):
         total, place = total + float(match[1]) * _SECONDS[match[2]], match.end()

@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +22,7 @@ from fmugym.declared.quantities import duration
 from fmugym.declared.values import number
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
 from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.extras import imported
 
 __all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
 
@@ -236,6 +236,10 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
         with file.placing():
             read = _read_parquet if path.suffix.lower() in _PARQUET else _read_text
             return read(path, status.st_mtime_ns, status.st_size)
+    except FileNotFoundError:
+        near = sorted(one.name for one in path.parent.glob(f"*{path.suffix}"))
+        missing = unknown_name("file", path.name, near)
+        raise file.error(f"{missing} (looked in {shown(str(path.parent))})") from None
     except OSError as error:
         raise file.error(f"{shown(str(path))} cannot be read: {error.strerror}") from None
 
@@ -243,12 +247,7 @@ def _read_file(file: Entry) -> Mapping[str, Table]:
 @lru_cache(maxsize=16)
 def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
     """Read a Parquet file, whose cells have types."""
-    try:
-        pyarrow, parquet = import_module("pyarrow"), import_module("pyarrow.parquet")
-    except ImportError:
-        raise ConfigError(
-            f'{path.name} needs pyarrow: pip install "fmugym-toolbox[parquet]"'
-        ) from None
+    pyarrow, parquet = imported("pyarrow", "parquet"), imported("pyarrow.parquet", "parquet")
     try:
         table = parquet.ParquetFile(path).read()
     except (pyarrow.ArrowException, ValueError) as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -92,6 +92,11 @@ def _read_archive(path: Path, changed: int, size: int, master: str | None) -> FM
 def _path(entry: Entry) -> Path:
     if isinstance(entry.value, str):
         return Path(entry.value)
+    if not isinstance(entry.value, Mapping):
+        raise entry.error(
+            f"expected the path of an FMU, or a table such as {{ bundled = 'Pendulum' }}, got "
+            f"{shown(entry.value)}"
+        )
     table = entry.table(("bundled", "fmi_version"))
     version: Any = table["fmi_version"].value if "fmi_version" in table else "2.0"
     with entry.placing():
@@ -214,7 +219,7 @@ def _status(entry: Entry, path: Path) -> Any:
     except (OSError, ValueError):  # there is none, or no file could have such a name
         near = sorted(file.name for file in path.parent.glob(f"*{path.suffix or '.fmu'}"))
         folder = shown(str(path.parent))
-        raise entry.error(f"{unknown_name('FMU', path.name, near)}; looked in {folder}") from None
+        raise entry.error(f"{unknown_name('FMU', path.name, near)} (looked in {folder})") from None
 
 
 @lru_cache(maxsize=16)

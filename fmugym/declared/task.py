@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_integer, check_mapping, check_path
+from fmugym.checks import check_mapping, check_path, integer_of
 from fmugym.declared.entries import Entry, Source
 from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.warming import period_of
@@ -42,7 +42,7 @@ _MOST_FILES: Final = 20
 """Files may extend each other in a chain of this length."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Task:
     """A declared task.
 
@@ -56,8 +56,15 @@ class Task:
     """
 
     document: Mapping[str, Any]
-    sources: tuple[Source, ...] = field(compare=False, repr=False)
+    sources: tuple[Source, ...] = field(compare=False)
     is_physical: bool = False
+
+    def __repr__(self) -> str:
+        if "class" in self.document:
+            return f"Task({self.name!r}: {shown(self.document['class'])})"
+        agent = self.root.child("agent")
+        seen, done = (shown(agent.child(key).value) for key in ("observations", "actions"))
+        return f"Task({self.name!r}: {done} -> {seen})"
 
     @classmethod
     def of(cls, config: Any) -> Task:
@@ -206,7 +213,7 @@ def _read(path: Path) -> Source:
     except FileNotFoundError:
         near = sorted(file.name for file in path.parent.glob("*.toml"))
         error = unknown_name("task file", path.name, near)
-        raise ConfigError(f"{error}; looked in {shown(str(path.parent))}") from None
+        raise ConfigError(f"{error} (looked in {shown(str(path.parent))})") from None
     except OSError as error:
         raise ConfigError(f"{shown(str(path))} cannot be read: {error.strerror}") from None
     try:
@@ -235,14 +242,10 @@ def _check(source: Source) -> None:
     if root.child("description").value is not None:
         root.child("description").text()
     version = root.child("version")
-    if version.value is not None:
-        with version.placing():
-            check_integer(
-                f"the version of the format (this is fmugym with version {VERSION})",
-                version.value,
-                1,
-                VERSION,
-            )
+    if version.value is not None and integer_of(version.value) != VERSION:
+        raise version.error(
+            f"this fmugym reads version {VERSION} of the format, got {shown(version.value)}"
+        )
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -303,6 +306,10 @@ def _relative_path(path: str, folder: Path) -> str:
 
 def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
     fmu, data, system = document.get("fmu"), document.get("data"), document.get("system")
+    config = document.get("config")
+    if isinstance(config, dict) and "preload" in config:
+        preload = _mapped_libraries(config["preload"], function)
+        document = document | {"config": config | {"preload": preload}}
     if isinstance(system, dict):
         document = document | {"system": _mapped_system(system, function)}
     if isinstance(fmu, str):
@@ -312,6 +319,16 @@ def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
             "data": {name: _mapped_path(d, function) for name, d in data.items()}
         }
     return document
+
+
+def _mapped_libraries(preload: Any, function: Any) -> Any:
+    """Map the paths of libraries. A bare name is for the loader of the system to find."""
+    if isinstance(preload, list):
+        return [_mapped_libraries(one, function) for one in preload]
+    if not isinstance(preload, str) or not os.path.dirname(preload):
+        return preload
+    path = function(preload)
+    return path if os.path.dirname(path) else f"./{path}"
 
 
 def _mapped_system(system: dict[str, Any], function: Any) -> dict[str, Any]:

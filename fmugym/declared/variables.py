@@ -350,7 +350,8 @@ def start_value(record: Record, entry: Entry) -> Any:
     """
     name, variable = record.fmu_name, record.variable
     if variable is None or not variable.settable_at_start:
-        raise entry.error(f"{name!r} cannot be set at the start of an episode")
+        what = "" if variable is None else f": it is a {variable.variability} {variable.causality}"
+        raise entry.error(f"{name!r} cannot be set at the start of an episode{what}")
     if variable.shape:
         return _array_start(variable, entry, record.own_range)
     if isinstance(entry.value, str) and (variable.items or variable.kind == "string"):

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from fmugym.errors import ConfigError
+from fmugym.extras import installation
 
 __all__ = ["PLATFORMS", "Platform", "compiled", "header_folder", "own_platform"]
 
@@ -108,7 +109,6 @@ def _compiler(where: str) -> list[str]:
         return [found]
     if importlib.util.find_spec("ziglang") is None:
         raise ConfigError(
-            f"there is no compiler for {where}: install ziglang, for example with: pip install "
-            "'fmugym-toolbox[windows]'"
+            f"there is no compiler for {where}; one is ziglang: {installation('windows')}"
         )
     return [sys.executable, "-m", "ziglang", "cc", "-target", PLATFORMS[where].target]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.errors import ConfigError
+from fmugym.extras import imported
 
 __all__ = ["Nodes", "imported_onnx"]
 
@@ -19,13 +18,7 @@ def imported_onnx() -> Any:
     Raises:
         ConfigError: If it is missing.
     """
-    try:
-        return import_module("onnx")
-    except ImportError as error:
-        raise ConfigError(
-            "an ONNX file needs the package onnx, which cannot be imported; install the extra: "
-            "pip install 'fmugym-toolbox[onnx]'"
-        ) from error
+    return imported("onnx", "onnx")
 
 
 class Nodes:

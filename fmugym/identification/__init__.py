@@ -4,7 +4,7 @@
 squares. ``fit_parameters`` fits any parameters of any FMU, by simulation. An environment takes the
 results as parameter values or, with their uncertainty, as distributions.
 
-The package needs SciPy: ``pip install "fmugym-toolbox[identification]"``.
+The package needs SciPy, which the extra ``identification`` installs.
 """
 
 from fmugym.identification.output_error import FitResult, fit_parameters

@@ -15,7 +15,8 @@ from fmugym.pool.base import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+
+    from fmugym.figures import Figure
 
 __all__ = ["Comparison", "plot_comparison"]
 
@@ -101,7 +102,7 @@ def plot_comparison(
     Raises:
         ConfigError: If an output was not measured, or an argument has a wrong type.
     """
-    from matplotlib.figure import Figure
+    from fmugym.figures import Figure
 
     if not isinstance(comparison, Comparison):
         raise ConfigError(f"expected a Comparison, not {shown(comparison)}")

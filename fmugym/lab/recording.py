@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.extras import installation
 from fmugym.lab.errors import LabError
 from fmugym.lab.pictures import CellPicture
 
@@ -25,7 +26,6 @@ FRAME_RATE: Final = 25
 
 _SIZE: Final = (320, 320)  # codecs need multiples of 16
 _FFMPEG: Final = "imageio_ffmpeg"
-_HOW_TO: Final = "install one with: pip install 'fmugym-toolbox[lab]'"
 
 Frame = npt.NDArray[np.uint8]
 
@@ -77,7 +77,7 @@ def check_can_record() -> None:
         LabError: If neither imageio-ffmpeg nor Pillow is installed.
     """
     if not any(importlib.util.find_spec(name) for name in (_FFMPEG, "PIL")):
-        raise LabError(f"recording needs imageio-ffmpeg or Pillow; {_HOW_TO}")
+        raise LabError(f"recording needs imageio-ffmpeg or Pillow; {installation('lab')}")
 
 
 def write_video(recording: Recording, picture: CellPicture, folder: Path, name: str) -> Path:

@@ -148,7 +148,7 @@ def svg_of(figure: Any) -> str:
 
 
 def _figure(series: TimeSeries, title: str) -> Any:
-    figures: Any = imported("matplotlib.figure", "plot")
+    figures: Any = imported("fmugym.figures", "plot")
     panels = _panels(series)
     with drawing_style():
         heights = [panel.height for panel in panels]

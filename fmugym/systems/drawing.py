@@ -57,7 +57,7 @@ def _metadata(suffix: str) -> dict[str, None] | None:
 
 
 def _figure(system: WiredSystem, layout: Layout) -> Any:
-    figures: Any = imported("matplotlib.figure", "plot")
+    figures: Any = imported("fmugym.figures", "plot")
     width, height = layout.size
     size = max(width + 2 * _MARGIN, 5.0), height + 2 * _MARGIN + 2 * _TITLE
     figure = figures.Figure(figsize=size)

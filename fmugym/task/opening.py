@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 import os
+from abc import ABCMeta
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -208,8 +209,8 @@ def _find_file(cls: type, path: Path) -> Path:
     if path.is_absolute():
         return path
     own = takewhile(lambda c: c.__module__ != "fmugym.env", cls.__mro__)
-    folders = [Path(inspect.getfile(c)).parent for c in own if _has_file(c)] or [Path.cwd()]
-    candidates = [folder / path for folder in folders]
+    folders = [Path(inspect.getfile(c)).parent if _has_file(c) else Path.cwd() for c in own]
+    candidates = [folder / path for folder in folders or [Path.cwd()]]
     return next((c for c in candidates if _exists(c)), candidates[0])
 
 
@@ -221,6 +222,8 @@ def _exists(path: Path) -> bool:
 
 
 def _has_file(cls: type) -> bool:
+    if cls.__module__ == ABCMeta.__module__:  # it was made by a call of type()
+        return False
     try:
         return Path(inspect.getfile(cls)).is_file()
     except (TypeError, OSError):

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import pickle
 from collections.abc import Mapping
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
-from fmugym.checks import check_option
+from fmugym.baselines import Controller
+from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.extras import imported
 from fmugym.search.agent import AGENT, Agent
 from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
@@ -27,6 +30,7 @@ __all__ = [
     "imported_for_training",
     "load_agent",
     "policy_with",
+    "read_agent",
     "save",
 ]
 
@@ -41,13 +45,7 @@ def imported_for_training(name: str) -> Any:
     Raises:
         ConfigError: If it is missing.
     """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(
-            f"this needs Stable-Baselines3, but {name} cannot be imported; install the extra: "
-            "pip install 'fmugym-toolbox[sb3]'"
-        ) from error
+    return imported(name, "sb3")
 
 
 def algorithm_of(name: str) -> Any:
@@ -81,26 +79,73 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
     (folder / FACTS).write_text(json.dumps(dict(facts)), encoding="utf-8")
 
 
-def agent_player(folder: Path) -> Player:
-    """Load the agent that ``train`` has written to a folder.
+def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
+    """Load the agent that ``fmugym train`` has written to a folder, to act as controllers do.
 
     Only load agents of Stable-Baselines3 from sources that you trust: their files hold pickles,
     which can run code. Those of a search hold numbers only.
 
     Returns:
-        The player. It makes no policy but raises ``ConfigError`` for an environment with other
-        observations or actions than the agent was trained for.
+        The agent, which ``bind`` prepares for an environment: that of a search for one or many
+        environments in the physical form of the task, one of Stable-Baselines3 for a single one.
+        It refuses other observations or actions than it was trained for.
 
     Raises:
         ConfigError: If there is no agent, its files are damaged, or Stable-Baselines3 is missing.
     """
-    model, normalization = load_agent(folder)
+    path = check_path("folder", folder)
+    model, normalization = read_agent(path)
     if isinstance(model, Agent):
-        return Player(partial(policy_of_controller, model.policy()), is_physical=True)
-    return Player(partial(_checked_policy, folder, model, normalization), is_physical=False)
+        return model.policy()
+    return TrainedModel(path, model, normalization)
 
 
-def load_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
+def agent_player(folder: Path) -> Player:
+    """The one who acts as the agent in a folder; raises as ``load_agent``."""
+    agent = load_agent(folder)
+    return Player(partial(policy_of_controller, agent), agent.is_physical)
+
+
+class TrainedModel:
+    """An agent of Stable-Baselines3, with the methods of a ``fmugym.baselines.Controller``.
+
+    Args:
+        folder: Where it comes from, for errors.
+        model: The model.
+        normalization: Its ``VecNormalize``, or None.
+    """
+
+    is_physical: Final = False
+
+    def __init__(self, folder: Path, model: Any, normalization: Any) -> None:
+        self._folder, self._model, self._normalization = folder, model, normalization
+
+    def bind(self, env: Any) -> Self:
+        """Prepare for an environment.
+
+        Raises:
+            ConfigError: If the agent was trained for other observations or actions.
+        """
+        for what in ("observation", "action"):
+            own, other = getattr(self._model, f"{what}_space"), getattr(env, f"{what}_space")
+            if type(own) is not type(other) or own.shape != other.shape:
+                raise ConfigError(
+                    f"the agent in {shown(str(self._folder))} is for another task: its {what}s are "
+                    f"{_kind(own)}, those of the task are {_kind(other)} ({_names(what, env)})"
+                )
+        self._policy = policy_with(self._model, self._normalization, env.unwrapped)
+        return self
+
+    def act(self, observation: Any, info: Any = None) -> Any:
+        """Choose the best action."""
+        return self._policy.act(observation)
+
+    def reset(self) -> None:
+        """Begin a new episode."""
+        self._policy.begin()
+
+
+def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     """Load an agent of a search, or the model of one of Stable-Baselines3.
 
     Only load the latter from sources that you trust: their files hold pickles, which can run code.
@@ -151,15 +196,14 @@ def _normalization_in(folder: Path) -> Any:
     return normalization
 
 
-def _checked_policy(folder: Path, model: Any, normalization: Any, env: FMUEnv) -> Policy:
-    for what in ("observation", "action"):
-        own, other = getattr(model, f"{what}_space"), getattr(env, f"{what}_space")
-        if type(own) is not type(other) or own.shape != other.shape:
-            raise ConfigError(
-                f"the agent in {shown(str(folder))} is for another task: its {what} space is "
-                f"{own}, that of the task is {other}"
-            )
-    return policy_with(model, normalization, env)
+def _kind(space: Any) -> str:
+    """A space without its limits, which may be long arrays."""
+    return f"{type(space).__name__} of shape {space.shape}"
+
+
+def _names(what: str, env: FMUEnv) -> str:
+    seen = env.observation_names or env.config.model_output_names
+    return ", ".join(seen if what == "observation" else env.config.model_input_names)
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:

@@ -27,7 +27,7 @@
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
-``--steps N``. All commands take ``--json``.
+``--steps N``. All commands take ``--json``, ``-q`` and ``-v``; those that write files ``--force``.
 
 ``info``, ``new``, ``skeleton``, ``stand-in`` and ``compile`` execute nothing of the FMU, the others
 do. Output is printable text; letters that the console lacks are escaped. The exit code is 0; 1 if
@@ -76,7 +76,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from typing import Final
+from typing import Any, Final, NoReturn
 
 from fmugym.errors import FMUGymError, unknown_name
 from fmugym.tools.datasets import add_dataset
@@ -92,10 +92,15 @@ from fmugym.tools.inspecting import (
     add_validate,
 )
 from fmugym.tools.learning import add_train
-from fmugym.tools.options import note
+from fmugym.tools.options import add_common, free_outputs, note, speaking
 from fmugym.tools.playing import add_bench, add_evaluate, add_record, add_simulate
 from fmugym.tools.showing import add_demo
-from fmugym.tools.streams import drop_output, escape_what_consoles_lack, keep_output_from_fmus
+from fmugym.tools.streams import (
+    drop_output,
+    escape_what_consoles_lack,
+    keep_output_from_fmus,
+    named,
+)
 
 __all__ = ["main"]
 
@@ -118,12 +123,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     Raises:
         SystemExit: With the code 2 if the arguments are wrong, 0 after ``--help``.
     """
-    if argv is None:
-        keep_output_from_fmus()
     escape_what_consoles_lack()
     arguments = _parsed(argv)
+    printed = None if argv is not None else keep_output_from_fmus(shown=arguments.verbose)
+    with speaking(arguments):
+        try:
+            return _code_of(arguments)
+        finally:
+            if printed is not None and (file := named(printed)):
+                note(f"what FMUs and their libraries printed is in {file}; -v shows it")
+
+
+def _code_of(arguments: argparse.Namespace) -> int:
+    """Run the command; returns the exit code."""
     try:
-        code: int = arguments.run(arguments) or 0
+        with free_outputs(arguments):
+            code: int = arguments.run(arguments) or 0
         sys.stdout.flush()
         return code
     except KeyboardInterrupt as error:
@@ -147,28 +162,69 @@ def _told(error: Exception) -> str:
     return f"{error.filename}: {error.strerror}"
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line with the nearest name."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.register("type", int, _whole_number)
+        self.register("type", float, _number)
+
+    def error(self, message: str) -> NoReturn:
+        """End the program."""
+        hint = "" if message.endswith("?") else f"; '{self.prog} --help' tells more"
+        self.exit(2, f"{self.prog}: error: {message}{hint}\n")
+
+    def refuse(self, text: str) -> NoReturn:
+        """End the program for an argument that is not known."""
+        if not text.startswith("-"):
+            self.error(f"unexpected argument {text!r}")
+        self.error(str(unknown_name("option", text.partition("=")[0], self.options)))
+
+    @property
+    def options(self) -> list[str]:
+        """The names of the options; argparse has no public list of them."""
+        return list(self._option_string_actions)
+
+
+def _whole_number(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected an integer, got {text!r}") from None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a number, got {text!r}") from None
+
+
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
     parser, commands = _parser()
     given = sys.argv[1:] if argv is None else argv
     if given and not given[0].startswith("-") and given[0] not in commands:
         parser.error(str(unknown_name("command", given[0], commands)))
+    if given and given[0].startswith("-") and given[0] not in parser.options:
+        parser.refuse(given[0])
     arguments, rest = parser.parse_known_args(given)
-    more = [text for text in rest if not text.startswith("-")]
-    if rest and (len(more) < len(rest) or not hasattr(arguments, "arguments")):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    for text in rest:
+        if text.startswith("-") or not hasattr(arguments, "arguments"):
+            commands[arguments.command].refuse(text)
     if rest:
-        arguments.arguments = [*arguments.arguments, *more]
+        arguments.arguments = [*arguments.arguments, *rest]
     return arguments
 
 
-def _parser() -> tuple[argparse.ArgumentParser, Sequence[str]]:
-    """Make the parser; return it with the names of the commands."""
-    parser = argparse.ArgumentParser(
-        "fmugym", description="Look at an FMU, make a task of it, and run that."
-    )
+def _parser() -> tuple[_Parser, dict[str, _Parser]]:
+    """Make the parser; return it with those of the commands."""
+    parser = _Parser("fmugym", description="Look at an FMU, make a task of it, and run that.")
     parser.add_argument("--version", action="version", version=version("fmugym-toolbox"))
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND", dest="command")
     for add in _COMMANDS:
         add(commands)
-    return parser, tuple(commands.choices)
+    for command in commands.choices.values():
+        add_common(command)
+    return parser, commands.choices

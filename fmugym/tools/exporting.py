@@ -14,7 +14,7 @@ from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.search.agent import Agent as FoundAgent
-from fmugym.tools.agents import load_agent
+from fmugym.tools.agents import read_agent
 from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
 from fmugym.tools.targets import maker_of
 
@@ -71,7 +71,7 @@ def _export(arguments: argparse.Namespace) -> None:
         )
     if not output.parent.is_dir():
         raise ConfigError(f"{shown(str(output.parent))} is no folder")
-    model, normalization = load_agent(arguments.agent, arguments.algorithm)
+    model, normalization = read_agent(arguments.agent, arguments.algorithm)
     is_physical = isinstance(model, FoundAgent)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:
         options = {"all_inputs": arguments.all_inputs, "external": arguments.external}

@@ -22,7 +22,7 @@ from fmugym.tools.options import (
     write_text,
 )
 from fmugym.tools.overview import as_text, overview, plain
-from fmugym.tools.proposal import Proposal
+from fmugym.tools.proposal import Proposal, preload_line
 from fmugym.tools.skeleton import Skeleton
 from fmugym.tools.stand_in import build_stand_in
 from fmugym.tools.systems import as_text_of_system, find_model, open_model, overview_of_system
@@ -182,5 +182,6 @@ def _stand_in(arguments: argparse.Namespace) -> None:
         say(plain(f"{library.path}: {len(library.served)} functions"))
         for name in library.lacking:
             say(plain(f"  without {name}: an FMU that calls it ends its process"))
-    paths = ", ".join(repr(str(library.path)) for library in built)
-    say(plain(f'Put it into the config: "preload": [{paths}]'))
+    line = preload_line([str(library.path) for library in built])
+    say(f"Put it into the task file, below [config]: {line}")
+    say(f'or into the config of a class: "preload": {line.removeprefix("preload = ")}')

@@ -153,9 +153,11 @@ def _search(arguments: argparse.Namespace) -> None:
         check_number("--candidates", arguments.candidates, LEAST_CANDIDATES)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
-    make_env, names = maker_of(arguments.task), scenarios_of(arguments.task)
-    scenarios = {name: partial(maker_of(arguments.task, name), physical=True) for name in names}
-    make_env = partial(make_env, physical=True)
+    task, master = arguments.task, arguments.master
+    make_env = partial(maker_of(task, master=master), physical=True)
+    scenarios = {
+        name: partial(maker_of(task, name, master), physical=True) for name in scenarios_of(task)
+    }
     quest = Quest(
         make_env,
         scenarios or {"unseen episodes": make_env},

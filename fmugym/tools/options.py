@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import codecs
 import json
+import logging
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,18 +19,21 @@ from fmugym.errors import ConfigError, shown
 from fmugym.systems.plan import MASTERS
 from fmugym.tools.agents import agent_player
 from fmugym.tools.overview import plain
+from fmugym.tools.progress import quiet
 from fmugym.tools.simulation import Player, action_of, policy_of
 
 __all__ = [
     "HELP_OF_TASK",
     "Commands",
     "add_command",
+    "add_common",
     "add_episodes",
     "add_json",
     "add_master",
     "add_players",
     "add_task",
     "check_numbers",
+    "free_outputs",
     "note",
     "only_player",
     "players_of",
@@ -36,6 +41,7 @@ __all__ = [
     "say",
     "say_json",
     "shown_in_any_case",
+    "speaking",
     "tell",
     "write_text",
 ]
@@ -46,6 +52,51 @@ Commands = Any
 HELP_OF_TASK: Final = "a task file, a registered id or module:Class"
 _CONTROLLER: Final = "a controller and its arguments: 'pid of=T setpoint=21 kp=0.5 ti=14400'"
 _ACTION: Final = "random, or the numbers of one action: 0.5,-1"
+_FILES: Final = ("output", "plot")
+"""Options that name files to write."""
+
+EXAMPLES: Final = {
+    "info": (
+        "fmugym info model.fmu",
+        "fmugym info --filter 'theta*' model.fmu",
+        "fmugym info system.ssp --plot system.svg",
+    ),
+    "new": (
+        "fmugym new model.fmu --output task.toml",
+        "fmugym new --class model.fmu --output my_env.py",
+    ),
+    "validate": ("fmugym validate task.toml", "fmugym validate fmugym/Pendulum-v0 --json"),
+    "simulate": (
+        "fmugym simulate task.toml",
+        "fmugym simulate task.toml --action 0.01 --episodes 2 --seed 3 --output run.csv",
+        "fmugym simulate fmugym/House-v0 --scenario frost "
+        "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96",
+    ),
+    "train": (
+        "fmugym train examples/cart_pole.toml --output agent --minutes 0.1",
+        "fmugym train examples/cart_pole.toml --output agent --minutes 0.1 --resume",
+    ),
+    "tune": (
+        'fmugym tune task.toml "pid of=q setpoint=1 kp=0.01..1 td=0..1" --rounds 3 --steps 100 '
+        "--output tuned.toml",
+    ),
+    "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
+    "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
+    "record": (
+        "fmugym record task.toml --output run.csv --variables 'q*' --variables tau --every 0.1",
+    ),
+    "bench": ("fmugym bench task.toml --seconds 0.1",),
+    "dataset": (
+        "fmugym dataset house/measured-v0 --task house.toml --log week.csv --column pump_speed=u",
+        "fmugym dataset swing/random-v0 --output episodes",
+    ),
+    "demo": ("fmugym demo --output demo.png",),
+    "skeleton": ("fmugym skeleton model.fmu --output my_env.py",),
+    "stand-in": ("fmugym stand-in model.fmu --folder lib",),
+    "compile": ("fmugym compile model.fmu", "fmugym compile model.fmu --output here.fmu"),
+}
+"""What ``--help`` shows of each command; a test finds these lines in the documents."""
+
 SCHEMA: Final = 1
 """Of the JSON; raised when a key goes or changes its meaning."""
 
@@ -58,14 +109,31 @@ def add_command(
 ) -> argparse.ArgumentParser:
     """Add a command that calls a function with the arguments."""
     command: argparse.ArgumentParser = commands.add_parser(
-        name, help=text, description=f"{text[0].upper()}{text[1:]}."
+        name,
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}.",
+        epilog="\n  ".join(["examples:", *EXAMPLES[name]]),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command.set_defaults(run=run)
     return command
 
 
+def add_common(command: argparse.ArgumentParser) -> None:
+    """Add the options of all commands, and ``--force`` where one writes files."""
+    group = command.add_mutually_exclusive_group()
+    group.add_argument("-q", "--quiet", action="store_true", help="print results and errors only")
+    group.add_argument(
+        "-v", "--verbose", action="store_true", help="show the log, and what FMUs print"
+    )
+    files = [one.dest for one in command._actions if one.dest in _FILES and one.metavar == "FILE"]
+    command.set_defaults(files=files)
+    if files:
+        command.add_argument("--force", action="store_true", help="replace a file that exists")
+
+
 def add_json(command: argparse.ArgumentParser) -> None:
-    """Add the option that all commands have."""
+    """Add the option for results that programs read."""
     command.add_argument("--json", action="store_true", help="print one JSON object")
 
 
@@ -85,22 +153,43 @@ def add_episodes(
     command: argparse.ArgumentParser, episodes: int, seed: int, *, steps: bool = True
 ) -> None:
     """Add the options for which episodes are played."""
-    command.add_argument("--episodes", type=int, default=episodes, help=f"default {episodes}")
     command.add_argument(
-        "--seed", type=int, default=seed, help=f"of the first episode; default {seed}"
+        "--episodes",
+        type=int,
+        default=episodes,
+        metavar="N",
+        help=f"how many to play; default {episodes}",
+    )
+    command.add_argument(
+        "--seed",
+        type=int,
+        default=seed,
+        metavar="N",
+        help=f"of the first episode, the next have the next; default {seed}",
     )
     if steps:
-        command.add_argument("--steps", type=int, default=10_000, help="at most, in each episode")
+        command.add_argument(
+            "--steps",
+            type=int,
+            default=10_000,
+            metavar="N",
+            help="the most steps of an episode; default 10000",
+        )
 
 
 def add_players(command: argparse.ArgumentParser) -> None:
     """Add the options for who acts, each of which may be given several times."""
-    command.add_argument("--action", action="append", default=[], help=_ACTION)
+    command.add_argument("--action", action="append", default=[], metavar="TEXT", help=_ACTION)
     command.add_argument(
         "--controller", action="append", default=[], metavar="TEXT", help=_CONTROLLER
     )
     command.add_argument(
-        "--agent", type=Path, action="append", default=[], metavar="FOLDER", help="of train"
+        "--agent",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FOLDER",
+        help="the folder of an agent, which 'fmugym train' has written",
     )
 
 
@@ -156,12 +245,68 @@ def say(text: str) -> None:
 
 def note(text: str, kind: str = "note") -> None:
     """Print a line to the error stream."""
-    print(f"fmugym: {kind}: {plain(text)}", file=sys.stderr)
+    tell(f"fmugym: {kind}: {text}", is_needed=kind == "error")
 
 
-def tell(text: str) -> None:
-    """Print a line of progress to the error stream."""
-    print(plain(text), file=sys.stderr)
+def tell(text: str, *, is_needed: bool = False) -> None:
+    """Print a line of progress to the error stream; ``--quiet`` leaves out what is not needed."""
+    if is_needed or not quiet.get():
+        print(plain(text), file=sys.stderr)
+
+
+@contextmanager
+def speaking(arguments: argparse.Namespace) -> Iterator[None]:
+    """Say as much as ``--quiet`` and ``--verbose`` ask for."""
+    logger, handler = logging.getLogger("fmugym"), logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.ERROR if arguments.quiet else logging.INFO)
+    token, level = quiet.set(arguments.quiet), logger.level
+    if arguments.verbose:
+        logger.setLevel(logging.INFO)
+    if arguments.quiet or arguments.verbose:
+        logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        quiet.reset(token)
+        logger.removeHandler(handler)
+        logger.setLevel(level)
+
+
+@contextmanager
+def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
+    """Refuse files that exist before work is done for them; ``--force`` replaces them.
+
+    An old file comes back if the command ends without a new one.
+
+    Raises:
+        ConfigError: If a file exists, or its folder does not.
+    """
+    old: dict[Path, Path] = {}
+    paths = list(_outputs_of(arguments))
+    for path in paths:
+        require_folder(path)
+        if path.is_file() and not arguments.force:
+            raise ConfigError(f"{path} exists; name a new file, or replace it with --force")
+    try:
+        for path in filter(Path.is_file, paths):
+            old[path] = path.rename(path.with_name(f".{path.name}.{os.getpid()}"))
+        yield
+    finally:
+        for path, aside in old.items():
+            if path.exists():
+                aside.unlink()
+            else:
+                aside.rename(path)
+
+
+def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
+    """The files that a command will write."""
+    for name in arguments.files:
+        given = getattr(arguments, name)
+        for path in given if isinstance(given, list) else filter(None, [given]):
+            yield path
+            if path.suffix == ".c":
+                yield path.with_suffix(".h")
 
 
 def say_json(facts: dict[str, Any]) -> None:

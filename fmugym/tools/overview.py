@@ -224,14 +224,15 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
 def _this_machine(facts: Mapping[str, Any]) -> str:
     platform, tool = facts["platform"], facts["missing_tool"]
     if not facts["runs_here"]:
-        return f"{platform}: does NOT run here: {'; '.join(facts['obstacles'])}"
+        how = "does NOT run here" if facts["trial"] is None else "has run here, but not like this"
+        return f"{platform}: {how}: {'; '.join(facts['obstacles'])}"
     how = "runs here, in Wine" if facts["in_wine"] else "runs here"
     return f"{platform}: {how}" + (f" if it is installed: {tool}" if tool else "")
 
 
 def _first_meeting(trial: Mapping[str, Any] | None) -> str:
     if trial is None:
-        return "not yet, or exempt"
+        return "none on this machine; the first use tries an FMU, unless fmugym brings it along"
     grades = ", ".join(f"{method} is {_GRADES[g]}" for method, g in trial["resets"].items())
     parts = [grades] if grades else []
     if trial["reset_method"]:

@@ -1,32 +1,43 @@
-"""Progress bars on the error stream of a terminal."""
+"""Progress bars on the error stream."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
+from typing import Final
 
-__all__ = ["Advance", "no_progress", "progress"]
+__all__ = ["Advance", "no_progress", "progress", "quiet"]
 
 Advance = Callable[..., None]
 """Is told how many steps were done since the last call, and perhaps a text to show beside."""
+
+
+quiet: Final = ContextVar("quiet", default=False)
+"""Whether to show results and errors only."""
 
 
 def no_progress(steps: float, text: str = "") -> None:
     """An ``Advance`` that shows nothing."""
 
 
+def _is_watched() -> bool:
+    """Whether the error stream can show a bar: it is a terminal, or a notebook's."""
+    return sys.stderr.isatty() or type(sys.stderr).__module__.startswith("ipykernel.")
+
+
 @contextmanager
 def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Advance]:
-    """Show a bar, if the error stream is a terminal and tqdm is installed (extra ``sb3``).
+    """Show a bar, in a terminal or a notebook, if tqdm is installed (extra ``sb3``).
 
     Args:
         total: The number of steps; None if it is not known.
         what: A word for what is done.
         unit: What is counted.
     """
-    if not sys.stderr.isatty():
+    if quiet.get() or not _is_watched():
         yield no_progress
         return
     try:

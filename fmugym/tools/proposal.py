@@ -9,7 +9,8 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -17,11 +18,13 @@ from typing import Final
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, FMULoadError
+from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain
 from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
+from fmugym.tools.stand_in import replaceable
 
-__all__ = ["Proposal"]
+__all__ = ["Proposal", "preload_line"]
 
 _HEAD: Final = """\
 # A task for the FMU {file}. Decide what is marked with TODO, then try
@@ -34,6 +37,12 @@ episode_length = {length}  # s
 reward = "0"  # TODO: what is there to learn? For example: "-abs({output} - 1)"
 # terminated = "abs({output}) > 10"  # TODO: does the task have an end?
 """
+
+_MOST_RESULTS: Final = 30
+"""Locals that are listed, at most."""
+
+_UNITS_OF_RESULTS: Final = frozenset({"K", "degC", "degF", "W", "kW", "MW", "J", "kJ", "Wh", "kWh"})
+"""Units of temperatures, powers and energies, which rewards and agents often need."""
 
 
 class Proposal:
@@ -77,9 +86,13 @@ class Proposal:
         """What the user has to decide before the task is useful."""
         yield 'the reward is "0": say what there is to learn'
         for variable in filter(needs_bounds, self._actions):
-            yield f"the FMU gives no limits of input {variable.name!r}: the file has a guess"
+            yield (
+                f"the FMU gives no limits of input {variable.name!r}: those in the file are a guess"
+            )
         if not self._skeleton.has_step_size:
             yield "the FMU gives no step size that fits its default experiment; check 'time_step'"
+        if self._skeleton.left_out:
+            yield f"{self._skeleton.left_out} parameters are left out; 'fmugym info' lists them"
         for obstacle in self._fmu.obstacles:
             yield f"the FMU does not run on this machine: {obstacle}"
 
@@ -95,7 +108,10 @@ class Proposal:
             output=self._aliases[skeleton.outputs[0].name],
         )
         return "\n".join(
-            [head, *self._variables(), "", *self._agent(), "", *self._parameters(), ""]
+            [
+                *(head, *self._variables(), *self._results(), "", *self._agent(), ""),
+                *(*self._parameters(), *self._config(), ""),
+            ]
         )
 
     def _path(self) -> str:
@@ -115,6 +131,20 @@ class Proposal:
             if self._aliases[variable.name] != variable.name:
                 name = _quoted(variable.name)
                 yield f"{self._aliases[variable.name]} = {{ name = {name} }}{remark(variable)}"
+
+    def _results(self) -> Iterator[str]:
+        """Locals as comments: for many an exporter, the interesting variables are no outputs."""
+        outputs = self._skeleton.outputs
+        found = [v for v in self._fmu.description.variables.values() if _is_result(v)]
+        found = [variable for variable in found if variable not in outputs]
+        if found:
+            yield "# These locals are no outputs of the FMU, but a reward or an agent may use them:"
+        taken = set(self._aliases.values())
+        for variable in found[:_MOST_RESULTS]:
+            taken.add(alias := _free_alias(variable.name, taken))
+            yield f"# {alias} = {{ name = {_quoted(variable.name)} }}{remark(variable)}"
+        if len(found) > _MOST_RESULTS:
+            yield f"# {len(found) - _MOST_RESULTS} more are listed by: fmugym info --all"
 
     def _action(self, variable: Variable) -> str:
         parts = []
@@ -145,6 +175,32 @@ class Proposal:
         yield '# name = { distribution = "uniform", low = 0.9, high = 1.1 }'
         for variable in self._skeleton.parameters:
             yield f"# {_key(variable.name)} = {_as_toml(literal(variable))}{remark(variable)}"
+        if self._skeleton.left_out:
+            yield f"# {self._skeleton.left_out} more are listed by: fmugym info"
+
+    def _config(self) -> Iterator[str]:
+        """The old libraries that the FMU lacks; a comment until they are built."""
+        names: tuple[str, ...] = ()
+        if not isinstance(self._fmu.description, SystemDescription):
+            with suppress(FMULoadError):  # the notes tell what is damaged
+                names = replaceable(self._fmu)
+        if not names:
+            return
+        are_there = all(((self._folder or Path()) / name).exists() for name in names)
+        yield "\n[config]"
+        yield f"# The FMU needs this: fmugym stand-in {plain(self._fmu.path.name)} builds it"
+        yield ("" if are_there else "# ") + preload_line([f"./{name}" for name in names])
+
+
+def preload_line(paths: Sequence[str]) -> str:
+    """The line that names libraries, for the table ``[config]`` of a task file."""
+    return f"preload = [{', '.join(map(_quoted, paths))}]"
+
+
+def _is_result(variable: Variable) -> bool:
+    """Whether a local looks like something that a model is made to compute."""
+    is_local = variable.causality == "local" and variable.variability == "continuous"
+    return is_local and variable.numeric and variable.unit in _UNITS_OF_RESULTS
 
 
 def _free_alias(name: str, taken: set[str]) -> str:

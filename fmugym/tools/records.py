@@ -13,7 +13,6 @@ from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.series import RecordSeries, TimeSeries, plot, write_report
-from fmugym.tools.options import require_folder
 
 __all__ = ["About", "Recording", "require_format", "require_picture", "title_of"]
 
@@ -26,32 +25,25 @@ def require_picture(path: Path) -> None:
     """Refuse a file for a picture before any episode is played for it.
 
     Raises:
-        ConfigError: If its name tells no format of pictures, or its folder does not exist.
-        FileExistsError: If it exists.
+        ConfigError: If its name tells no format of pictures.
     """
-    _require_new(path, _PICTURES)
+    _require_ending(path, _PICTURES)
 
 
 def require_format(path: Path, runs: int) -> None:
     """Refuse a file before any episode is played for it.
 
     Raises:
-        ConfigError: If its name tells no known format, its folder does not exist, or a table cannot
-            hold so many runs.
-        FileExistsError: If it exists.
+        ConfigError: If its name tells no known format, or a table cannot hold so many runs.
     """
-    _require_new(path, (*_TABLES, *_PICTURES, _REPORT))
+    _require_ending(path, (*_TABLES, *_PICTURES, _REPORT))
     if path.suffix.lower() in _TABLES and runs > 1:
         raise ConfigError(f"{shown(str(path))} holds one run, got {runs}; a report holds several")
 
 
-def _require_new(path: Path, endings: Sequence[str]) -> None:
+def _require_ending(path: Path, endings: Sequence[str]) -> None:
     if path.suffix.lower() not in endings:
         raise ConfigError(f"the file ends with one of {', '.join(endings)}; got {shown(str(path))}")
-    require_folder(path)
-    if path.exists():
-        raise FileExistsError(f"{path} exists; name a new file")
-    require_folder(path)
 
 
 def title_of(target: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from fmugym.baselines import Controller, controller_of
+from fmugym.baselines import controller_of
 from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
@@ -150,7 +150,7 @@ def policy_of(env: FMUEnv, text: str) -> Policy:
     return policy_of_controller(controller_of(given), env)
 
 
-def policy_of_controller(controller: Controller, env: FMUEnv) -> Policy:
+def policy_of_controller(controller: Any, env: FMUEnv) -> Policy:
     """Bind a controller to an environment.
 
     Raises:

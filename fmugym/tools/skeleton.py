@@ -145,6 +145,11 @@ class Skeleton:
         """
         return self._settable_parameters[:MOST_PARAMETERS]
 
+    @property
+    def left_out(self) -> int:
+        """How many parameters of the FMU are not among ``parameters``."""
+        return len(self._of("parameter")) - len(self.parameters)
+
     @cached_property
     def _settable_parameters(self) -> list[Variable]:
         usable = (v for v in self._of("parameter") if v.settable_at_start and literal(v))
@@ -218,9 +223,8 @@ class Skeleton:
     def _parameter_lines(self) -> Iterator[str]:
         for variable in self.parameters:
             yield f"{_quoted(variable.name)}: {literal(variable)},{remark(variable)}"
-        left_out = len(self._of("parameter")) - len(self.parameters)
-        if left_out:
-            yield f"# {left_out} more are listed by: fmugym info"
+        if self.left_out:
+            yield f"# {self.left_out} more are listed by: fmugym info"
 
     def _times(self) -> Iterator[str]:
         note = "the default of the FMU" if self.has_step_size else _NO_STEP_SIZE

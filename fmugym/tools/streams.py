@@ -1,36 +1,70 @@
-"""The standard output of the command line, which FMUs and their libraries must not write to."""
+"""The standard streams of the command line, which FMUs and their libraries must not write to."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import io
 import os
+import shutil
 import sys
+import tempfile
+from pathlib import Path
+from typing import Any, BinaryIO
 
-__all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus"]
+__all__ = ["drop_output", "escape_what_consoles_lack", "keep_output_from_fmus", "named"]
 
 
-def keep_output_from_fmus() -> None:
-    """Let the standard output have what Python prints; all else goes to the standard error.
+def keep_output_from_fmus(*, shown: bool) -> BinaryIO | None:
+    """Let the standard streams have what Python prints; all else goes elsewhere.
 
     FMUs print what they like. A table, or the JSON that another program reads, must not have it
     between its lines. The C library writes what it still has when the process ends, so this is not
     undone.
+
+    Args:
+        shown: Whether it goes to the standard error instead of a file.
+
+    Returns:
+        The file, which has no name, so that nothing is left of it after any end of the process.
     """
-    old = sys.stdout
     with contextlib.suppress(OSError, AttributeError, io.UnsupportedOperation):
-        if old.fileno() != 1 or not isinstance(old, io.TextIOWrapper):
-            return
-        old.flush()
-        own = os.dup(1)
-        os.dup2(sys.stderr.fileno(), 1)
-        sys.stdout = open(  # noqa: SIM115, it lives as long as the process
-            own,
-            "w",
-            encoding=old.encoding,
-            errors=old.errors,
-            buffering=1 if old.line_buffering else -1,
-        )
+        if (sys.stdout.fileno(), sys.stderr.fileno()) != (1, 2):
+            return None
+        sys.stdout = _apart(sys.stdout)
+        if shown:
+            os.dup2(2, 1)
+            return None
+        sys.stderr = _apart(sys.stderr)
+        file = tempfile.TemporaryFile()  # noqa: SIM115, it lives as long as the process
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+        return file
+    return None
+
+
+def _apart(stream: Any) -> Any:
+    """The same stream on a descriptor of its own."""
+    stream.flush()
+    return open(
+        os.dup(stream.fileno()),
+        "w",
+        encoding=stream.encoding,
+        errors=stream.errors,
+        buffering=1 if stream.line_buffering or stream.write_through else -1,
+    )
+
+
+def named(printed: BinaryIO) -> Path | None:
+    """Give what FMUs have printed a file with a name; None if they have printed nothing."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # Windows has no such library
+        ctypes.CDLL(None).fflush(None)
+    if not printed.seek(0, os.SEEK_END):
+        return None
+    printed.seek(0)
+    with tempfile.NamedTemporaryFile(prefix="fmugym-printed-", suffix=".txt", delete=False) as file:
+        shutil.copyfileobj(printed, file)
+    return Path(file.name)
 
 
 def escape_what_consoles_lack() -> None:

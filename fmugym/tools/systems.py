@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
+from fmugym.declared.configuring import own_config
 from fmugym.declared.systems import fmu_of
 from fmugym.errors import ConfigError
 from fmugym.systems import FMUSystem
@@ -31,11 +32,19 @@ def find_model(path: Path, master: str | None = None) -> FMU | FMUSystem:
     if path.suffix.lower() == ".ssp":
         return FMUSystem.read(path, master=master)
     if path.suffix.lower() == ".toml":
-        source = fmu_of(Task.read(path), master)
-        return source if isinstance(source, FMUSystem) else FMU(source)
+        return _model_of(Task.read(path), master)
     if master is not None:
         raise ConfigError(f"a master is for systems; {path.name} is a single FMU")
     return FMU(path)
+
+
+def _model_of(task: Task, master: str | None) -> FMU | FMUSystem:
+    """The system that a task file names, or the FMU with the libraries of the task."""
+    source = fmu_of(task, master)
+    if isinstance(source, FMUSystem):
+        return source
+    preload = own_config(task.root).get("preload", ())
+    return FMU(source, preload=[preload] if isinstance(preload, str) else preload)
 
 
 def open_model(path: Path) -> FMU:

@@ -6,6 +6,7 @@ checks look for tasks that run but cannot be learned.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -15,11 +16,14 @@ import numpy as np
 from gymnasium import spaces
 
 from fmugym.archive.fmu import FMU
+from fmugym.declared import Task
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
+from fmugym.series.choice import quantities_of
 from fmugym.systems.fmu import SystemFMU
+from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, advise
 from fmugym.tools.findings import Finding, Report
@@ -388,21 +392,37 @@ def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     if not isinstance(space, spaces.Box):
         return
     names = env.observation_names or tuple(f"element {i}" for i in range(seen.shape[1]))
-    findings = [*_of_limits(space, names, seen), *_of_sizes(names, seen)]
+    findings = [*_of_limits(env, space, names, seen)]
+    if not _is_normalized(env):
+        findings += _of_sizes(names, seen)
     fine = Finding("ok", "observations", "within their limits, and of similar sizes")
     yield from findings or [fine]
 
 
-def _of_limits(space: spaces.Box, names: tuple[str, ...], seen: Any) -> Iterator[Finding]:
+def _is_normalized(env: FMUEnv) -> bool:
+    """Whether a task maps what the agent observes from its limits to -1 to 1."""
+    task = getattr(env, "task", None)
+    way = task.root.child("agent").child("normalize").value if isinstance(task, Task) else None
+    return way in (True, "limits")
+
+
+def _of_limits(
+    env: FMUEnv, space: spaces.Box, names: tuple[str, ...], seen: Any
+) -> Iterator[Finding]:
     outside = ((seen < space.low.reshape(-1)) | (seen > space.high.reshape(-1))).any(axis=0)
     if outside.any():
-        listing = ", ".join(
-            f"{names[i]} ({seen[:, i].min():.4g} to {seen[:, i].max():.4g})"
-            for i in np.flatnonzero(outside)
-        )
+        listing = ", ".join(_range(env, names[i], seen[:, i]) for i in np.flatnonzero(outside))
         yield Finding(
             "warning", "observations", f"outside of their limits: {listing}", "widen min and max"
         )
+
+
+def _range(env: FMUEnv, name: str, values: Any) -> str:
+    """The values of an observation, in the unit of the task."""
+    found = {one.name: one for one in quantities_of(env).all}.get(name, Quantity(name, "output"))
+    if _is_normalized(env) and math.isfinite(found.high - found.low):
+        values = found.low + (values + 1.0) / 2.0 * (found.high - found.low)
+    return f"{name} ({values.min():.4g} to {values.max():.4g} {found.unit}".rstrip() + ")"
 
 
 def _of_sizes(names: tuple[str, ...], seen: Any) -> Iterator[Finding]:

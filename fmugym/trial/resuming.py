@@ -81,13 +81,21 @@ def method_that_works(candidate: Candidate, spec: PoolSpec, starts: Starts | Non
         note_resuming(candidate, spec, starts, method)
     if grade is not Grade.BITWISE:
         logger.warning(
-            "%s: its saved states do not work%s (%s); snapshots keep the inputs of the episode, "
-            "and restoring one%s plays the episode again",
+            "%s: %s%s; snapshots keep the inputs of the episode, and restoring one%s plays the "
+            "episode again",
             candidate.path.name,
-            *(" in another process" if method is SaveMethod.COPY else "", grade),
+            *(_WHAT_IS_WRONG[grade], " in another process" if method is SaveMethod.COPY else ""),
             " in another environment" if method is SaveMethod.COPY else "",
         )
     return method
+
+
+_WHAT_IS_WRONG: Final = {
+    Grade.TOLERANCE: "outputs after a saved state are equal only within the solver's tolerance",
+    Grade.WRONG: "an episode that goes on from a saved state has other outputs",
+    Grade.FAILS: "a saved state cannot be restored",
+    Grade.ABSENT: "its state cannot be saved",
+}
 
 
 def _tried(request: Request) -> tuple[SaveMethod, Grade]:

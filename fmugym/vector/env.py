@@ -13,6 +13,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
+from fmugym.checks import check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray, Pool
 from fmugym.task.saving import require_saving
@@ -152,13 +153,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def reset(
         self,
-        *,
+        *misplaced: object,
         seed: int | Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Start new episodes.
 
         Args:
+            misplaced: None: the others are given by name.
             seed: Environment i is seeded with ``seed + i``, or with ``seed[i]`` of a list.
             options: As for a single environment, and ``"reset_mask"``, a Boolean array of shape
                 (N,): which environments to reset. The others go on.
@@ -170,6 +172,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
+        check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
             self._open_pool("reset")
         if seed is None and self._is_ready:
@@ -558,7 +561,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ) from None
 
     def __repr__(self) -> str:
-        return f"FMUVectorEnv({type(self._prototype).__name__}, num_envs={self.num_envs})"
+        return f"<FMUVectorEnv of {self.num_envs}: {self._prototype!r}>"
 
 
 def _rebuilt(

@@ -34,8 +34,8 @@ _HOW_TO_GET_WINE: Final = (
     "name its loader in the environment variable FMUGYM_WINE"
 )
 _HOW_TO_GET_ZIG: Final = (
-    "install the compiler that builds the worker program once: "
-    "pip install 'fmugym-toolbox[windows]'"
+    "install the compiler that builds the worker program once: ziglang, of the extra 'windows'; in "
+    "a clone of fmugym: pip install '.[windows]'"
 )
 
 
