@@ -3,6 +3,7 @@
 import itertools
 from contextlib import closing, suppress
 from functools import partial
+from operator import attrgetter
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -20,7 +21,7 @@ from fmugym.search.agent import AGENT, Agent
 from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.policy import LIMIT, Form, Policy, Scale
+from fmugym.search.policy import LIMIT, Form, Policy, scale_of
 from fmugym.search.search import VALIDATION
 from fmugym.tools import searching
 from fmugym.tools.evaluation import HELD_OUT_SEED
@@ -241,10 +242,10 @@ def test_costs_beyond_their_limits_come_first():
     """Returns 5, 9, 7, 1; two costs, of which the second has no room at all."""
     costs = np.array([[[1.0, 0.0]], [[4.0, 0.0]], [[2.0, 0.5]], [[2.0, -1.0]]])
     returns = np.array([[5.0], [9.0], [7.0], [1.0]])
-    merits = merits_of(Outcome(returns, costs), [2.0, 0.0])
+    merits = merits_of(Outcome(returns, costs, costs), [2.0, 0.0])
     assert merits == [(0.0, 5.0), (-1.0, 9.0), (-0.5, 7.0), (0.0, 1.0)]
     assert sorted(range(4), key=merits.__getitem__, reverse=True) == [0, 3, 2, 1]
-    without = merits_of(Outcome(returns, np.empty((4, 1, 0))), [])
+    without = merits_of(Outcome(returns, costs[..., :0], costs), [])
     assert [merit for _, merit in without] == [5, 9, 7, 1]
 
 
@@ -479,14 +480,36 @@ def recording(network, seen):
 
 
 def test_a_scale_is_mean_and_deviation():
-    scale, rng = Scale(3), np.random.default_rng(0)
-    features = rng.normal([[5.0], [-3.0], [0.0]], [[2.0], [0.1], [0.0]], (3, 1000))
-    features[2] = -7.0
-    assert [scale(part) for part in np.split(features, 4, axis=1)] == [(0.0, 1.0)] * 4
-    mean, divisor = scale.fixed()
+    """Of the steps of all episodes until their ends, whatever plays beside them."""
+    observed = []
+    form = Form("linear with history", history=True)
+    rows = np.array([np.zeros(form.size(2, 1))] * 4)
+    rows[:, -1] = np.sqrt(8) * np.array([-1.0, -0.3, 0.2, 0.9])
+    make = partial(Policy, None, form, scale=(np.zeros(7), np.ones(7)))
+    scales = []
+    for most_envs in (3, 512):
+        with closing(Arena(load(), most_envs)) as arena:
+            moments = arena.play(make, rows, SEEDS, attrgetter("moments")).watched.sum(axis=(0, 1))
+            scales.append(scale_of(moments))
+    assert np.array_equal(*scales)
+    with closing(load()()) as env:
+        for weights in rows:
+            policy = make(weights).bind(env)
+            policy._network = recording(policy._network, observed)
+            for seed in SEEDS:
+                policy.reset()
+                episode(env, policy, seed)
+    features = np.concatenate(observed, axis=1)
+    assert features.shape[1] == moments[0] < 40 * 12
+    mean, divisor = scales[0]
     assert mean == pytest.approx(features.mean(axis=1))
-    assert divisor[:2] == pytest.approx(features.std(axis=1)[:2])
-    assert divisor[2] == 7.0  # a constant is not made larger
+    assert divisor == pytest.approx(features.std(axis=1))
+
+
+def test_constants_are_not_made_larger():
+    mean, divisor = scale_of(np.array([10.0, -70.0, 1e-3, 0.0, 490.0, 1e-7, 0.0]))
+    assert mean.tolist() == [-7.0, 1e-4, 0.0]
+    assert divisor.tolist() == [7.0, 1.0, 1.0]
 
 
 class TestAgent:
@@ -756,7 +779,7 @@ class TestSearch:
             Arena, "play", lambda arena, *rest: calls.append(rest) or play(arena, *rest)
         )
         searched(tmp_path / "agent")
-        several = [(len(numbers), list(seeds)) for _, numbers, seeds in calls]
+        several = [(len(numbers), list(seeds)) for _, numbers, seeds, *_ in calls]
         training = {seed for count, seeds in several if count > 1 for seed in seeds}
         other = {seed for count, seeds in several if count == 1 for seed in seeds}
         test = set(range(HELD_OUT_SEED, HELD_OUT_SEED + 3))
@@ -770,9 +793,9 @@ class TestSearch:
     def test_equal_episodes_are_played_once(self, tmp_path, monkeypatch):
         counts, told, play = set(), [], Arena.play
 
-        def spy(arena, make, numbers, seeds):
+        def spy(arena, make, numbers, seeds, *watch):
             counts.add(len(seeds))
-            return play(arena, make, numbers, seeds)
+            return play(arena, make, numbers, seeds, *watch)
 
         monkeypatch.setattr(Arena, "play", spy)
         parameters = {"q_0": "pi", "theta_0": 0.5}
@@ -814,7 +837,7 @@ class TestSearch:
         guessed = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
         _, facts = searched(tmp_path / "agent", rounds=32, **guessed)
         assert "2 PI controllers" in told[0]
-        assert facts["baseline"] == "tuned guess"
+        assert facts["baseline"] == "tuned PI"
 
     def test_without_any_constant_actions_are_tuned(self, tmp_path):
         told = []

@@ -20,6 +20,8 @@ MOST_ENVS: Final = 512
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
+_NOTHING: Final = np.empty((0, 0))
+
 Make = Callable[[FloatArray], Controller]
 """Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
 
@@ -34,10 +36,12 @@ class Outcome(NamedTuple):
     Attributes:
         returns: The total rewards, shape (n, k).
         costs: The total of each cost that the arena watches, shape (n, k, c).
+        watched: The totals of other numbers, shape (n, k, r).
     """
 
     returns: FloatArray
     costs: FloatArray
+    watched: FloatArray
 
 
 class Arena:
@@ -75,13 +79,20 @@ class Arena:
             self._envs.close()
         self._envs = None
 
-    def play(self, make: Make, numbers: FloatArray, seeds: Sequence[int]) -> Outcome:
+    def play(
+        self,
+        make: Make,
+        numbers: FloatArray,
+        seeds: Sequence[int],
+        watch: Callable[[Any], FloatArray] = lambda controller: _NOTHING,
+    ) -> Outcome:
         """Let candidates play.
 
         Args:
             make: Makes the controller of a group.
             numbers: What the candidates differ in, shape (n, k).
             seeds: The seeds of their episodes.
+            watch: Gives more numbers of a controller that has decided, shape (r, N).
 
         Raises:
             CeilingError: If more steps are needed than there may be.
@@ -92,10 +103,11 @@ class Arena:
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
-            totals = self._play(envs, controller, [seeds[index] for index in which.tolist()])
+            totals = self._play(envs, controller, [seeds[index] for index in which.tolist()], watch)
             groups.append(totals[:, : len(part)])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
-        return Outcome(totals[0], np.moveaxis(totals[1:], 0, -1))
+        costs, watched = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._costs)], axis=-1)
+        return Outcome(totals[0], costs, watched)
 
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
@@ -105,19 +117,21 @@ class Arena:
             self._envs = FMUVectorEnv(self._make_env, size)
         return self._envs
 
-    def _play(self, envs: FMUVectorEnv, controller: Controller, seeds: list[int]) -> FloatArray:
-        """The total rewards and costs of one episode in each environment, shape (1 + c, N)."""
+    def _play(
+        self, envs: FMUVectorEnv, controller: Controller, seeds: list[int], watch: Any
+    ) -> FloatArray:
+        """Rewards, costs and what is watched, summed over an episode, shape (1 + c + r, N)."""
         observations, infos = envs.reset(seed=seeds)
-        totals = np.zeros((1 + len(self._costs), len(seeds)))
+        totals: FloatArray = np.zeros(())
         running = np.ones(len(seeds), dtype=bool)
         for _ in range(self._most_steps):
             if self.steps + len(seeds) > self.ceiling:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
             actions = controller.act(observations, infos)
             observations, rewards, terminated, truncated, infos = envs.step(actions)
-            totals[0] += np.where(running, rewards, 0.0)
-            for row, name in enumerate(self._costs, 1):
-                totals[row] += np.where(running, infos["costs"][name], 0.0)
+            costs = (infos["costs"][name] for name in self._costs)
+            each = np.stack([rewards, *costs, *watch(controller)])
+            totals = totals + np.where(running, each, 0.0)
             self.steps += len(seeds)
             running &= ~(terminated | truncated)
             if not running.any():

@@ -18,9 +18,9 @@ from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Axes", "Tuning", "tune"]
+__all__ = ["LEAST_CANDIDATES", "Axes", "Tuning", "tune"]
 
-_LEAST_CANDIDATES: Final = 8
+LEAST_CANDIDATES: Final = 8
 _SIGMA: Final = 0.3
 """Of the first candidates, as a part of the ranges."""
 
@@ -114,7 +114,7 @@ def tune(
     """
     for what, value in (("episodes", episodes), ("rounds", rounds), ("most_steps", most_steps)):
         check_count(what, value)
-    check_number("candidates", check_count("candidates", candidates), _LEAST_CANDIDATES)
+    check_number("candidates", check_count("candidates", candidates), LEAST_CANDIDATES)
     given = check_mapping("search", search)
     axes = Axes({name: _range(name, one) for name, one in given.items()})
     _check_names(make_controller, axes.ranges)

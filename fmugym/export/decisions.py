@@ -120,6 +120,6 @@ def _network_of(policy: Policy) -> Network | None:
     matrices = [one[0] for one in policy._layers]
     functions = [(Activation("tanh"),)] * (len(matrices) - 1) + [()]
     layers = [Layer(m[:-1].T, m[-1], then) for m, then in zip(matrices, functions, strict=True)]
-    mean, divisor = policy.scale  # type: ignore[misc]  # an agent's is fixed
+    mean, divisor = policy.scale
     scaling = Scaling(mean, divisor, np.full(mean.shape, LIMIT))
     return Network(tuple(layers), policy.space, scaling, dtype=np.dtype(np.float64))

@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "scale_of"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -83,28 +83,16 @@ class Form:
 CONSTANT: Final = Form("constant action", blind=True)
 
 
-class Scale:
-    """Learns what features are like: their mean and their deviation.
+def scale_of(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and divisor of each feature, shape (f,); constant ones are not made larger.
 
     Args:
-        count: How many features there are.
+        moments: The sums of what ``Policy.moments`` gives in each step, shape (1 + 2 f,).
     """
-
-    def __init__(self, count: int) -> None:
-        self._count, self._sums = 0, np.zeros((2, count))
-
-    def __call__(self, features: FloatArray) -> tuple[float, float]:
-        """Take features of shape (f, N) into account, and leave them as they are."""
-        self._count += features.shape[1]
-        self._sums += np.sum([features, features**2], axis=2)
-        return 0.0, 1.0
-
-    def fixed(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and divisor of each feature, shape (f,); constant ones are not made larger."""
-        mean, square = self._sums / self._count
-        deviation = np.sqrt(np.maximum(square - mean**2, 0.0))
-        is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
-        return mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
+    mean, square = np.split(moments[1:] / moments[0], 2)
+    deviation = np.sqrt(np.maximum(square - mean**2, 0.0))
+    is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
+    return mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
 
 
 class Policy(Controller):
@@ -118,8 +106,7 @@ class Policy(Controller):
         baseline: The controller; None for the middle of the range, or the first of the choices.
         form: What the network sees, and its layers; None for no network.
         weights: Shape (n,) with n from ``Form.size``, or (N, n) with those of each environment.
-        scale: Mean and divisor of each feature, shape (f,). Or a ``Scale``, which then learns from
-            the features.
+        scale: Mean and divisor of each feature, shape (f,).
         task: The names of the observations, and the action space in words, that it is for; None
             for any.
     """
@@ -129,7 +116,7 @@ class Policy(Controller):
         baseline: Controller | None,
         form: Form | None = None,
         weights: FloatArray = _NOTHING,
-        scale: Scale | tuple[FloatArray, FloatArray] = (_NOTHING, _NOTHING),
+        scale: tuple[FloatArray, FloatArray] = (_NOTHING, _NOTHING),
         task: tuple[tuple[str, ...], str] | None = None,
     ) -> None:
         self.baseline, self.form, self.task = baseline, form, task
@@ -186,8 +173,7 @@ class Policy(Controller):
     def _require_sizes(self, form: Form, weights: FloatArray) -> None:
         sizes = len(self.names), self.acting
         given = [(weights.shape[1], form.size(*sizes), "weights")]
-        if not callable(self.scale):
-            given += [(len(one), form.features(*sizes), "scales") for one in self.scale]
+        given += [(len(one), form.features(*sizes), "scales") for one in self.scale]
         for count, needed, what in given:
             if count != needed:
                 raise ConfigError(f"a {form.name} needs {needed} {what} here, got {count}")
@@ -211,6 +197,11 @@ class Policy(Controller):
             base = self.baseline._decide(rows).reshape(self.count, -1).T
         action, self._memory = self.step(rows.T, self._memory, base, self._network)
         return np.stack(action, axis=-1)
+
+    @property
+    def moments(self) -> FloatArray:
+        """One, the features of the last decision and their squares, shape (1 + 2 f, N)."""
+        return np.concatenate([np.ones((1, self.count)), self._shown, self._shown**2])
 
     @property
     def middle(self) -> list[float]:
@@ -274,7 +265,7 @@ class Policy(Controller):
 
         Rows are contiguous, as products of rows with gaps may be rounded in another way.
         """
-        mean, divisor = self.scale(features) if callable(self.scale) else self.scale
+        self._shown, (mean, divisor) = features, self.scale
         rows = np.ascontiguousarray(features.T)
         values = np.clip((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
         *hidden, last = self._layers

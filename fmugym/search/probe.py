@@ -11,12 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS
+from fmugym.baselines.base import FloatArray
 from fmugym.env import FMUEnv
 from fmugym.search.flattening import require_numbers, rows_of
 from fmugym.search.policy import Policy
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Probe"]
+__all__ = ["Probe", "document_of"]
 
 _ENVS: Final = 8
 _QUICK: Final = 2e-3
@@ -75,7 +76,7 @@ class Probe:
             limit = env.spec.max_episode_steps if env.spec is not None else None
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
-            document = env.task.document if hasattr(env, "task") else {}
+            document = document_of(env)
         with closing(FMUVectorEnv(make_env, min(envs, _ENVS))) as many:
             is_same, seconds, only_reward = _steps(many)
         if seconds < _QUICK:
@@ -104,20 +105,43 @@ class Probe:
         return self.seconds * self.most_steps * candidates * episodes
 
 
+def document_of(env: Any) -> Mapping[str, Any]:
+    """What the task of an environment declares; empty if it is no declared one."""
+    return env.task.document if hasattr(env, "task") else {}
+
+
 def _steps(envs: FMUVectorEnv) -> tuple[bool, float, float | None]:
-    """Whether all environments go the same way, the seconds of a step, and the only reward."""
+    """Whether all episodes go the same way, the seconds of a step, and the only reward.
+
+    Few environments play several times, so that their number does not matter.
+    """
+    count = envs.num_envs
+    begins = range(0, max(count, _ENVS), count)
+    begin = perf_counter()
+    played = [_played(envs, first, _SECONDS / len(begins)) for first in begins]
+    seconds = (perf_counter() - begin) / (sum(len(one) - 1 for one in played) * count)
+    steps = min(map(len, played))
+    together = np.concatenate([one[:steps] for one in played], axis=1)
+    is_same = bool((together == together[:, :1]).all())
+    rewards, terminated = np.unique(together[1:, :, 0]), together[:, :, 1].any()
+    only = float(rewards[0]) if len(rewards) == 1 and not terminated else None
+    return is_same, seconds, only
+
+
+def _played(envs: FMUVectorEnv, first: int, seconds: float) -> FloatArray:
+    """Reward, both kinds of ends and the observation after each step: shape (1 + steps, N, k).
+
+    They are for episodes from the seed ``first`` on. The first row is that of the reset.
+    """
     space, count = envs.single_observation_space, envs.num_envs
     envs.single_action_space.seed(0)
-    observations, _ = envs.reset(seed=list(range(count)))
-    rows = rows_of(space, observations, count)
-    is_same, seen, steps, begin = bool((rows == rows[0]).all()), set[float](), 0, perf_counter()
-    ended = over = False
-    while not over and steps < _STEPS and perf_counter() - begin < _SECONDS:
+    observations, _ = envs.reset(seed=list(range(first, first + count)))
+    told, over, begin = [np.zeros((count, 3))], False, perf_counter()
+    seen = [rows_of(space, observations, count)]
+    while not over and len(told) <= _STEPS and perf_counter() - begin < seconds:
         action = envs.single_action_space.sample()
         observations, rewards, terminated, truncated, _ = envs.step(np.array([action] * count))
-        rows, steps = rows_of(space, observations, count), steps + 1
-        is_same = is_same and bool((rows == rows[0]).all() and (rewards == rewards[0]).all())
-        seen = seen if len(seen) > 1 else seen.union(rewards.tolist())
-        ended, over = ended or bool(terminated.any()), bool((terminated | truncated).all())
-    only = seen.pop() if len(seen) == 1 and not ended else None
-    return is_same, (perf_counter() - begin) / (steps * count), only
+        seen.append(rows_of(space, observations, count))
+        told.append(np.stack([rewards, terminated, truncated], axis=1))
+        over = bool((terminated | truncated).all())
+    return np.concatenate([told, seen], axis=2)

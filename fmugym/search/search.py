@@ -16,7 +16,7 @@ from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
 from fmugym.search.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
-from fmugym.search.policy import CONSTANT, Form, Policy, Scale
+from fmugym.search.policy import CONSTANT, Form, Policy, scale_of
 
 __all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
 
@@ -257,16 +257,19 @@ class Search:
 
     def _scale(self, arena: Arena, *agents: Agent) -> tuple[FloatArray, FloatArray]:
         """What observations are like while each candidate adds another constant."""
-        scale = Scale(_HISTORY.features(*self._sizes))
         size, acting = _HISTORY.size(*self._sizes), self._sizes[1]
+        count = _HISTORY.features(*self._sizes)
+        moments = np.zeros(1 + 2 * count)
         for agent in agents:
             rows = np.zeros((self._population, size))
             rows[:, -acting:] = self._rng.uniform(-1, 1, (self._population, acting))
             rows *= np.sqrt(_HISTORY.shapes(*self._sizes)[0][0])
-            make = _Policies(agent, _HISTORY, scale)
-            arena.play(make, rows, self._training(self._episodes))
+            make = _Policies(agent, _HISTORY, (np.zeros(count), np.ones(count)))
+            seeds = self._training(self._episodes)
+            outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
+            moments += outcome.watched.sum(axis=(0, 1))
             self.rounds += 1
-        return scale.fixed()
+        return scale_of(moments)
 
     # Who wins.
 

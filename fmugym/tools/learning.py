@@ -12,6 +12,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
+from fmugym.baselines.tuning import LEAST_CANDIDATES
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
@@ -121,6 +122,7 @@ _OF_ALGORITHMS: Final = (
     *("record_every", "record_format", "track"),
 )
 _OF_SEARCHES: Final = ("minutes", "rounds", "candidates")
+_OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
 _COUNTS: Final = ("rounds", "candidates", "steps", "envs", "episodes")
 _BETWEEN_LINES: Final = 10.0
 
@@ -129,6 +131,8 @@ def _train(arguments: argparse.Namespace) -> None:
     has_algorithm = arguments.resume and (arguments.output / TRAINING).exists()
     if arguments.algorithm is None and not has_algorithm:
         _refuse(arguments, _OF_ALGORITHMS, "is for trainings with --algorithm, such as PPO")
+        if arguments.resume:
+            _refuse(arguments, ("seed", "candidates"), "cannot be changed by --resume")
         _search(arguments)
     else:
         _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")
@@ -138,15 +142,16 @@ def _train(arguments: argparse.Namespace) -> None:
 def _refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
     for name in names:
         if getattr(arguments, name) not in (None, []):
-            raise ConfigError(
-                f"--{name.replace('_', '-')} {why}".replace("--arguments", "KEY=VALUE")
-            )
+            option = _OTHERWISE.get(name, f"--{name.replace('_', '-')}")
+            raise ConfigError(f"{option} {why}")
 
 
 def _search(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in _COUNTS}
     counts = {name: value for name, value in given.items() if value is not None}
     check_numbers(arguments, *counts)
+    if arguments.candidates is not None:
+        check_number("--candidates", arguments.candidates, LEAST_CANDIDATES)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
     task, master = arguments.task, arguments.master
@@ -174,7 +179,8 @@ def _search(arguments: argparse.Namespace) -> None:
         say_json({"task": arguments.task, "output": arguments.output, **facts})
     else:
         say(verdict.text())
-        tell(f"{arguments.output} has the agent; --rounds {facts['rounds']} repeats the search")
+        options = f"--rounds {facts['rounds']} --candidates {facts['candidates']}"
+        tell(f"{arguments.output} has the agent; {options} repeats the search")
 
 
 def _now_and_then(advance: Advance) -> Callable[[float, str], None]:

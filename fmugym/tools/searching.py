@@ -19,9 +19,9 @@ from fmugym.baselines.parsing import has_range, search_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.agent import Agent
-from fmugym.search.entrants import NO_MERIT
+from fmugym.search.entrants import NO_MERIT, Merit
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.probe import Probe
+from fmugym.search.probe import Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search
 from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
@@ -124,7 +124,7 @@ def search(
         FileExistsError: If the folder exists, unless a search is resumed.
     """
     if resume:
-        course = _resumed(quest.folder)
+        course = _resumed(quest)
     else:
         require_new(quest.folder)
         course = _begun(quest, tell)
@@ -138,7 +138,8 @@ def search(
         winner = course.search.winner(arena)
     if winner is None:
         raise ConfigError(
-            f"{course.search.rounds} rounds are too few to find anything: give more --minutes"
+            f"{course.search.rounds} rounds are too few to find anything: give more --minutes, "
+            "--rounds or --steps"
         )
     return _judged(quest, course, winner, tell)
 
@@ -246,15 +247,21 @@ class _Run:
         self, quest: Quest, course: _Course, arena: Arena, advance: Callable[[float, str], None]
     ) -> None:
         self._quest, self._course, self._arena = quest, course, arena
-        self._advance, self._written, self._noted = advance, monotonic(), NO_MERIT
+        self._advance, self._written = advance, monotonic()
+        self._noted = NO_MERIT if course.search.baseline is None else self._best()
 
     def run(self) -> None:
-        """Search. What was found is written also if an exception ends the search."""
-        found, begin = self._course.search, monotonic()
-        last = begin
+        """Search. What was found is written also if an exception ends the search.
+
+        What was done in the round that it has interrupted is forgotten, so that those who resume or
+        repeat the search come to the same agent.
+        """
+        begin = last = monotonic()
+        self._keep()
         try:
             while not self._is_over(last - begin):
-                found.advance(self._arena)
+                self._course.search.advance(self._arena)
+                self._keep()
                 self._note()
                 now = monotonic()
                 self._advance(now - last, self._text())
@@ -262,7 +269,15 @@ class _Run:
         except CeilingError:
             pass
         finally:
+            self._course.search = pickle.loads(self._kept)
             self._write()
+
+    def _keep(self) -> None:
+        """Remember the search as it is between two rounds."""
+        self._kept, self._course.steps = pickle.dumps(self._course.search), self._arena.steps
+
+    def _best(self) -> Merit:
+        return max((merit for _, merit in self._course.search.known()), default=NO_MERIT)
 
     def _is_over(self, seconds: float) -> bool:
         found, rounds = self._course.search, self._quest.rounds
@@ -271,9 +286,8 @@ class _Run:
 
     def _text(self) -> str:
         """The scores, for a line of progress."""
-        found = self._course.search
-        merits = [merit for _, merit in found.known()]
-        best = f", best {max(merits)[1]:.6g}" if merits else ""
+        found, merit = self._course.search, self._best()
+        best = f", best {merit[1]:.6g}" if merit > NO_MERIT else ""
         beside = (
             f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}" if found.baseline else ""
         )
@@ -281,8 +295,7 @@ class _Run:
 
     def _note(self) -> None:
         """Add a line to the curve if a better agent than the baseline was found."""
-        found = self._course.search
-        best = max((merit for _, merit in found.known()), default=NO_MERIT)
+        found, best = self._course.search, self._best()
         if found.baseline is not None and best > self._noted:
             self._noted = best
             path = self._quest.folder / EVALUATIONS
@@ -297,7 +310,7 @@ class _Run:
 
     def _write(self) -> None:
         """Write the best agent until now, and the state of the search."""
-        self._course.steps, self._written = self._arena.steps, monotonic()
+        self._written = monotonic()
         known = self._course.search.known()
         if known:
             best, _ = max(known, key=lambda one: one[1])
@@ -327,12 +340,13 @@ def _save(folder: Path, course: _Course, agent: Agent) -> dict[str, Any]:
     return facts
 
 
-def _resumed(folder: Path) -> _Course:
+def _resumed(quest: Quest) -> _Course:
     """Read the state of a search; it is a pickle, which can run code.
 
     Raises:
-        ConfigError: If there is none, or it is damaged.
+        ConfigError: If there is none, it is damaged, or it is of another task.
     """
+    folder = quest.folder
     try:
         course = pickle.loads((folder / STATE).read_bytes())
     except FileNotFoundError:
@@ -343,6 +357,15 @@ def _resumed(folder: Path) -> _Course:
         ) from None
     if not isinstance(course, _Course):
         raise ConfigError(f"{STATE} in {shown(str(folder))} is of something else")
+    probe = course.probe
+    with closing(quest.make_env()) as env:
+        Agent("", None, names=probe.names, actions=probe.actions).policy().bind(env)
+        now = document_of(env)
+    changed = [key for key in {**probe.document, **now} if probe.document.get(key) != now.get(key)]
+    if changed:
+        raise ConfigError(
+            f"the search in {shown(str(folder))} is of a task with another {', '.join(changed)}"
+        )
     return course
 
 

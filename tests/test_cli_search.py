@@ -1,0 +1,421 @@
+"""The command that searches for agents: train without an algorithm."""
+
+import csv
+import io
+import json
+import shutil
+from contextlib import redirect_stderr, redirect_stdout
+
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym.baselines.arena import Arena, Outcome
+from fmugym.search.agent import AGENT, Agent
+from fmugym.search.probe import Probe
+from fmugym.search.search import Search
+from fmugym.tools.cli import main
+from fmugym.tools.judging import Verdict
+
+TASK = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": 0.05,
+    "episode_length": "2s",
+    "variables": {"tau": {"min": -0.1, "max": 0.1}},
+    "agent": {"actions": ["tau"], "observations": ["theta", "theta_dot"]},
+    "parameters": {"q_0": "pi", "theta_0": {"distribution": "uniform", "low": 0.1, "high": 1}},
+    "controllers": {"lazy": 0, "pi": "pid of=theta setpoint=0 kp=-2..-0.01 td=0.2"},
+    "reward": "-theta**2 - 0.1 * theta_dot**2",
+    "costs": {"effort": {"expr": "abs(tau)", "limit": 1.0}},
+    "terminated": "abs(theta) > 1.45",
+}
+SMALL = "--candidates", "8", "--episodes", "3"
+ROUNDS = 45
+
+
+def run(capsys, *arguments):
+    code = main([str(argument) for argument in arguments])
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def searched(capsys, task, folder, *options):
+    return run(capsys, "train", task, "--output", folder, *SMALL, *options)
+
+
+@pytest.fixture
+def task(tmp_path):
+    return written(tmp_path)
+
+
+def written(tmp_path, name="task", **changes):
+    document = {key: value for key, value in (TASK | changes).items() if value is not None}
+    path = tmp_path / f"{name}.toml"
+    fmugym.Task.from_dict(document).write(path)
+    return path
+
+
+def facts_of(folder):
+    return json.loads((folder / "agent.json").read_text())
+
+
+def curve(folder):
+    """The scores; how many environments were idle depends on when they were made."""
+    lines = (folder / "evaluations.csv").read_text().splitlines()
+    return [line.partition(",")[2] for line in lines]
+
+
+def content(folder):
+    return (folder / AGENT).read_bytes()
+
+
+class Interruption:
+    """Ctrl-C after some rounds, or within the next one."""
+
+    def __init__(self, monkeypatch, rounds, *, within=False):
+        self.rounds, advance, play = rounds, Search.advance, Arena.play
+
+        def advanced(search, arena):
+            if not within and search.rounds >= self.rounds:
+                raise KeyboardInterrupt
+            self.now = search.rounds
+            advance(search, arena)
+
+        def played(arena, *arguments):
+            outcome = play(arena, *arguments)
+            if within and self.now >= self.rounds:
+                raise KeyboardInterrupt
+            return outcome
+
+        monkeypatch.setattr(Search, "advance", advanced)
+        monkeypatch.setattr(Arena, "play", played)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The folder of a search, and what it has printed."""
+    path, out = tmp_path_factory.mktemp("search"), io.StringIO()
+    options = "--output", str(path / "whole"), *SMALL, "--rounds", str(ROUNDS)
+    with redirect_stdout(out), redirect_stderr(io.StringIO()):
+        assert main(["train", str(written(path)), *options]) == 0
+    return path / "whole", out.getvalue()
+
+
+class TestCourse:
+    def test_rounds_repeat_a_search_and_its_output(self, whole, task, tmp_path, capsys):
+        folder, told = whole
+        code, out, err = searched(capsys, task, tmp_path / "b", "--rounds", ROUNDS, "--envs", "7")
+        assert (code, out) == (0, told)
+        assert content(tmp_path / "b") == content(folder)
+        assert f"--rounds {ROUNDS}" in err
+
+    @pytest.mark.parametrize("within", [False, True])
+    @pytest.mark.parametrize("rounds", [7, 20, 33])
+    def test_an_interrupted_search_goes_on_as_if_it_was_not(
+        self, rounds, within, whole, task, tmp_path, capsys, monkeypatch
+    ):
+        folder, parts = whole[0], tmp_path / "parts"
+        with monkeypatch.context() as patch:
+            Interruption(patch, rounds, within=within)
+            code, out, err = searched(capsys, task, parts, "--rounds", ROUNDS)
+        assert (code, out) == (130, "")
+        assert "--resume" in err
+        assert Agent.load(parts).name == facts_of(parts)["agent"]  # the best until then
+        options = "--output", parts, "--episodes", "3", "--rounds", ROUNDS, "--resume"
+        code, out, err = run(capsys, "train", task, *options)
+        assert (code, out) == (0, whole[1]), err
+        assert content(parts) == content(folder)
+        assert curve(parts) == curve(folder)
+
+    def test_a_resumed_search_may_be_longer(self, whole, task, tmp_path, capsys):
+        """And is then like one that was as long from the beginning."""
+        options = "--rounds", ROUNDS + 12
+        code, *_ = searched(capsys, task, tmp_path / "longer", *options)
+        assert code == 0
+        folder = shutil.copytree(whole[0], tmp_path / "whole")
+        options = "--output", folder, "--episodes", "3", *options, "--resume"
+        assert run(capsys, "train", task, *options)[0] == 0
+        assert content(folder) == content(tmp_path / "longer")
+
+    @pytest.mark.parametrize("ceiling", [20_000, 60_000, 75_000])
+    def test_steps_are_a_ceiling(self, ceiling, task, tmp_path, capsys):
+        """The rounds that it tells repeat what was found until then."""
+        code, out, err = searched(capsys, task, tmp_path / "a", "--steps", ceiling)
+        assert code == 0, err
+        facts = facts_of(tmp_path / "a")
+        assert 0.5 * ceiling < facts["steps"] <= ceiling
+        options = words_after(err, "agent;")
+        code, again, err = searched(capsys, task, tmp_path / "b", *options)
+        assert (code, again) == (0, out), err
+        assert content(tmp_path / "b") == content(tmp_path / "a")
+
+    def test_a_search_that_time_has_ended_is_repeated(self, task, tmp_path, capsys, monkeypatch):
+        """Also if the FMU was slow, so that candidates were few."""
+        monkeypatch.setattr(Probe, "round_time", lambda self, candidates, _: 0.2 * candidates)
+        arguments = "train", task, "--episodes", "3"
+        options = "--minutes", "0.05", "--output", tmp_path / "a"
+        code, out, err = run(capsys, *arguments, *options)
+        assert code == 0, err
+        assert "--minutes" in err  # that it needs more
+        monkeypatch.undo()
+        options = words_after(err, "agent;")
+        code, again, err = run(capsys, *arguments, *options, "--output", tmp_path / "b")
+        assert (code, again) == (0, out), err
+        assert content(tmp_path / "b") == content(tmp_path / "a")
+
+    def test_what_cannot_be_resumed(self, whole, task, tmp_path, capsys):
+        folder = shutil.copytree(whole[0], tmp_path / "whole")
+        before = content(folder)
+        other = written(tmp_path, "other", time_step=0.1)
+        another = written(tmp_path, "another", agent=TASK["agent"] | {"observations": ["theta"]})
+        for path, output, options, fact in (
+            (task, tmp_path / "none", ["--rounds", "1"], "no search to resume"),
+            (task, folder, ["--rounds", "1", "--seed", "1"], "--seed"),
+            (task, folder, ["--rounds", "1", "--candidates", "9"], "--candidates"),
+            (task, folder, ["--algorithm", "PPO"], "no training to resume"),
+            (other, folder, ["--rounds", "1"], "time_step"),
+            (another, folder, ["--rounds", "1"], "theta_dot"),
+        ):
+            code, out, err = run(capsys, "train", path, "--output", output, *options, "--resume")
+            assert (code, out, err.count("\n")) == (1, "", 1), options
+            assert fact in err
+        assert content(folder) == before
+        (folder / "search.pkl").write_bytes(b"broken")
+        code, _, err = run(capsys, "train", task, "--output", folder, "--resume")
+        assert (code, "cannot be resumed" in err) == (1, True)
+
+    def test_an_interruption_before_anything_is_found(self, task, tmp_path, capsys, monkeypatch):
+        Interruption(monkeypatch, 0)
+        code, out, err = searched(capsys, task, tmp_path / "a", "--rounds", ROUNDS)
+        assert (code, out) == (130, "")
+        assert "nothing" in err
+
+
+def words_after(text, mark):
+    """The options in the last line that a search prints."""
+    words = text.rpartition(mark)[2].split()
+    return words[: words.index("repeats")]
+
+
+class TestOutput:
+    def test_it_tells_what_it_does(self, task, tmp_path, capsys):
+        code, out, err = searched(
+            capsys, task, tmp_path / "a", "--rounds", "25", "--steps", "1e9"[:1] + "0" * 9
+        )
+        assert code == 0
+        first, plan, *_ = err.splitlines()
+        assert "lazy" in first
+        assert "pi (to be tuned)" in first
+        for fact in ("8 candidates", "40 steps", "round 25", "1000000000 steps"):
+            assert fact in plan
+        assert out.count("\n") == 1
+        for fact in ("lazy", "tuned pi", "unseen episodes", "effort", "of at most 1"):
+            assert fact in out
+
+    def test_json(self, task, tmp_path, capsys):
+        code, out, _ = searched(capsys, task, tmp_path / "a", "--rounds", "32", "--json")
+        told = json.loads(out)
+        assert code == 0
+        assert told["output"] == str(tmp_path / "a")
+        assert told["rounds"] == 32
+        assert {"algorithm", "agent", "baseline", "candidates", "seed", "steps"} < told.keys()
+        assert {key: told[key] for key in facts_of(tmp_path / "a")} == facts_of(tmp_path / "a")
+        test = told["test"]
+        assert next(iter(test)) == told["agent"]
+        for one in test.values():
+            rewards = one["rewards"]["unseen episodes"]
+            assert len(rewards) == 3
+            assert one["total_reward"] == pytest.approx(np.mean(rewards))
+            assert one["mean_costs"]["effort"] >= 0
+
+    def test_its_curve(self, task, tmp_path, capsys):
+        code, *_ = searched(capsys, task, tmp_path / "a", "--rounds", "32")
+        assert code == 0
+        rows = list(csv.DictReader((tmp_path / "a" / "evaluations.csv").read_text().splitlines()))
+        steps = [int(row["steps"]) for row in rows]
+        rewards = [float(row["reward"]) for row in rows]
+        assert steps == sorted(set(steps))
+        assert rewards == sorted(rewards)
+        assert len({row["lazy"] for row in rows}) == 1
+
+    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, capsys):
+        path = written(tmp_path, reward=3, terminated=None)
+        code, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "5")
+        assert code == 0
+        assert err.count("warning") == err.count("3 in each step") == 1
+        path = written(tmp_path, "ends", reward=3)
+        _, _, err = searched(capsys, path, tmp_path / "b", "--rounds", "5")
+        assert "warning" not in err
+
+    def test_episodes_without_a_length_are_told(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr("fmugym.search.probe.MOST_STEPS", 50)
+        path = written(tmp_path, episode_length=None, controllers={"lazy": 0})
+        _, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "3")
+        assert "no length" in err
+        assert "50 steps" in err
+
+    def test_scenarios_are_the_test(self, tmp_path, capsys):
+        more = {
+            "data": {"goal": {"values": [0, 1, 2], "step": "1d"}},
+            "clock": {"from": "01-01", "to": "01-03", "step": "1h", "exclude": "scenarios"},
+            "scenarios": {
+                "early": {"start": "01-01 12:00", "length": "0.5s"},
+                "late": {"start": "01-02 12:00", "length": "1.5s"},
+            },
+            "reward": "-1",
+            "terminated": None,
+        }
+        path = written(tmp_path, **more)
+        code, out, _ = searched(capsys, path, tmp_path / "a", "--rounds", "5", "--json")
+        assert code == 0
+        (one, *_) = json.loads(out)["test"].values()
+        assert one["rewards"] == {"early": [-10.0] * 3, "late": [-30.0] * 3}
+        assert one["total_reward"] == -40.0
+
+    @pytest.mark.parametrize(
+        ("arguments", "facts"),
+        [
+            (["gamma=0.9"], ["KEY=VALUE", "--algorithm"]),
+            (["--no-normalize"], ["--no-normalize", "--algorithm"]),
+            (["--tune", "3"], ["--tune", "--algorithm"]),
+            (["--tune-steps", "3"], ["--tune-steps", "--algorithm"]),
+            (["--record", "*"], ["--record", "--algorithm"]),
+            (["--record-env", "1"], ["--record-env", "--algorithm"]),
+            (["--record-every", "1"], ["--record-every", "--algorithm"]),
+            (["--record-format", "csv"], ["--record-format", "--algorithm"]),
+            (["--track", "wandb"], ["--track", "--algorithm"]),
+            (["--algorithm", "PPO", "--minutes", "2"], ["--minutes", "without --algorithm"]),
+            (["--algorithm", "PPO", "--rounds", "2"], ["--rounds", "without --algorithm"]),
+            (["--algorithm", "PPO", "--candidates", "9"], ["--candidates", "without --algorithm"]),
+            (["--minutes", "0"], ["--minutes"]),
+            (["--minutes", "nan"], ["--minutes"]),
+            (["--rounds", "0"], ["--rounds"]),
+            (["--steps", "-3"], ["--steps"]),
+            (["--envs", "0"], ["--envs"]),
+            (["--candidates", "7"], ["--candidates", "8"]),
+            (["--seed", "-1"], ["seed"]),
+        ],
+        ids=lambda one: " ".join(one),
+    )
+    def test_mistakes(self, arguments, facts, task, tmp_path, capsys):
+        code, out, err = run(capsys, "train", task, "--output", tmp_path / "a", *arguments)
+        assert (code, out, err.count("\n")) == (1, "", 1)
+        for fact in facts:
+            assert fact in err
+        assert not (tmp_path / "a").exists()
+
+    def test_a_folder_with_files_is_refused(self, task, tmp_path, capsys):
+        code, _, err = searched(capsys, task, tmp_path, "--rounds", "3")
+        assert code == 1
+        assert f"{tmp_path} exists" in err
+
+    def test_a_task_that_no_search_can_take(self, tmp_path, capsys):
+        path = written(tmp_path, reward=None)
+        code, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "3")
+        assert (code, err.count("\n")) == (1, 1)
+        assert "reward" in err
+        assert not (tmp_path / "a").exists()
+
+
+class TestAgents:
+    def test_all_who_play_take_them(self, whole, task, tmp_path, capsys):
+        folder, told = whole[0], facts_of(whole[0])
+        expected = told["test"][told["agent"]]["rewards"]["unseen episodes"]
+        options = "--agent", folder, "--episodes", "3", "--seed", "1000000", "--json"
+        code, out, _ = run(capsys, "evaluate", task, *options)
+        assert code == 0
+        assert json.loads(out)["scores"][1]["rewards"] == expected
+        code, out, _ = run(capsys, "simulate", task, *options)
+        assert code == 0
+        assert [one["total_reward"] for one in json.loads(out)["episodes"]] == expected
+        table = tmp_path / "table.csv"
+        code, out, _ = run(capsys, "record", task, *options, "--output", table)
+        assert code == 0
+        assert [one["total_reward"] for one in json.loads(out)["runs"][str(folder)]] == expected
+        assert table.exists()
+
+    def test_beside_controllers_they_reach_what_the_verdict_tells(self, whole, task, capsys):
+        told = facts_of(whole[0])["test"]["lazy"]
+        options = "--controller", "lazy", "--episodes", "3", "--json"
+        code, out, _ = run(capsys, "evaluate", task, *options)
+        assert code == 0
+        score = json.loads(out)["scores"][1]
+        assert score["rewards"] == told["rewards"]["unseen episodes"]
+        assert score["mean_cost"] == pytest.approx(told["mean_costs"]["effort"])
+
+    def test_another_task_is_refused_by_what_differs(self, whole, tmp_path, capsys):
+        other = written(tmp_path, "other", agent=TASK["agent"] | {"observations": ["theta"]})
+        for command in ("evaluate", "simulate"):
+            code, _, err = run(capsys, command, other, "--agent", whole[0])
+            assert (code, err.count("\n")) == (1, 1)
+            assert "theta_dot" in err
+
+    def test_a_controller_with_a_range_plays_nowhere(self, task, capsys):
+        code, _, err = run(capsys, "simulate", task, "--controller", "pi")
+        assert (code, err.count("\n")) == (1, 1)
+        assert "kp=-2..-0.01 is a range" in err
+
+
+def verdict(limits=(), **returns):
+    """Of returns for each scenario, with 0.5 for each cost."""
+    outcomes = {
+        name: [
+            Outcome(np.array([one]), np.full((1, len(one), len(limits)), 0.5), np.empty(0))
+            for one in rows
+        ]
+        for name, rows in returns.items()
+    }
+    names = [f"s{i}" for i in range(len(next(iter(returns.values()))))]
+    return Verdict(outcomes, names, dict(limits))
+
+
+class TestVerdict:
+    def test_its_interval_is_students(self):
+        """Of paired differences, each beside its mean in the scenario."""
+        stats = pytest.importorskip("scipy.stats", reason="needs SciPy: the extra test")
+        rng = np.random.default_rng(0)
+        for scenarios, episodes in ((1, 100), (1, 2), (3, 4), (2, 3)):
+            one = rng.normal([[-100.0], [-50.0], [-10.0]][:scenarios], 5.0, (scenarios, episodes))
+            two = one + rng.normal(2.0, 1.0, (scenarios, episodes)) * [[1], [3], [9]][:scenarios]
+            gain, half = verdict(new=two.tolist(), old=one.tolist()).gain("new", "old")
+            difference = two - one
+            assert gain == pytest.approx(difference.mean(axis=1).sum())
+            error = np.sqrt((difference.var(axis=1, ddof=1) / episodes).sum())
+            freedom = scenarios * (episodes - 1)
+            low, high = stats.t.interval(0.95, freedom, loc=gain, scale=error)
+            assert (gain - half, gain + half) == pytest.approx((low, high), rel=0.01)
+            if scenarios == 1:
+                known = stats.ttest_rel(two[0], one[0]).confidence_interval(0.95)
+                assert (gain - half, gain + half) == pytest.approx(tuple(known), rel=0.01)
+
+    @pytest.mark.parametrize(
+        ("new", "old", "facts", "missing"),
+        [
+            ([-90, -91, -89], [-100, -101, -99], ["10 % better than old"], ["chance"]),
+            ([110, 111, 109], [100, 101, 99], ["10 % better than old"], ["chance"]),
+            ([-110, -111, -109], [-100, -101, -99], ["10 % worse than old"], ["chance"]),
+            ([5, 6, 4], [-5, -4, -6], ["10 better than old"], ["%", "chance"]),
+            ([0, 0, 0], [-5, -4, -6], ["5 better than old (2.52 to 7.48)"], ["%", "chance"]),
+            ([-5, 5, 0], [-1, -1, -1], ["1 better than old", "chance"], ["%"]),
+            ([3], [2], ["50 % better than old in"], ["(", "chance"]),
+        ],
+    )
+    def test_its_line(self, new, old, facts, missing):
+        text = verdict(new=[new], old=[old], third=[old]).text()
+        for fact in facts:
+            assert fact in text
+        for one in missing:
+            assert one not in text
+        assert text.startswith(f"new {np.mean(new):g}, old {np.mean(old):g}, third ")
+
+    def test_totals_are_sums_over_scenarios(self):
+        text = verdict(
+            new=[[-1.0, -3.0], [-10.0, -10.0]], old=[[-4.0, -4.0], [-20.0, -20.0]]
+        ).text()
+        assert text.startswith("new -12, old -24: 50 % better than old (32.1 to 67.9)")
+
+    def test_costs_stand_beside_their_limits(self):
+        limits = {"cold": 2.0, "noise": 0.25}.items()
+        text = verdict(limits, new=[[1.0, 2.0]], old=[[0.5, 0.5]]).text()
+        assert "cold new 0.5, old 0.5 of at most 2" in text
+        assert "noise new 0.5, old 0.5 of at most 0.25" in text
