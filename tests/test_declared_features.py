@@ -308,7 +308,7 @@ def test_parquet_without_pyarrow(tmp_path, monkeypatch):
     (tmp_path / "weather.parquet").write_bytes(b"PAR1")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     data = {"T": {"file": str(tmp_path / "weather.parquet"), "column": "T_C"}}
-    with pytest.raises(TaskError, match=r"weather\.parquet.*\[parquet\]"):
+    with pytest.raises(TaskError, match=r"data\.T\.file.*'parquet'"):
         fmugym.load(BASE | {"data": data})
 
 
