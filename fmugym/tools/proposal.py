@@ -53,7 +53,7 @@ _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
 _GOAL: Final = re.compile(
-    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\bx\b|\[(m|rad|deg|m/s|rad/s)\]",
+    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\b[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
     re.IGNORECASE,
 )
 """What is often controlled, in names, descriptions and units."""
@@ -221,7 +221,7 @@ class Proposal:
         low, high = _ends_of_setpoint(self._goal)
         drawn = f'{{ distribution = "uniform", low = {low:.12g}, high = {high:.12g} }}'
         yield "[setpoints]"
-        yield f"{self._setpoint} = {drawn}  # TODO: a guess; a number, if it is constant"
+        yield f"{self._setpoint} = {drawn}  # TODO: a guess; a number is constant"
 
     def _controllers(self) -> Iterator[str]:
         """PI controllers of a single action, with both signs."""
