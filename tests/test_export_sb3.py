@@ -224,7 +224,17 @@ class TestCommand:
 
     def test_from_training_to_c(self, tmp_path, capsys):
         task, folder = str(EXAMPLES / "cart_pole.toml"), tmp_path / "trained"
-        options = ["--steps", "256", "--envs", "2", "--episodes", "1", "n_steps=64"]
+        options = [
+            "--algorithm",
+            "PPO",
+            "--steps",
+            "256",
+            "--envs",
+            "2",
+            "--episodes",
+            "1",
+            "n_steps=64",
+        ]
         assert main(["train", task, "--output", str(folder), *options]) == 0
         capsys.readouterr()
         output = tmp_path / "agent.c"

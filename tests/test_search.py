@@ -21,6 +21,10 @@ from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
+from fmugym.search.search import VALIDATION
+from fmugym.tools import searching
+from fmugym.tools.evaluation import HELD_OUT_SEED
+from fmugym.tools.searching import Quest
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
 STRETCH = 10.0 ** np.linspace(0, 2, 6)  # lengths of axes, so that variances differ by 1e4
@@ -679,3 +683,158 @@ def guesses(physical=True, **changes):
     document = CONTROLLED | changes
     with closing(fmugym.load(fmugym.Task.from_dict(document), physical=physical)) as env:
         return guessed_controllers(env.task.document, env)
+
+
+CONTROLLERS = {"lazy": "schedule 00:00=0", "pi": "pid of=theta setpoint=0 kp=0.01..2 td=0.2"}
+ROUNDS = 45  # enough for the tuning of one controller, and for two classes of policies
+
+
+def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS, **options):
+    """The verdict and the facts of a short search; ``options`` are of quests or of the task."""
+    fields = {name for name in options if name in Quest.__dataclass_fields__}
+    changes = {name: value for name, value in options.items() if name not in fields}
+    make_env = load(document, **{"controllers": CONTROLLERS, **changes})
+    given = {"candidates": 8, "episodes": 3} | {name: options[name] for name in fields}
+    quest = Quest(make_env, {"unseen episodes": make_env}, folder, rounds=rounds, **given)
+    told = [] if told is None else told
+    return searching.search(quest, told.append, lambda *_: None, resume=resume)
+
+
+def content(folder):
+    return (folder / AGENT).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    """The folder of a search, its verdict, and its facts."""
+    folder = tmp_path_factory.mktemp("search") / "agent"
+    return folder, *searched(folder)
+
+
+class TestSearch:
+    def test_it_beats_the_controllers(self, usual):
+        folder, verdict, facts = usual
+        agents = list(verdict.outcomes)
+        assert set(agents) > {"lazy", "tuned pi"}
+        assert agents[0] == facts["agent"] == Agent.load(folder).name
+        assert agents[1] == facts["baseline"]
+        gain, half = verdict.gain(*agents[:2])
+        assert gain > half > 0
+        assert facts["rounds"] == ROUNDS
+
+    def test_its_agent_reaches_what_it_tells(self, usual):
+        """In single environments, by the file alone."""
+        folder, verdict, _ = usual
+        told = next(iter(verdict.outcomes.values()))[0].returns[0].tolist()
+        with closing(load()()) as env:
+            policy = Agent.load(folder).policy().bind(env)
+            for seed, expected in enumerate(told, HELD_OUT_SEED):
+                policy.reset()
+                assert episode(env, policy, seed)[0] == expected
+
+    @pytest.mark.parametrize("envs", [1, 5, 33])
+    def test_the_same_rounds_give_the_same_agent_with_any_environments(self, usual, envs, tmp_path):
+        folder, verdict, _ = usual
+        again, _ = searched(tmp_path / "agent", envs=envs)
+        assert content(tmp_path / "agent") == content(folder)
+        assert again.as_dict() == verdict.as_dict()
+
+    def test_the_same_rounds_give_the_same_agent_with_one_thread(
+        self, usual, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr("fmugym.pool.native.available_processors", lambda: 1)
+        searched(tmp_path / "agent")
+        assert content(tmp_path / "agent") == content(usual[0])
+
+    def test_another_seed_gives_another_agent(self, usual, tmp_path):
+        searched(tmp_path / "agent", seed=1)
+        assert content(tmp_path / "agent") != content(usual[0])
+
+    def test_training_validation_and_test_never_share_episodes(self, tmp_path, monkeypatch):
+        calls, play = [], Arena.play
+        monkeypatch.setattr(
+            Arena, "play", lambda arena, *rest: calls.append(rest) or play(arena, *rest)
+        )
+        searched(tmp_path / "agent")
+        several = [(len(numbers), list(seeds)) for _, numbers, seeds in calls]
+        training = {seed for count, seeds in several if count > 1 for seed in seeds}
+        other = {seed for count, seeds in several if count == 1 for seed in seeds}
+        test = set(range(HELD_OUT_SEED, HELD_OUT_SEED + 3))
+        assert len(training) > 100
+        assert 0 <= min(training) < max(training) < VALIDATION == 500_000
+        assert test < other
+        assert VALIDATION <= min(other - test) < max(other - test) < HELD_OUT_SEED == 1_000_000
+        firsts = [min(seeds) for count, seeds in several if count == 1]
+        assert firsts == sorted(firsts)  # the test is played once, at the end
+
+    def test_equal_episodes_are_played_once(self, tmp_path, monkeypatch):
+        counts, told, play = set(), [], Arena.play
+
+        def spy(arena, make, numbers, seeds):
+            counts.add(len(seeds))
+            return play(arena, make, numbers, seeds)
+
+        monkeypatch.setattr(Arena, "play", spy)
+        parameters = {"q_0": "pi", "theta_0": 0.5}
+        verdict, _ = searched(tmp_path / "agent", parameters=parameters, told=told)
+        assert counts == {1}
+        assert any("one episode" in line for line in told)
+        assert np.isnan(verdict.gain(*list(verdict.outcomes)[:2])[1])
+
+    def test_a_baseline_that_cannot_be_beaten_stays(self, tmp_path):
+        told = []
+        best = {"best": "schedule 00:00=0.05", "lazy": "schedule 00:00=0"}
+        verdict, facts = searched(
+            tmp_path / "agent", reward="-abs(tau - 0.05)", controllers=best, told=told
+        )
+        assert facts["agent"] == facts["baseline"] == next(iter(verdict.outcomes)) == "best"
+        assert [line for line in told if "nothing was found that beats best" in line]
+        agent = Agent.load(tmp_path / "agent")
+        assert (agent.text, agent.form) == ("schedule 00:00=0.05", None)
+
+    def test_limits_of_costs_are_kept(self, tmp_path):
+        """The most torque is best, and half of it is allowed: 40 steps of 0.05 Nm."""
+        costs = {"effort": {"expr": "abs(tau)", "limit": 2.0}}
+        changes = {"reward": "tau", "costs": costs, "controllers": None, "terminated": None}
+        verdict, facts = searched(tmp_path / "agent", rounds=60, **changes)
+        (outcome,) = verdict.outcomes[facts["agent"]]
+        assert outcome.costs.mean() <= 2.0
+        assert outcome.returns.mean() > 1.8
+        assert "of at most 2" in verdict.text()
+
+    def test_a_number_is_a_controller_to_be_beaten(self, tmp_path):
+        verdict, facts = searched(
+            tmp_path / "agent", reward="-abs(tau - 0.05)", controllers={"best": 0.05}, rounds=20
+        )
+        assert facts["baseline"] == "best"
+        assert verdict.total("best") == pytest.approx(0.0, abs=1e-6)
+
+    def test_without_controllers_guesses_are_tuned(self, tmp_path):
+        told = []
+        guessed = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
+        _, facts = searched(tmp_path / "agent", rounds=32, **guessed)
+        assert "2 PI controllers" in told[0]
+        assert facts["baseline"] == "tuned guess"
+
+    def test_without_any_constant_actions_are_tuned(self, tmp_path):
+        told = []
+        _, facts = searched(tmp_path / "agent", controllers=None, told=told, rounds=8)
+        assert "constant action" in told[0]
+        assert facts["baseline"] == "constant action"
+
+    def test_too_few_rounds_are_told(self, tmp_path):
+        one = {"pi": CONTROLLERS["pi"]}
+        with pytest.raises(ConfigError, match="3 rounds are too few"):
+            searched(tmp_path / "agent", rounds=3, controllers=one)
+
+    def test_a_folder_that_exists_is_refused(self, tmp_path):
+        (tmp_path / "other.txt").touch()
+        with pytest.raises(FileExistsError, match=str(tmp_path)):
+            searched(tmp_path)
+
+    def test_few_rounds_find_no_less_than_what_is_there(self, tmp_path):
+        """A controller that is ready takes part from the beginning."""
+        good = {"best": "schedule 00:00=0.05", "pi": CONTROLLERS["pi"]}
+        changes = {"reward": "-abs(tau - 0.05)", "controllers": good}
+        _, facts = searched(tmp_path / "agent", rounds=6, **changes)
+        assert facts["agent"] == "best"

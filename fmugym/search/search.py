@@ -284,7 +284,8 @@ class Search:
         Returns:
             The agent; None if the search has been too short to find one.
         """
-        agents = [agent for agent, _ in self.known()] or self._fixed
+        ready = self._fixed if self.baseline is None else []
+        agents = [*ready, *(agent for agent, _ in self.known())]
         if not agents:
             return None
         seeds = range(_FINAL, _FINAL + (_LAST if self._episodes > 1 else 1))

@@ -73,8 +73,8 @@ EXAMPLES: Final = {
         "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96",
     ),
     "train": (
-        "fmugym train examples/cart_pole.toml --output agent --steps 20000 learning_rate=1e-3",
-        "fmugym train examples/cart_pole.toml --output agent --steps 24000 --resume",
+        "fmugym train examples/cart_pole.toml --output agent --minutes 0.1",
+        "fmugym train examples/cart_pole.toml --output agent --minutes 0.1 --resume",
     ),
     "tune": (
         'fmugym tune task.toml "pid of=q setpoint=1 kp=0.01..1 td=0..1" --rounds 3 --steps 100 '
