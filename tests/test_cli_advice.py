@@ -98,6 +98,68 @@ def test_lines_can_be_written_into_the_file(lag, tmp_path, capsys):
     load(tmp_path / "b.toml").close()
 
 
+class TestEpisodeLength:
+    """The lag follows as 1 - exp(-t), so with a time constant of 1 s."""
+
+    def length_of(self, task):
+        advice, report = advised(task)
+        reasons = [one.why for one in report.advices if one.key == "episode_length"]
+        return advice.get("episode_length"), "".join(reasons)
+
+    @pytest.mark.parametrize("length", [0.05, 0.5])
+    def test_one_shorter_than_the_time_constant_becomes_longer(self, lag, length):
+        agent = {"actions": ["u"], "observations": ["x"]}
+        found, why = self.length_of(lag_task(lag, 1.0, episode_length=length, agent=agent))
+        assert 2.4 <= found <= 3.6
+        assert "x follows with a time constant of" in why
+        assert found == pytest.approx(0.05 * round(found / 0.05))
+        load(lag_task(lag, 1.0, episode_length=found, agent=agent)).close()
+
+    def test_one_that_is_long_enough_stays(self, lag):
+        assert self.length_of(lag_task(lag, 1.0)) == (None, "")
+
+    def test_a_second_of_a_house_gets_longer_steps_too(self):
+        """T_m follows by c_m A_f and the conductances of its walls and air, in a day or two."""
+        house = Task.from_dict(
+            {
+                "fmu": {"bundled": "House"},
+                "time_step": 0.002,
+                "episode_length": 1.0,
+                "agent": {"actions": ["u"], "observations": ["T_m"]},
+                "reward": "-abs(T_m - 293)",
+            }
+        )
+        advice, _ = advised(house)
+        assert 1 <= advice["episode_length"] / 3 / 86400 <= 2
+        assert 100 <= advice["episode_length"] / advice["time_step"] <= 2000
+        top = {key: advice[key] for key in ("time_step", "episode_length")}
+        load({**house.document, **top}).close()
+
+    def test_what_does_not_settle_gives_none(self):
+        cart = {
+            "fmu": {"bundled": "CartPole"},
+            "time_step": 0.05,
+            "episode_length": 0.5,
+            "variables": {"f": {"min": -10, "max": 10}},
+            "agent": {"actions": ["f"], "observations": ["x"]},
+            "reward": "-abs(x)",
+        }
+        assert self.length_of(Task.from_dict(cart)) == (None, "")
+
+
+def test_outputs_that_never_change_are_told(lag):
+    _, report = advised(lag_task(lag, 0.0))
+    (told,) = [one for one in report.findings if "never change" in one.text]
+    assert (told.verdict, told.check) == ("warning", "observations")
+    assert told.text.endswith(": fast")
+
+
+@pytest.mark.parametrize(("limit", "expected"), [(200.0, True), (5.0, None), (0.001, True)])
+def test_actions_of_another_size_than_algorithms_explore_are_rescaled(limit, expected):
+    variables = {"tau": {"min": -limit, "max": limit}}
+    assert advised(pendulum(variables=variables))[0].get("rescale") is expected
+
+
 class Exchanged(fmugym.FMI2MEEnv):
     """A model of ``exchange`` without inputs."""
 

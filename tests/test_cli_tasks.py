@@ -30,13 +30,13 @@ class TestNew:
         fmu = fmugym.bundled_fmu(model, version)
         code, out, err = run(capsys, "new", fmu, "--output", path)
         assert (code, out) == (0, "")
-        assert 'the reward is "0"' in err
+        assert "reward and set point are guesses" in err
         code, out, err = run(capsys, "validate", path, "--json")
-        report = json.loads(out)
-        assert (code, report["verdict"], err) == (0, "warning", "")
-        bad = {finding["check"] for finding in report["findings"] if finding["verdict"] != "ok"}
-        assert "reward" in bad
-        assert bad <= {"reward", "observations"}  # sizes of temperatures and powers differ
+        findings = json.loads(out)["findings"]
+        assert (code, err) == (0, "")
+        bad = {finding["check"] for finding in findings if finding["verdict"] != "ok"}
+        # sizes of temperatures and powers differ, and nothing writes the weather
+        assert bad <= ({"inputs", "observations"} if model == "House" else {"observations"})
 
     @pytest.mark.parametrize("version", [1, 2, 3])
     def test_types_of_every_kind(self, version, tmp_path, capsys):
@@ -91,6 +91,22 @@ DEFECTS = {
             "agent": {"actions": ["tau", "idle"], "observations": ["q"]},
         },
         ("warning", "actions", "element 1"),
+    ),
+    "an action that only the reward knows": (
+        {
+            "variables": {"fee": {"min": 0, "max": 1}} | TASK["variables"],
+            "agent": {"actions": ["tau", "fee"], "observations": ["q"]},
+            "reward": "-abs(q - 1) - fee",
+        },
+        ("warning", "actions", "no effect on observations: element 1"),
+    ),
+    "a reward that no action changes": (
+        {"reward": "-abs(time - 1)"},
+        ("warning", "reward", "the same in 50 steps, whatever the actions"),
+    ),
+    "a tiny reward": (
+        {"reward": "-1e-7 * abs(q - 1)"},
+        ("warning", "reward", "from -3"),
     ),
     "constant reward": ({"reward": 1}, ("warning", "reward", "always 1")),
     "no limit": ({"episode_length": None}, ("warning", "length", "no limit")),

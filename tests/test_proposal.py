@@ -66,15 +66,15 @@ def test_an_output_follows_a_set_point_that_the_agent_sees(new):
     assert "T_air_set" in task["agent"]["observations"]
     drawn = task["setpoints"]["T_air_set"]
     assert (drawn["low"], drawn["high"]) == (295.0, 305.0)  # 5 K around the nominal value
-    assert "the reward is a guess: 'T_air'" in notes
+    assert "guesses: 'T_air' follows 'T_air_set'" in notes
 
 
 def test_a_controller_of_one_action_has_both_signs(new):
     one, _ = new(fmugym.bundled_fmu("CartPole"))
     starts = [text.split("ti=")[0] for text in one["controllers"].values()]
     assert starts == [
-        "pid of=x setpoint=x_set kp=10..1e+05 ",
-        "pid of=x setpoint=x_set kp=-1e+05..-10 ",
+        "pid of=x setpoint=x_set kp=20..2e+05 ",
+        "pid of=x setpoint=x_set kp=-2e+05..-20 ",
     ]
     two, _ = new(fmugym.bundled_fmu("DoublePendulum"))
     assert two["controllers"] == {}
@@ -84,12 +84,12 @@ def test_a_controller_of_one_action_has_both_signs(new):
     ("inner", "low", "high"),
     [
         ('<Real min="0" max="8"/>', 2.0, 6.0),
-        ('<Real start="5"/>', 4.5, 5.5),
-        ('<Real start="5" max="5.2"/>', 4.5, 5.2),
+        ('<Real start="5"/>', 4.75, 5.25),
+        ('<Real start="5" min="6"/>', 6.125, 6.375),
         ('<Real start="293.15" unit="K" min="0"/>', 288.15, 298.15),
         ('<Real nominal="300" unit="K" min="0"/>', 295.0, 305.0),
-        ("<Real/>", 0.0, 1.0),
-        ("<Boolean/>", 0.0, 1.0),
+        ("<Real/>", 0.25, 0.75),
+        ("<Boolean/>", 0.25, 0.75),
     ],
 )
 def test_a_set_point_is_near_to_what_is_known(inner, low, high, make_fmu, new):
@@ -104,6 +104,7 @@ def test_a_set_point_is_near_to_what_is_known(inner, low, high, make_fmu, new):
     [
         ([("P", "W", "power"), ("T_room", "K", "")], "T_room"),
         ([("i", "A", "current"), ("w", "rad/s", "")], "w"),
+        ([("P", "W", ""), ("motor.w", "", "")], "motor_w"),
         ([("flow", "kg/s", ""), ("h", "", "Level of the tank")], "h"),
         ([("T_amb", "K", ""), ("T_room", "K", "")], "T_room"),
         ([("a", "", ""), ("b", "", "")], "a"),

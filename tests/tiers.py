@@ -137,6 +137,9 @@ EVERY_IN_SYSTEMS = 17
 """The same for the contract of pools with the FMU as a component of a system."""
 
 SLOW_TESTS = (
+    "test_proposal.py::test_bundled",
+    "test_proposal.py::test_foreign",
+    "test_proposal.py::test_types",
     "test_baselines_tuning.py::test_it_finds",
     "test_baselines_tuning.py::test_the_same",
     "test_cli.py::TestSkeleton::test_runs_for",

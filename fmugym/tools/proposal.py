@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import json
-import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -25,7 +24,7 @@ from fmugym.errors import ConfigError, FMULoadError
 from fmugym.search.guessing import guessed_controller
 from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value
-from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, reach, remark
+from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
 from fmugym.tools.stand_in import replaceable
 
 __all__ = ["Proposal", "preload_line"]
@@ -47,14 +46,14 @@ _MOST_RESULTS: Final = 30
 """Locals that are listed, at most."""
 
 _TEMPERATURES: Final = frozenset({"K", "degC", "degF"})
-_POWERS: Final = frozenset({"W", "kW", "MW", "J", "kJ", "Wh", "kWh"})
-"""Units of powers and energies; rewards and agents often need these and temperatures."""
+_UNITS_OF_RESULTS: Final = _TEMPERATURES | {"W", "kW", "MW", "J", "kJ", "Wh", "kWh"}
+"""Units of temperatures, powers and energies, which rewards and agents often need."""
 
 _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
 _GOAL: Final = re.compile(
-    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\bx\b|\[(m|rad|deg|m/s|rad/s)\]",
+    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\b[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
     re.IGNORECASE,
 )
 """What is often controlled, in names, descriptions and units."""
@@ -123,8 +122,7 @@ class Proposal:
 
     def notes(self) -> Iterator[str]:
         """What the user has to decide before the task is useful."""
-        goal, ends = self._goal, " to ".join(f"{end:g}" for end in _ends_of_setpoint(self._goal))
-        yield f"the reward is a guess: {goal.name!r} is to follow a set point from {ends}"
+        yield f"reward and set point are guesses: {self._goal.name!r} follows {self._setpoint!r}"
         for variable in self._others:
             yield f"input {variable.name!r} looks like a disturbance: no action writes it"
         for variable in filter(needs_bounds, self._actions):
@@ -221,10 +219,9 @@ class Proposal:
 
     def _setpoints(self) -> Iterator[str]:
         low, high = _ends_of_setpoint(self._goal)
-        drawn = f'{{ distribution = "uniform", low = {low!r}, high = {high!r} }}'
-        unit = f" [{plain(self._goal.unit)}]" if self._goal.unit else ""
+        drawn = f'{{ distribution = "uniform", low = {low:.12g}, high = {high:.12g} }}'
         yield "[setpoints]"
-        yield f"{self._setpoint} = {drawn}  # TODO: a guess{unit}; a number, if it is constant"
+        yield f"{self._setpoint} = {drawn}  # TODO: a guess; a number is constant"
 
     def _controllers(self) -> Iterator[str]:
         """PI controllers of a single action, with both signs."""
@@ -232,12 +229,12 @@ class Proposal:
         if len(self._actions) > 1:
             yield "# None: each gives one action, but there are several."
             return
-        (action,), of = self._actions, self._aliases[self._goal.name]
-        gain = np.ptp(guessed_bounds(action)) / (np.ptp(_ends_of_setpoint(self._goal)) or 1.0)
+        of, (low, high) = self._aliases[self._goal.name], guessed_bounds(self._actions[0])
+        gain = (high - low) / -np.subtract(*_ends_of_setpoint(self._goal))
         times = self._skeleton.time_step, self._length()
         yield f"# Guesses: the first one if more of the action raises {of}, or else the second."
         for name, sign in (("pi", ""), ("pi_reversed", "-")):
-            text = guessed_controller(of, self._setpoint, float(gain), times, sign)
+            text = guessed_controller(of, self._setpoint, gain, times, sign)
             yield f"{name} = {_quoted(text)}"
 
     def _parameters(self) -> Iterator[str]:
@@ -272,7 +269,7 @@ def preload_line(paths: Sequence[str]) -> str:
 def _is_result(variable: Variable) -> bool:
     """Whether a local looks like something that a model is made to compute."""
     is_local = variable.causality == "local" and variable.variability == "continuous"
-    return is_local and variable.numeric and variable.unit in _TEMPERATURES | _POWERS
+    return is_local and variable.numeric and variable.unit in _UNITS_OF_RESULTS
 
 
 def _words(variable: Variable) -> str:
@@ -293,19 +290,16 @@ def _unlikeliness(variable: Variable) -> tuple[bool, ...]:
         variable.unit not in _TEMPERATURES,
         _is_outside(variable),
         _GOAL.search(_words(variable)) is None,
-        variable.unit in _POWERS,
     )
 
 
 def _ends_of_setpoint(variable: Variable) -> tuple[float, float]:
-    """The middle of the range of an output, or values near its start or nominal value."""
-    low, high = variable.limits
-    if math.isfinite(high - low):
-        return low + (high - low) / 4, high - (high - low) / 4
-    start = variable.nominal if variable.start is None else start_value(variable)
-    middle = float(start) if isinstance(start, int | float) else 0.0
-    down, up = reach(variable) if variable.unit not in _TEMPERATURES else (_DEGREES, _DEGREES)
-    return max(middle - down, low), min(middle + up, high)
+    """Values near the start of a temperature, or in the middle of the range of another output."""
+    start = start_value(variable) or variable.nominal
+    if variable.unit in _TEMPERATURES and isinstance(start, int | float):
+        return start - _DEGREES, start + _DEGREES
+    low, high = guessed_bounds(variable)
+    return (3 * low + high) / 4, (low + 3 * high) / 4
 
 
 def _free_alias(name: str, taken: set[str]) -> str:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import chain
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.pool.base import FloatArray
-from fmugym.tools.accuracy import Course, Replay
+from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, rounded_down
 
 __all__ = ["advise_episodes"]
@@ -25,9 +23,10 @@ _FACTORS: Final = tuple(8**power for power in range(7))
 _MOST_SUBSTEPS: Final = 64
 """The FMU's own steps stay as long as they are, up to this factor."""
 
-_SECONDS: Final = 0.25
-"""After a response that took so long in real time, there are no longer ones."""
+_SLOW: Final = 2e-3
+"""After a response with longer steps in seconds of real time, there are no others."""
 
+_RISEN: Final = 1 - math.exp(-1)
 _SETTLED: Final = 0.02
 """The part of a response by which it changes in its second half, at most, if it has settled."""
 
@@ -38,94 +37,51 @@ _MANY: Final = 2000
 """Steps of an episode for which longer ones are recommended."""
 
 
-class _Response(NamedTuple):
-    """Real outputs with the lowest and with the highest inputs, each of shape (T + 1, k)."""
-
-    time_step: float
-    low: FloatArray
-    high: FloatArray
-
-
 def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
     """Tell outputs that never change, and recommend longer episodes where outputs are slow.
-
-    Outputs that do not settle, such as positions and levels, give no time constant.
 
     Args:
         replay: An episode.
         steps: How many steps one takes.
     """
-    outputs = [one for one in replay.spec.outputs if one.kind == "real"]
-    responses = _responses(replay, steps)
-    first = next(responses, None)
-    if first is not None:
-        yield from _of_still(outputs, first)
-        constants = _time_constants(outputs, chain([first], responses))
-        yield from _longer(replay.spec.time_step, steps, constants)
-
-
-def _responses(replay: Replay, steps: int) -> Iterator[_Response]:
-    """Those with longer and longer steps, as far as the FMU goes."""
-    first = max(1, round(steps / _STEPS_OF_AN_EPISODE))
-    for factor in _FACTORS:
-        low, high = (
-            _held(replay, values, first * factor)
-            for values in (replay.inputs.min(axis=0), replay.inputs.max(axis=0))
-        )
-        if low is None or high is None:
-            return
-        yield _Response(first * factor * replay.spec.time_step, low.outputs, high.outputs)
-        if _STEPS * (low.seconds + high.seconds) > _SECONDS:
-            return
-
-
-def _held(replay: Replay, inputs: FloatArray, factor: int) -> Course | None:
-    """What the FMU gives with constant inputs and longer steps; None if it does not go so far."""
-    course = replace(replay, inputs=np.tile(inputs, (_STEPS, 1))).run(
-        time_step=factor * replay.spec.time_step,
-        substeps=min(factor, _MOST_SUBSTEPS) * replay.spec.substeps,
-        stop_time=None,
-    )
-    is_there = course is not None and course.is_whole and np.isfinite(course.outputs).all()
-    return course if is_there else None
-
-
-def _of_still(outputs: list[Variable], response: _Response) -> Iterator[Doubt]:
-    both = np.concatenate([response.low, response.high])
+    constants = _time_constants(replay, steps)
     still = [
-        output.name
-        for output, values in zip(outputs, both.T, strict=True)
-        if output.variability == "continuous" and np.ptp(values) == 0.0
+        one.name for one in constants if not constants[one] and one.variability == "continuous"
     ]
     if still:
-        text = f"never change, whatever the inputs: {', '.join(still)}"
+        text = f"never change while the first action holds: {', '.join(still)}"
         yield Doubt(text, "leave them out of observations under [agent]", "observations")
-
-
-def _time_constants(outputs: list[Variable], responses: Iterable[_Response]) -> dict[str, float]:
-    """Those of the outputs that settle after a step of all inputs, in s, by name."""
-    found: dict[str, float] = {}
-    for time_step, low, high in responses:
-        for output, away in zip(outputs, np.abs(high - low).T, strict=True):
-            is_settled = np.ptp(away[_STEPS // 2 :]) <= _SETTLED * away[-1]
-            if output.name not in found and is_settled:
-                steps = int(np.argmax(away >= (1 - math.exp(-1)) * away[-1]))
-                found[output.name] = steps * time_step
-        if len(found) == len(outputs):
-            break
-    return found
-
-
-def _longer(time_step: float, steps: int, constants: dict[str, float]) -> Iterator[Advice]:
-    """What makes an episode longer than the slowest response."""
-    slowest = max(constants, key=lambda name: constants[name], default=None)
-    length = steps * time_step
-    if slowest is None or constants[slowest] <= length:
+    seconds, name = max(((constants[one], one.name) for one in constants), default=(0.0, ""))
+    time_step = replay.spec.time_step
+    if seconds <= steps * time_step:
         return
-    needed = _TIME_CONSTANTS * constants[slowest]
+    why = f"{name} follows with a time constant of {seconds:.3g} s: an episode ends before"
+    needed = _TIME_CONSTANTS * seconds
     if needed > _MANY * time_step:
         time_step = rounded_down(needed / _STEPS)
-        yield Advice("", "time_step", time_step, "for an episode of a few hundred steps")
+        yield Advice("", "time_step", time_step, why)
     value = float(f"{math.ceil(needed / time_step) * time_step:.12g}")
-    why = f"{slowest} follows with a time constant of {constants[slowest]:.3g} s"
-    yield Advice("", "episode_length", value, f"{why}, but an episode takes {length:g} s")
+    yield Advice("", "episode_length", value, why)
+
+
+def _time_constants(replay: Replay, steps: int) -> dict[Variable, float]:
+    """How long real outputs take to follow constant inputs, in s; 0 if they never change.
+
+    Outputs that do not settle, such as positions and levels, have none.
+    """
+    outputs = [one for one in replay.spec.outputs if one.kind == "real"]
+    held = replace(replay, inputs=np.repeat(replay.inputs[:1], _STEPS, axis=0))
+    found: dict[Variable, float] = {}
+    for factor in (max(1, round(steps / _STEPS_OF_AN_EPISODE)) * one for one in _FACTORS):
+        time_step = factor * replay.spec.time_step
+        substeps = min(factor, _MOST_SUBSTEPS) * replay.spec.substeps
+        course = held.run(time_step=time_step, substeps=substeps, stop_time=None)
+        if course is None or not course.is_whole or not np.isfinite(course.outputs).all():
+            break
+        for output, values in zip(outputs, course.outputs.T, strict=True):
+            away = np.abs(values - values[0])
+            if np.ptp(away[_STEPS // 2 :]) <= _SETTLED * away[-1]:
+                found.setdefault(output, time_step * int(np.argmax(away >= _RISEN * away[-1])))
+        if len(found) == len(outputs) or course.seconds > _SLOW:
+            break
+    return found

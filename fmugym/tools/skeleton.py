@@ -21,7 +21,7 @@ from fmugym.errors import ConfigError
 from fmugym.systems.description import SystemDescription
 from fmugym.tools.overview import plain, start_value
 
-__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "reach", "remark"]
+__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -301,7 +301,7 @@ def guessed_bounds(variable: Variable) -> tuple[float, float]:
     A model often fails far away from its start value.
     """
     low, high = variable.limits
-    down, up = reach(variable)
+    down, up = _reach(variable)
     start = _start(variable)
     if not math.isfinite(low):
         low = min(start, high) - down
@@ -315,7 +315,7 @@ def _start(variable: Variable) -> float:
     return float(value) if isinstance(value, int | float) else 0.0
 
 
-def reach(variable: Variable) -> tuple[float, float]:
+def _reach(variable: Variable) -> tuple[float, float]:
     """How far below and above its start value an input without limits may move.
 
     A tenth of a start value, and at most the nominal value. Without both, nothing is known; a model

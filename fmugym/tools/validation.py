@@ -132,8 +132,8 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
     if recommended.get("normalize") and _has_limits(env.observation_space):
         yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
     space = env.action_space
-    if isinstance(space, spaces.Box) and isinstance(getattr(env, "task", None), Task):
-        size = float(np.abs([space.low, space.high]).max())
+    if isinstance(space, spaces.Box):
+        size = np.abs([space.low, space.high]).max()
         if not _EXPLORED[0] <= size <= _EXPLORED[1]:
             why = f"actions reach {size:.3g}, but --algorithm explores by steps of about 1"
             yield Advice("agent", "rescale", True, why)
@@ -216,7 +216,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield from _of_actions(env, pairs)
     yield from _of_parameters(env)
     yield from _of_inputs(env)
-    yield _of_reward([first, *(episode for pair in pairs.values() for episode in pair)])
+    yield _of_reward(first, [episode for pair in pairs.values() for episode in pair])
     yield from _of_observations(env, first)
     yield _of_length(env)
     yield _of_export(env)
@@ -266,23 +266,19 @@ def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
 
 def _of_actions(env: FMUEnv, pairs: Mapping[str, Sequence[_Episode]]) -> Iterator[Finding]:
     """Compare episodes in which one action is at its lowest and its highest value."""
-    useless = [name for name, pair in pairs.items() if not _differ(*pair)]
-    unseen = [name for name, pair in pairs.items() if name not in useless and _look_same(*pair)]
-    if useless:
-        yield Finding(
-            "warning",
-            "actions",
-            f"no effect on observations or reward: {', '.join(useless)}",
-            "leave them out, or observe what they change",
-        )
+    unseen = [
+        name
+        for name, (low, high) in pairs.items()
+        if np.array_equal(low.observations, high.observations)
+    ]
     if unseen:
         yield Finding(
             "warning",
             "actions",
             f"no effect on observations: {', '.join(unseen)}",
-            "name what they change in observations under [agent]",
+            "leave them out, or name what they change in observations under [agent]",
         )
-    if _is_simple(env.action_space) and not useless and not unseen:
+    elif _is_simple(env.action_space):
         yield Finding("ok", "actions", "each action has an effect")
 
 
@@ -316,12 +312,9 @@ def _always(action: Any) -> Callable[[], Any]:
     return lambda: action
 
 
-def _look_same(first: _Episode, second: _Episode) -> bool:
-    return np.array_equal(first.observations, second.observations)
-
-
 def _differ(first: _Episode, second: _Episode) -> bool:
-    return not (_look_same(first, second) and np.array_equal(first.rewards, second.rewards))
+    same = np.array_equal(first.observations, second.observations)
+    return not same or not np.array_equal(first.rewards, second.rewards)
 
 
 def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
@@ -401,15 +394,19 @@ def _middle(space: Any) -> Any:
     return space.sample()
 
 
-def _of_reward(episodes: Sequence[_Episode]) -> Finding:
-    rewards, fault = episodes[0].rewards, episodes[0].fault
+def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
+    rewards = first.rewards
     low, high = rewards.min(), rewards.max()
     if low == high:
         text = f"always {low:g} with random actions"
         cure = "an agent learns from differences; that is fine only if episodes end early"
-    elif fault is None and all(np.array_equal(rewards, one.rewards) for one in episodes[1:]):
-        text = "the same whatever the actions"
-        cure = "name what the actions change in reward"
+    elif (
+        first.fault is None
+        and others
+        and all(np.array_equal(rewards, one.rewards) for one in others)
+    ):
+        text = f"the same in {len(rewards)} steps, whatever the actions"
+        cure = "let it depend on what the actions change"
     elif max(-low, high) < _TINY:
         text = f"from {low:.4g} to {high:.4g} with random actions"
         cure = f"multiply it by {rounded_down(1 / max(-low, high)):g}; only --algorithm minds"
