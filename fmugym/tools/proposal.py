@@ -53,7 +53,8 @@ _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
 _GOAL: Final = re.compile(
-    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\b[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
+    r"level|height|position|angle|speed|veloc|omega|rpm|pressure"
+    r"|\b[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
     re.IGNORECASE,
 )
 """What is often controlled, in names, descriptions and units."""
