@@ -53,7 +53,7 @@ def test_its_commands_run(tmp_path, monkeypatch, capsys):
             printed[words[1]] = capsys.readouterr().out
     told = {"info", "new", "validate", "simulate", "record", "train", "evaluate"}
     assert told == set(printed)
-    assert "than tuned pi" in printed["train"]
+    assert "tuned pi" in printed["train"]
     assert "T_op" in printed["info"]
     assert "agent" in printed["evaluate"]
     for name in re.findall(r"--output (\S+\.png)|--plot (\S+\.png)", TEXT):

@@ -395,7 +395,7 @@ def test_a_column_of_zeros_is_undetermined():
 
 def test_scipy_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(ImportError, match=r"fmugym-toolbox\[identification\]"):
+    with pytest.raises(ImportError, match="'identification'"):
         fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0))
 
 

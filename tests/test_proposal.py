@@ -27,7 +27,7 @@ def new(capsys):
     return lambda fmu: proposed(capsys, fmu)
 
 
-def trained(folder, capsys, fmu, candidates=4):
+def trained(folder, capsys, fmu, candidates=8):
     """The facts of the agent that a newcomer gets by two commands."""
     path, agent = folder / "task.toml", folder / "agent"
     assert main(["new", str(fmu), "--output", str(path)]) == 0

@@ -22,6 +22,7 @@ PAGES: Final = {
     "Task files": ("load", "Task", "TaskEnv"),
     "Distributions": ("Uniform", "Normal", "LogUniform", "Choice"),
     "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
+    "Agents": ("load_agent",),
     "Recordings": ("Recorder", "Recording", "replay"),
     "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
     "Systems": ("FMUSystem", "Component", "Connection"),
