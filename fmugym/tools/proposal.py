@@ -53,7 +53,8 @@ _DEGREES: Final = 5.0
 """A set point of a temperature is this near to its start; zero of its unit means nothing."""
 
 _GOAL: Final = re.compile(
-    r"level|height|position|angle|speed|veloc|omega|rpm|pressure|\b[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
+    r"level|height|position|angle|speed|veloc|omega|rpm|pressure"
+    r"|(^|\.)[hwx] \[|\[(m|rad|deg|m/s|rad/s)\]",
     re.IGNORECASE,
 )
 """What is often controlled, in names, descriptions and units."""
@@ -274,8 +275,7 @@ def _is_result(variable: Variable) -> bool:
 
 def _words(variable: Variable) -> str:
     """The name, the unit and the description of a variable."""
-    name = re.sub(r"[\W_]+", " ", variable.name)
-    return f"{name} [{variable.unit or ''}] {variable.description}"
+    return f"{variable.name.replace('_', ' ')} [{variable.unit or ''}] {variable.description}"
 
 
 def _is_outside(variable: Variable) -> bool:
