@@ -405,7 +405,7 @@ class TestNew:
         rows += [variable("der(x)", real.format("m/s"), "local"), variable("n", "<Real/>", "local")]
         assert main(["new", str(make_fmu(INPUT, OUTPUT, *rows))]) == 0
         text = capsys.readouterr().out
-        table = text[text.index("# These locals") :].partition("\n[")[0]
+        table = text[text.index("# These locals") :].partition("\n[setpoints]")[0]
         table = re.sub(r"^# ", "", table.partition("\n")[2], flags=re.M)
         assert {row["name"] for row in tomllib.loads(table).values()} == wanted.keys()
         assert tomllib.loads(text)["variables"].keys() == {"u"}
