@@ -185,7 +185,7 @@ class Proposal:
         found = [variable for variable in found if variable not in outputs]
         if found:
             yield "# These locals are no outputs of the FMU, but a reward or an agent may use them:"
-        taken = set(self._aliases.values())
+        taken = {self._setpoint, *self._aliases.values()}
         for variable in found[:_MOST_RESULTS]:
             taken.add(alias := _free_alias(variable.name, taken))
             yield f"# {alias} = {{ name = {_quoted(variable.name)} }}{remark(variable)}"

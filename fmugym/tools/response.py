@@ -49,7 +49,7 @@ def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
         one.name for one in constants if not constants[one] and one.variability == "continuous"
     ]
     if still:
-        text = f"never change while the first action holds: {', '.join(still)}"
+        text = f"never change while an action is held: {', '.join(still)}"
         yield Doubt(text, "leave them out of observations under [agent]", "observations")
     seconds, name = max(((constants[one], one.name) for one in constants), default=(0.0, ""))
     time_step = replay.spec.time_step

@@ -131,8 +131,8 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
     """Lines for what other checks have found."""
     if recommended.get("normalize") and _has_limits(env.observation_space):
         yield Advice("agent", "normalize", True, f"observations are {_UNEVEN}")
-    space = env.action_space
-    if isinstance(space, spaces.Box):
+    space: Any = env.action_space
+    if _has_limits(space):
         size = np.abs([space.low, space.high]).max()
         if not _EXPLORED[0] <= size <= _EXPLORED[1]:
             why = f"actions reach {size:.3g}, but --algorithm explores by steps of about 1"
@@ -142,7 +142,7 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
 
 
 def _has_limits(space: spaces.Space[Any]) -> bool:
-    """Whether observations can be normalized by their limits."""
+    """Whether observations or actions can be scaled by their limits."""
     return isinstance(space, spaces.Box) and bool(np.isfinite([space.low, space.high]).all())
 
 
