@@ -76,9 +76,6 @@ def test_bars_are_shown_in_notebooks(monkeypatch):
         def update(self, steps):
             drawn.append(steps)
 
-        def set_postfix_str(self, text, refresh):
-            """There is no room for it."""
-
     stream = type("OutStream", (), {"__module__": "ipykernel.iostream", "isatty": lambda _: False})
     monkeypatch.setitem(sys.modules, "tqdm", types.SimpleNamespace(tqdm=Bar))
     with progress(7, "play") as advance:

@@ -48,7 +48,8 @@ def progress(total: int | None, what: str, unit: str = "steps") -> Iterator[Adva
     with tqdm(total=total, desc=what, unit=f" {unit}", ascii=True, leave=False, delay=1) as bar:
 
         def advance(steps: float, text: str = "") -> None:
-            bar.set_postfix_str(text, refresh=False)
+            if text:
+                bar.set_postfix_str(text, refresh=False)
             bar.update(steps)
 
         yield advance
