@@ -30,7 +30,7 @@ LEVELS = {
     "reward": "-abs(q)",
 }
 PENDULUM = LEVELS | {"variables": {"tau": {"min": -0.1, "max": 0.1}}}
-ON_POLICY = "n_steps=32", "batch_size=32", "n_epochs=2"
+ON_POLICY = "--algorithm", "PPO", "n_steps=32", "batch_size=32", "n_epochs=2"
 OFF_POLICY = "--algorithm", "SAC", "learning_starts=20", "batch_size=16", "buffer_size=1000"
 
 
@@ -119,7 +119,8 @@ class TestResume:
 
     def test_what_cannot_be_resumed(self, task, tmp_path, capsys):
         folder = tmp_path / "agent"
-        code, _, err = run(capsys, "train", task, "--output", folder, "--resume")
+        algorithm = "--algorithm", "PPO"
+        code, _, err = run(capsys, "train", task, "--output", folder, "--resume", *algorithm)
         assert (code, "no training to resume" in err) == (1, True)
         options = "--envs", "2", "--steps", "64", "--episodes", "1", *ON_POLICY
         run(capsys, "train", task, "--output", folder, *options)
@@ -218,6 +219,7 @@ class TestTune:
         pytest.importorskip("optuna", reason="needs Optuna: the extra tune")
         folder = tmp_path / "agent"
         options = "--envs", "2", "--steps", "256", "--episodes", "1", "--tune", "3"
+        options = "--algorithm", "PPO", *options
         code, out, err = run(
             capsys, "train", task, "--output", folder, *options, "gamma=0.9", "--json"
         )
@@ -234,7 +236,7 @@ class TestTune:
 
     def test_without_optuna_the_extra_is_named(self, task, tmp_path, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "optuna", None)
-        arguments = "--output", tmp_path / "agent", "--tune", "2"
+        arguments = "--output", tmp_path / "agent", "--algorithm", "PPO", "--tune", "2"
         code, _, err = run(capsys, "train", task, *arguments)
         assert code == 1
         assert ".[tune]" in err

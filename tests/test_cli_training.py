@@ -41,12 +41,21 @@ def run(capsys, *arguments):
     return code, printed.out, printed.err
 
 
-def test_a_full_disk_is_told_with_the_folder(tmp_path, capsys, monkeypatch):
+def trained(capsys, task, *arguments):
+    """By PPO, if ``arguments`` name no other algorithm."""
+    return run(capsys, "train", task, "--algorithm", "PPO", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("function", "options"), [("train", ["--algorithm", "PPO"]), ("search", [])]
+)
+def test_a_full_disk_is_told_with_the_folder(function, options, tmp_path, capsys, monkeypatch):
     def fill(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("fmugym.tools.learning.train", fill)
-    code, out, err = run(capsys, "train", CART_POLE, "--output", tmp_path / "agent")
+    monkeypatch.setattr(f"fmugym.tools.learning.{function}", fill)
+    options = "--output", tmp_path / "agent", *options
+    code, out, err = run(capsys, "train", CART_POLE, *options)
     assert (code, out) == (1, "")
     assert err == f"fmugym: error: {tmp_path / 'agent'}: No space left on device\n"
 
@@ -125,7 +134,7 @@ def test_arguments_of_an_algorithm():
 
 def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "fmugym.sb3", None)
-    code, out, err = run(capsys, "train", CART_POLE, "--output", tmp_path / "agent")
+    code, out, err = trained(capsys, CART_POLE, "--output", tmp_path / "agent")
     assert (code, out) == (1, "")
     assert "pip install '.[sb3]'" in err
     assert not (tmp_path / "agent").exists()
@@ -173,7 +182,7 @@ class TestTrain:
         folder = tmp_path / "agent"
         options = "--steps", "6000", "--episodes", "3", "--output", folder
         arguments = "n_steps=128", "batch_size=256"
-        code, out, err = run(capsys, "train", CART_POLE, *arguments, *options)
+        code, out, err = trained(capsys, CART_POLE, *arguments, *options)
         assert code == 0
         assert "5120 steps: reward" in err  # five rollouts of 128 steps in 8 environments
         assert "held-out seeds" in out
@@ -186,7 +195,7 @@ class TestTrain:
         random, agent = json.loads(out)["scores"]
         assert code == 0
         assert agent["mean_reward"] == best > 2 * random["mean_reward"]
-        code, _, err = run(capsys, "train", CART_POLE, *options)
+        code, _, err = trained(capsys, CART_POLE, *options)
         assert code == 1
         assert "exists" in err
 
@@ -194,7 +203,7 @@ class TestTrain:
         """PPO learns after every 128 steps here, and an evaluation is due after every 27."""
         folder = tmp_path / "agent"
         options = "--steps", "270", "--envs", "4", "--episodes", "1", "--output", folder
-        code, _, err = run(capsys, "train", CART_POLE, "n_steps=32", *options)
+        code, _, err = trained(capsys, CART_POLE, "n_steps=32", *options)
         assert code == 0
         assert "n_steps" not in err
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
@@ -202,7 +211,7 @@ class TestTrain:
 
     def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, capsys):
         options = "--steps", "100", "--envs", "2", "--output", tmp_path / "a"
-        code, _, err = run(capsys, "train", CART_POLE, "n_steps=64", *options)
+        code, _, err = trained(capsys, CART_POLE, "n_steps=64", *options)
         assert code == 1
         assert "128 steps (n_steps=64 in 2 environments)" in err
         assert not (tmp_path / "a").exists()
@@ -219,7 +228,7 @@ class TestTrain:
     def test_steps_are_a_ceiling(self, tmp_path, capsys, arguments, steps, done):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         options = "--steps", steps, "--envs", "2", "--episodes", "1", "--output", tmp_path / "a"
-        code, *_ = run(capsys, "train", tmp_path / "a.toml", *arguments, *options)
+        code, *_ = trained(capsys, tmp_path / "a.toml", *arguments, *options)
         assert code == 0
         last = (tmp_path / "a" / "evaluations.csv").read_text().splitlines()[-1]
         assert int(last.partition(",")[0]) == done
@@ -237,7 +246,7 @@ class TestTrain:
         monkeypatch.setattr("stable_baselines3.PPO.train", train)
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         options = "--steps", "192", "--envs", "2", "--output", tmp_path / "agent", "n_steps=32"
-        code, out, err = run(capsys, "train", tmp_path / "a.toml", *options, "--json")
+        code, out, err = trained(capsys, tmp_path / "a.toml", *options, "--json")
         told = json.loads(out)
         text = (tmp_path / "agent" / "evaluations.csv").read_text()
         rows = list(csv.DictReader(text.splitlines()))
@@ -253,7 +262,7 @@ class TestTrain:
         arguments = "learning_starts=10", "train_freq=20"
         options = "--steps", "100", "--envs", "2", "--episodes", "1", "--algorithm", "SAC"
         output = "--output", tmp_path / "agent"
-        code, out, _ = run(capsys, "train", tmp_path / "a.toml", *arguments, *options, *output)
+        code, out, _ = trained(capsys, tmp_path / "a.toml", *arguments, *options, *output)
         assert code == 0
         assert [line.split()[0] for line in out.splitlines()[1:]] == ["early", "late"]
         text = (tmp_path / "agent" / "evaluations.csv").read_text()
@@ -264,7 +273,7 @@ class TestTrain:
         fmugym.Task.from_dict(SCENARIOS | {"reward": "0"}).write(tmp_path / "a.toml")
         options = "--steps", "64", "--envs", "2", "--episodes", "1", "--output", tmp_path / "agent"
         own = "n_steps=8", "batch_size=16"
-        code, _, err = run(capsys, "train", tmp_path / "a.toml", *own, *options)
+        code, _, err = trained(capsys, tmp_path / "a.toml", *own, *options)
         assert code == 0
         assert err.count("the reward was 0") == 1
         assert err.count("in evaluation") > 2
@@ -276,7 +285,7 @@ class TestTrain:
         monkeypatch.setattr("stable_baselines3.PPO.train", train)
         folder = tmp_path / "agent"
         options = "--output", folder, "--episodes", "1", "--envs", "2"
-        code, *_ = run(capsys, "train", CART_POLE, "n_steps=16", "batch_size=32", *options)
+        code, *_ = trained(capsys, CART_POLE, "n_steps=16", "batch_size=32", *options)
         assert code == 130
         assert (folder / "model.zip").exists()
         code, out, _ = run(capsys, "evaluate", CART_POLE, "--agent", folder, "--episodes", "1")
@@ -299,7 +308,7 @@ class TestTrain:
         folder = tmp_path / "agent"
         options = "--output", folder, "--episodes", "1", "--envs", "2", "--steps", "400"
         arguments = "n_steps=32", "batch_size=32"
-        code, _, err = run(capsys, "train", tmp_path / "a.toml", *arguments, *options)
+        code, _, err = trained(capsys, tmp_path / "a.toml", *arguments, *options)
         assert code == 130
         assert "nothing was trained" not in err
         assert str(folder) in err
@@ -320,7 +329,7 @@ class TestTrain:
     )
     def test_mistakes(self, arguments, fact, tmp_path, capsys):
         options = "--output", tmp_path / "agent"
-        code, _, err = run(capsys, "train", CART_POLE, *arguments, *options)
+        code, _, err = trained(capsys, CART_POLE, *arguments, *options)
         assert code == 1
         assert fact in err
         assert not (tmp_path / "agent").exists()

@@ -128,14 +128,18 @@ _BETWEEN_LINES: Final = 10.0
 
 def _train(arguments: argparse.Namespace) -> None:
     has_algorithm = arguments.resume and (arguments.output / TRAINING).exists()
-    if arguments.algorithm is None and not has_algorithm:
+    is_search = arguments.algorithm is None and not has_algorithm
+    if is_search:
         _refuse(arguments, _OF_ALGORITHMS, "is for trainings with --algorithm, such as PPO")
         if arguments.resume:
             _refuse(arguments, ("seed", "candidates"), "cannot be changed by --resume")
-        _search(arguments)
     else:
         _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")
-        _learn(arguments)
+    try:
+        _search(arguments) if is_search else _learn(arguments)
+    except OSError as error:  # what writes to open files does not say where
+        error.filename = error.filename or str(arguments.output)
+        raise
 
 
 def _refuse(arguments: argparse.Namespace, names: Iterable[str], why: str) -> None:
@@ -210,9 +214,6 @@ def _learn(arguments: argparse.Namespace) -> None:
         except KeyboardInterrupt:
             _tell_what_is_kept(plan.folder, CHECKPOINT)
             write_outcome(plan, title_of(arguments.task), tell)
-            raise
-        except OSError as error:  # libraries that write a model do not say where
-            error.filename = error.filename or str(plan.folder)
             raise
     write_outcome(plan, title_of(arguments.task), tell)
     _show(plan, scores, arguments)
