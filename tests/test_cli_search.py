@@ -197,6 +197,20 @@ def words_after(text, mark):
     return words[: words.index("repeats")]
 
 
+@pytest.mark.parametrize(
+    ("task", "rounds", "target"),
+    [("fmugym/CartPole-v0", 40, 475), ("fmugym/CloudPendulum-v0", 100, -95)],
+)
+def test_targets_are_reached(task, rounds, target, tmp_path, capsys):
+    """By the mean of 100 episodes of the test."""
+    options = "--output", tmp_path / "a", "--rounds", rounds, "--json"
+    code, out, err = run(capsys, "train", task, *options)
+    assert code == 0, err
+    told = json.loads(out)
+    assert told["test"][told["agent"]]["total_reward"] >= target
+    assert len(told["test"][told["agent"]]["rewards"]["unseen episodes"]) == 100
+
+
 class TestOutput:
     def test_it_tells_what_it_does(self, task, tmp_path, capsys):
         code, out, err = searched(

@@ -207,7 +207,7 @@ class TestTrain:
         assert code == 0
         assert "n_steps" not in err
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
-        assert [int(row["steps"]) for row in rows] == [28, 136, 256]
+        assert [int(row["steps"]) for row in rows] == [28, 132, 256]
 
     def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, capsys):
         options = "--steps", "100", "--envs", "2", "--output", tmp_path / "a"

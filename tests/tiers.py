@@ -11,6 +11,7 @@ SLOW_MODULES = {
     "test_call_order",
     "test_cli_advice",
     "test_cli_docs",
+    "test_cli_search",
     "test_cli_tuning",
     "test_clock_fractions",
     "test_compile",
@@ -95,6 +96,12 @@ EVERY_OF_OTHERS = 31
 """For the modules that are not in ``EVERY``."""
 
 EVERY_IN_CI = {
+    "test_export_search": 3,
+    "test_declared_physical": 3,
+    "test_declared_weather": 3,
+    "test_proposal": 4,
+    "test_shared_data": 2,
+    "test_user_mistakes": 3,
     "test_array_derivatives": 3,
     "test_compile": 3,
     "test_copies": 2,
@@ -236,6 +243,9 @@ SLOW_TESTS = (
     "test_series.py::TestPictures::test_long",
     "test_series.py::TestReport::test_it_is_one",
     "test_single_compiled.py::test_generated_expressions",
+    "test_search.py::TestSearch::test_another_seed",
+    "test_search.py::TestSearch::test_limits_of_costs",
+    "test_search.py::TestSearch::test_without_controllers",
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestProgress::test_of_a_trial_is_logged",
     "test_slow_models.py::TestTime::test_is_given_in_worker",
