@@ -258,7 +258,9 @@ class Policy(Controller):
             told = [one == n for one, all_ in zip(action, self._choices, strict=True) for n in all_]
             return 1.0 * np.stack(told)
         pairs = zip(action, self.limits, strict=True)
-        return np.stack([(2.0 * one - low - high) / (high - low) for one, (low, high) in pairs])
+        return np.stack(
+            [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in pairs]
+        )
 
     def _network(self, features: FloatArray) -> Any:
         """The outputs for features of shape (f, N), row by row, so that groups do not matter.
