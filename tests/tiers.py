@@ -12,6 +12,7 @@ SLOW_MODULES = {
     "test_cli_advice",
     "test_cli_docs",
     "test_cli_search",
+    "test_docs_from_fmu",
     "test_cli_tuning",
     "test_clock_fractions",
     "test_compile",
@@ -134,11 +135,14 @@ EVERY_IN_CI = {
     "test_words": 5,
     "test_zoo": 5,
 }
-"""By module: of each test's combinations, ``.ci/run`` takes every n-th; all of other modules.
+"""By module: of each test's combinations, ``.ci/run`` takes every n-th.
 
 The numbers have no factor in common with those of FMI versions and ways of running, so that each of
 these occurs with others in turn.
 """
+
+EVERY_OF_OTHERS_IN_CI = 4
+"""For the modules that are not in ``EVERY_IN_CI``."""
 
 EVERY_IN_SYSTEMS = 17
 """The same for the contract of pools with the FMU as a component of a system."""
@@ -243,9 +247,7 @@ SLOW_TESTS = (
     "test_series.py::TestPictures::test_long",
     "test_series.py::TestReport::test_it_is_one",
     "test_single_compiled.py::test_generated_expressions",
-    "test_search.py::TestSearch::test_another_seed",
-    "test_search.py::TestSearch::test_limits_of_costs",
-    "test_search.py::TestSearch::test_without_controllers",
+    "test_search.py::TestSearch",
     "test_slow_models.py::TestProgress::test_is_not",
     "test_slow_models.py::TestProgress::test_of_a_trial_is_logged",
     "test_slow_models.py::TestTime::test_is_given_in_worker",
@@ -315,5 +317,5 @@ def is_exhaustive(node_id, number):
     module = node_id.partition(".py")[0]
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
-    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, 1)
+    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, EVERY_OF_OTHERS_IN_CI)
     return is_slow(node_id, number) and number % every > 0
