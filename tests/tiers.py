@@ -141,7 +141,7 @@ The numbers have no factor in common with those of FMI versions and ways of runn
 these occurs with others in turn.
 """
 
-EVERY_OF_OTHERS_IN_CI = 4
+EVERY_OF_OTHERS_IN_CI = 5
 """For the modules that are not in ``EVERY_IN_CI``."""
 
 EVERY_IN_SYSTEMS = 17
@@ -317,5 +317,6 @@ def is_exhaustive(node_id, number):
     module = node_id.partition(".py")[0]
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
-    every = EVERY_IN_SYSTEMS if "[system in " in node_id else EVERY_IN_CI.get(module, EVERY_OF_OTHERS_IN_CI)
+    every = EVERY_IN_CI.get(module, EVERY_OF_OTHERS_IN_CI)
+    every = EVERY_IN_SYSTEMS if "[system in " in node_id else every
     return is_slow(node_id, number) and number % every > 0
