@@ -69,10 +69,13 @@ def _origins(error: BaseException) -> Iterator[BaseException]:
 
 
 def _is_handler(frame: FrameType) -> bool:
-    """Python calls a handler with the number of the signal and the frame that it interrupts."""
+    """Python calls a handler with the number of the signal and the frame that it interrupts.
+
+    The types are asked for, as ``isinstance`` would call properties of a user's objects.
+    """
     names, rest, _, values = inspect.getargvalues(frame)
     given = [values.get(name) for name in names] + list(values.get(rest, ()) if rest else ())
     return any(
-        isinstance(number, int) and isinstance(place, FrameType) and place is frame.f_back
+        issubclass(type(number), int) and type(place) is FrameType and place is frame.f_back
         for number, place in pairwise(given)
     )

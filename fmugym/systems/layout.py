@@ -165,15 +165,10 @@ class Layout:
         ins += [(e.part, e.variable) for v in inputs for e in self.ends_of(v)]
         outs: list[tuple[int, Variable]] = [self._source(link) for link in self.plan.links]
         outs += [(e.part, e.variable) for v in outputs for e in self.ends_of(v)[:1]]
-        for part in self.parts:
-            part.inputs, part.outputs = [], []
-        for index, variable in ins:
-            self.parts[index].inputs.append(variable)
-        for index, variable in outs:
-            self.parts[index].outputs.append(variable)
-        for part in self.parts:
-            part.inputs = list(_different(_wholes(part.inputs)))
-            part.outputs = list(_different(_wholes(part.outputs)))
+        own_inputs, own_outputs = _by_part(ins), _by_part(outs)
+        for index, part in enumerate(self.parts):
+            part.inputs = list(_different(_wholes(own_inputs.get(index, []))))
+            part.outputs = list(_different(_wholes(own_outputs.get(index, []))))
         self.number_of_inputs = self.number_of_outputs = 0
         for index, part in enumerate(self.parts):
             part.first_input, part.first_output = self.number_of_inputs, self.number_of_outputs
@@ -297,6 +292,14 @@ def _wholes(variables: Iterable[Variable]) -> Iterator[Variable]:
     """Scalars as they are, and all elements of arrays of which something is there."""
     for variable in variables:
         yield from (variable if variable.array is None else variable.array).elements
+
+
+def _by_part(pairs: Iterable[tuple[int, Variable]]) -> dict[int, list[Variable]]:
+    """The variables of each component; those of the master itself have a negative number."""
+    found: dict[int, list[Variable]] = {}
+    for index, variable in pairs:
+        found.setdefault(index, []).append(variable)
+    return found
 
 
 def _different(variables: Iterable[Variable]) -> Iterator[Variable]:

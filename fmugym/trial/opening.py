@@ -52,6 +52,8 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 __all__ = ["make_pool"]
 
+logger = logging.getLogger(__name__)
+
 _BLIND: Final = (
     "%s cannot be read before its first step: until then, its outputs have the start values of the "
     "model description"
@@ -350,7 +352,8 @@ def _mark(candidate: Candidate) -> Mark | None:
         return None
     try:
         return Mark.attempt(*marks_of(candidate))
-    except ordinary(OSError):
+    except ordinary(OSError) as error:
+        logger.debug("a crash would not be noted: %s", error)
         return None
 
 
