@@ -37,7 +37,7 @@ NUM_ENVS = 3
 LOGGING = {"model_parameters": {"log_status": 1}}
 PROBE = "FMUGYM_FUZZ_PROBE"
 """The environment variable with the path of the FMU that logs."""
-LOSING = ("weakref.py", "_weakrefset.py", "in __del__", "etree.parse(", "zipfile.py")
+LOSING = ("weakref.py", "_weakrefset.py", "in __del__", "etree.parse(", "os.mkdir(", "zipfile.py")
 """Where Python or lxml may drop or replace what a signal handler raises, as a stack names it."""
 
 CALLS = 400

@@ -337,8 +337,9 @@ def test_the_master_of_an_archive_can_be_chosen(archive):
 
 class TestCommandLine:
     def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, capsys):
-        for path in (archive, task()):
-            assert main(["info", str(path), "--plot", str(tmp_path / "system.svg")]) == 0
+        for number, path in enumerate((archive, task())):
+            picture = tmp_path / f"{number}.svg"
+            assert main(["info", str(path), "--plot", str(picture)]) == 0
             text = capsys.readouterr().out
             for fact in (
                 "two houses (a system of 2 FMUs)",
@@ -347,8 +348,8 @@ class TestCommandLine:
                 "east -> west",
             ):
                 assert fact in text
-            picture = (tmp_path / "system.svg").read_text()
-            assert all(f">{name}<" in picture for name in ("east", "west", "outside", "Q_int"))
+            drawn = picture.read_text()
+            assert all(f">{name}<" in drawn for name in ("east", "west", "outside", "Q_int"))
 
     def test_info_describes_what_cannot_run(self, tmp_path, capsys):
         given = FMUSystem({"cart": bundled_fmu("CartPole", "1.0")}, error_tolerance=1e-3)

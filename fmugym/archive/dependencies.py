@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import os
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from fmugym.archive import loader
 from fmugym.archive.elf import opened
-from fmugym.archive.loader import ask
 from fmugym.errors import FMULoadError
-from fmugym.signals import ordinary
+from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["libraries_of", "load_globally", "missing_libraries", "stray_libraries"]
+__all__ = [
+    "ask_in_a_child",
+    "libraries_of",
+    "load_globally",
+    "missing_libraries",
+    "stray_libraries",
+]
+
+_TIMEOUT_OF_A_CHILD = 60.0
+"""Seconds."""
 
 
 class _Needed(NamedTuple):
@@ -32,7 +43,9 @@ class _Needed(NamedTuple):
 
 
 def missing_libraries(
-    library: Path, provided: Iterable[str] = (), ask: Callable[[Sequence[str]], list[str]] = ask
+    library: Path,
+    provided: Iterable[str] = (),
+    ask: Callable[[Sequence[str]], list[str]] = loader.ask,
 ) -> list[str]:
     """Find the shared libraries that a library needs and the system's loader would not find.
 
@@ -45,7 +58,7 @@ def missing_libraries(
     Args:
         library: The library, extracted.
         provided: Paths or names of libraries that will be loaded before.
-        ask: Asks the loader; see ``fmugym.archive.loader``.
+        ask: Asks the loader: ``fmugym.archive.loader.ask`` or ``ask_in_a_child``.
 
     Returns:
         Their names. Empty on systems other than Linux, where the loader has to report them.
@@ -58,6 +71,25 @@ def missing_libraries(
     known = set(_names_of(provided))
     absent = ask([n.name for n in _needed(library) if n.path is None and n.name not in known])
     return list(dict.fromkeys(name for name in absent if name not in known))
+
+
+def ask_in_a_child(names: Sequence[str]) -> list[str]:
+    """Ask the loader of a child process, so that this one loads nothing; otherwise as ``ask``.
+
+    Where the child dies of a library, or cannot be started, nothing counts as missing.
+    """
+    if not names:
+        return []
+    with Ignoring(OSError, ValueError, subprocess.SubprocessError):
+        done = subprocess.run(
+            [sys.executable, "-I", "-S", loader.__file__],
+            input=json.dumps(list(names)).encode(),
+            capture_output=True,
+            timeout=_TIMEOUT_OF_A_CHILD,
+            check=True,
+        )
+        return [str(name) for name in json.loads(done.stdout.splitlines()[-1])]
+    return []
 
 
 def stray_libraries(library: Path) -> list[Path]:
@@ -73,7 +105,7 @@ def stray_libraries(library: Path) -> list[Path]:
     if sys.platform != "linux":
         return []
     stray = [needed for needed in _needed(library) if needed.path and not needed.found]
-    return [needed.path for needed in reversed(stray) if needed.path and ask([needed.name])]
+    return [needed.path for needed in reversed(stray) if needed.path and loader.ask([needed.name])]
 
 
 def libraries_of(library: Path) -> list[Path]:

@@ -17,11 +17,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Protocol, runtime_checkable
 
-from fmugym.archive.dependencies import missing_libraries
+from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.description import INTERFACES
 from fmugym.archive.executable import check_library
 from fmugym.archive.loadable import LoadableFMU
-from fmugym.archive.loader import ask_in_a_child
 from fmugym.archive.packages import describe_missing
 from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip

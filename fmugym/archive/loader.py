@@ -9,15 +9,10 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import subprocess
 import sys
 from collections.abc import Sequence
 
-from fmugym.signals import Ignoring, ordinary
-
-__all__ = ["ask", "ask_in_a_child"]
-
-_TIMEOUT = 60.0
+__all__ = ["ask"]
 
 
 def ask(names: Sequence[str]) -> list[str]:
@@ -37,28 +32,11 @@ def _missing(name: str) -> list[str]:
         return [] if os.path.isfile(name) else [name]
     try:
         ctypes.CDLL(name)
-    except ordinary(OSError) as error:
+    except OSError as error:
+        if type(error) is not OSError:  # a signal handler has raised it
+            raise
         missing, _, reason = str(error).partition(": ")
         return [missing if reason.startswith("cannot open shared object file") else name]
-    return []
-
-
-def ask_in_a_child(names: Sequence[str]) -> list[str]:
-    """Ask the loader of a child process, so that this one loads nothing; otherwise as ``ask``.
-
-    Where the child dies of a library, or cannot be started, nothing counts as missing.
-    """
-    if not names:
-        return []
-    with Ignoring(OSError, ValueError, subprocess.SubprocessError):
-        done = subprocess.run(
-            [sys.executable, "-I", "-S", __file__],
-            input=json.dumps(list(names)).encode(),
-            capture_output=True,
-            timeout=_TIMEOUT,
-            check=True,
-        )
-        return [str(name) for name in json.loads(done.stdout.splitlines()[-1])]
     return []
 
 

@@ -337,8 +337,9 @@ int zoo_initialize(Animal *me) {
 
 int zoo_step(Animal *me, double step_size, bool no_set_state) {
     me->steps++;
-    shared_y += step_size * me->values[U];
-    me->values[Y] = me->shares ? shared_y : me->values[Y] + step_size * me->values[U];
+    double *y = me->shares ? &shared_y : &me->values[Y];
+    *y += step_size * me->values[U];
+    me->values[Y] = *y;
     return zoo_call(me, STEP);
 }
 
