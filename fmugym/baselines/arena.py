@@ -47,8 +47,8 @@ class Outcome(NamedTuple):
 class Arena:
     """A vector environment in which candidates play the same episodes.
 
-    The environments are made when they are needed. Where candidates and episodes are too many for
-    them, they play in groups, with the same result.
+    The environments are made when they are needed, and kept by their number. Where candidates and
+    episodes are too many for them, they play in groups, with the same result.
 
     Args:
         make_env: A function that makes the environment, or its class.
@@ -70,14 +70,14 @@ class Arena:
     ) -> None:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
         self._costs = tuple(costs)
-        self._envs: FMUVectorEnv | None = None
+        self._envs: dict[int, FMUVectorEnv] = {}
         self.steps, self.ceiling = 0, math.inf
 
     def close(self) -> None:
         """Close the environments."""
-        if self._envs is not None:
-            self._envs.close()
-        self._envs = None
+        while self._envs:
+            _, envs = self._envs.popitem()
+            envs.close()
 
     def play(
         self,
@@ -112,10 +112,11 @@ class Arena:
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
         size = min(jobs, self._most_envs)
-        if self._envs is None or self._envs.num_envs < size:
-            self.close()
-            self._envs = FMUVectorEnv(self._make_env, size)
-        return self._envs
+        if size not in self._envs:
+            if sum(self._envs) + size > self._most_envs:
+                self.close()
+            self._envs[size] = FMUVectorEnv(self._make_env, size)
+        return self._envs[size]
 
     def _play(
         self, envs: FMUVectorEnv, controller: Controller, seeds: list[int], watch: Any
