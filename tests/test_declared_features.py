@@ -227,7 +227,7 @@ class TestFiles:
         ("text", "column", "fact"),
         [
             (CSV, {"column": "T_K"}, "column 'T_K'; did you mean 'T_C'"),
-            (CSV, {"file": "/nowhere/x.csv"}, "/nowhere/x.csv"),
+            (CSV, {"file": "/nowhere/x.csv"}, "x.csv.*/nowhere"),
             (CSV, {"time": "tim"}, "'time'"),
             (CSV, {"interpolation": "cubic"}, "'cubic'"),
             (CSV, {"period": "1h"}, "3600"),

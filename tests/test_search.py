@@ -21,8 +21,8 @@ from fmugym.search.agent import AGENT, Agent
 from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.policy import LIMIT, Form, Policy, scale_of
-from fmugym.search.search import VALIDATION
+from fmugym.search.policy import LIMIT, Form, Policy, Scale
+from fmugym.search.search import VALIDATION, Search
 from fmugym.tools import searching
 from fmugym.tools.evaluation import HELD_OUT_SEED
 from fmugym.tools.searching import Quest
@@ -125,6 +125,16 @@ class TestCMA:
         assert max(sizes) == pytest.approx(3.0)
         assert 1.0 < max(steps) < 3.0
         assert cma.sigma == 2.0
+
+    def test_a_covariance_makes_up_for_stretched_and_turned_axes(self):
+        """With it, the search is that of a sphere, and far shorter than without it."""
+        inverse = AXES @ np.diag(STRETCH**-2) @ AXES.T
+        rng = np.random.default_rng(0)
+        cma = CMA(np.zeros(6), 100.0, 12, rng, covariance=inverse)
+        assert cma.sigma == pytest.approx(100.0 * np.sqrt(np.trace(inverse) / 6))
+        told = rounds_of(turned_ellipsoid, cma)
+        assert told < 1.5 * rounds_of(sphere, made())
+        assert told < 0.8 * rounds_of(turned_ellipsoid, made())
 
     def test_only_the_order_counts(self):
         """Not how much better a candidate is."""
@@ -399,11 +409,11 @@ class TestPolicy:
         for row, action, features in zip(observations, actions, seen, strict=True):
             leaky = leaky + 0.05 * (row - leaky)
             expected = np.concatenate([row, row - before, leaky, last])
-            assert features[:, 0] == pytest.approx(expected, rel=1e-12)
+            assert features[0] == pytest.approx(expected, rel=1e-12)
             before, last = row, (action - [1.0, 20.0]) / [3.0, 10.0]
         policy.reset()
         policy.act(observations[3])
-        assert seen[-1][:, 0].tolist() == [*observations[3], 0, 0, 0, *observations[3], 0, 0]
+        assert seen[-1][0].tolist() == [*observations[3], 0, 0, 0, *observations[3], 0, 0]
 
     def test_history_of_choices_is_one_hot(self):
         env, seen = Stub(NUMBERS, ACTING[2]), []
@@ -414,7 +424,7 @@ class TestPolicy:
         told = [float(action[0] == n) for n in (0, 1)] + [
             float(action[1] == n) for n in range(-1, 3)
         ]
-        assert [one[-6:, 0].tolist() for one in seen] == [[0.0] * 6, told]
+        assert [one[0, -6:].tolist() for one in seen] == [[0.0] * 6, told]
 
     def test_a_network_by_hand(self):
         env = Stub(NUMBERS, ACTING[0])
@@ -479,7 +489,7 @@ def recording(network, seen):
     return call
 
 
-def test_a_scale_is_mean_and_deviation():
+def test_a_scale_is_that_of_all_features():
     """Of the steps of all episodes until their ends, whatever plays beside them."""
     observed = []
     form = Form("linear with history", history=True)
@@ -490,8 +500,8 @@ def test_a_scale_is_mean_and_deviation():
     for most_envs in (3, 512):
         with closing(Arena(load(), most_envs)) as arena:
             moments = arena.play(make, rows, SEEDS, attrgetter("moments")).watched.sum(axis=(0, 1))
-            scales.append(scale_of(moments))
-    assert np.array_equal(*scales)
+            scales.append(Scale.of(moments, 7))
+    assert all(map(np.array_equal, *scales))
     with closing(load()()) as env:
         for weights in rows:
             policy = make(weights).bind(env)
@@ -499,17 +509,94 @@ def test_a_scale_is_mean_and_deviation():
             for seed in SEEDS:
                 policy.reset()
                 episode(env, policy, seed)
-    features = np.concatenate(observed, axis=1)
-    assert features.shape[1] == moments[0] < 40 * 12
-    mean, divisor = scales[0]
-    assert mean == pytest.approx(features.mean(axis=1))
-    assert divisor == pytest.approx(features.std(axis=1))
+    features = np.concatenate(observed)
+    assert len(features) == moments[0] < 40 * 12
+    scale = scales[0]
+    assert scale.mean == pytest.approx(features.mean(axis=0))
+    assert scale.divisor == pytest.approx(features.std(axis=0))
+    assert scale.correlations == pytest.approx(np.corrcoef(features[:, :2].T))
 
 
-def test_constants_are_not_made_larger():
-    mean, divisor = scale_of(np.array([10.0, -70.0, 1e-3, 0.0, 490.0, 1e-7, 0.0]))
-    assert mean.tolist() == [-7.0, 1e-4, 0.0]
-    assert divisor.tolist() == [7.0, 1.0, 1.0]
+def test_constants_are_not_made_larger_and_go_with_nothing():
+    seen = np.array([[-7.0, 1e-4, 0.0, x] for x in (-2.0, 2.0)])
+    products = np.einsum("ni,nj->ij", seen, seen)
+    sums = [2.0, *seen.sum(axis=0), *(seen**2).sum(axis=0), *products.ravel()]
+    scale = Scale.of(np.array(sums), 4)
+    assert scale.mean.tolist() == [-7.0, 1e-4, 0.0, 0.0]
+    assert scale.divisor.tolist() == [7.0, 1.0, 1.0, 2.0]
+    assert scale.correlations.tolist() == np.diag([0.0, 0.0, 0.0, 1.0]).tolist()
+
+
+@pytest.mark.parametrize("form", FORMS[:3], ids=lambda form: form.name)
+def test_what_goes_together_and_what_differs_move_the_outputs_alike(form):
+    """The variance of an output is that of all observations, and not of their sum only."""
+    correlations = np.array([[1.0, 0.98, 0.0], [0.98, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    covariance = form.covariance(correlations, 3, 2)
+    after = form.shapes(3, 2)[0][1]
+    weights = covariance[: 3 * after, : 3 * after].reshape(3, after, 3, after)
+    assert weights[:, 0, :, 1] == pytest.approx(0.0)  # outputs are independent
+    values, axes = np.linalg.eigh(correlations)
+    variances = values * np.diagonal(axes.T @ weights[:, 0, :, 0] @ axes)
+    assert variances.sum() == pytest.approx(3.0)  # as of independent weights
+    assert variances == pytest.approx(values / (values + 0.1) * 3 / sum(values / (values + 0.1)))
+    rest = covariance[3 * after :, 3 * after :]
+    assert np.array_equal(rest, np.eye(len(rest)))
+
+
+def test_a_linear_policy_can_be_extended_by_a_history():
+    env = Stub(NUMBERS, ACTING[0])
+    linear, longer = FORMS[:2]
+    first = policy_with(linear, env)
+    more = longer.features(3, 2)
+    mean, divisor = (np.resize(part, more) for part in first.scale)
+    weights = longer.extended(first.weights, 3, 2)
+    second = Policy(first.baseline, longer, weights, (mean, divisor)).bind(env)
+    first.bind(env)
+    for row in np.random.default_rng(2).uniform(-2, 2, (4, 3)):
+        assert second.act(row) == pytest.approx(first.act(row), rel=1e-12)
+
+
+class Field:
+    """Stands for an arena in which candidates reach what their numbers add up to, up to a limit."""
+
+    def __init__(self, most):
+        self.most = most
+
+    def play(self, make, numbers, seeds, watch=None):
+        returns = np.repeat(np.minimum(numbers.sum(axis=1), self.most)[:, None], len(seeds), axis=1)
+        seen = np.ones((*returns.shape, 1 + 2 * 7 + 4))
+        return Outcome(returns, np.empty((*returns.shape, 0)), seen)
+
+
+def names_of(search):
+    return [agent.name for agent, _ in search.known()]
+
+
+def test_a_history_enters_when_a_correction_gains_nothing_without_it():
+    fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
+    search, field = Search((2, 1), fixed, {}, []), Field(1.0)
+    while search.rounds < 60:
+        search.advance(field)
+    assert names_of(search) == ["given", "given + linear", "linear", "network"]
+    while "given + linear with history" not in names_of(search):
+        search.advance(field)
+    assert search.rounds < 300
+
+
+def test_who_is_worse_than_the_baseline_has_no_more_than_its_share():
+    class Uneven(Field):
+        def play(self, make, numbers, seeds, watch=None):
+            outcome = super().play(make, numbers, seeds, watch)
+            alone = getattr(make, "under", None) is not None and make.under.text is None
+            return outcome._replace(returns=outcome.returns - 1000.0 * alone)
+
+    fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
+    search, field = Search((2, 1), fixed, {}, []), Uneven(1e9)
+    for _ in range(200):
+        search.advance(field)
+    rounds = {one.make.agent(one.best).name: one.rounds for one in search._contenders}
+    assert {rounds["linear"], rounds["network"]} <= {19, 20}
+    assert rounds["given + linear"] + rounds.get("given + linear with history", 0) > 140
 
 
 class TestAgent:
@@ -709,7 +796,7 @@ def guesses(physical=True, **changes):
 
 
 CONTROLLERS = {"lazy": "schedule 00:00=0", "pi": "pid of=theta setpoint=0 kp=0.01..2 td=0.2"}
-ROUNDS = 45  # enough for the tuning of one controller, and for two classes of policies
+ROUNDS = 60  # enough for the tuning of one controller, and for the leaders among the policies
 
 
 def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS, **options):

@@ -26,6 +26,8 @@ class CMA:
         separable: Whether to take the separable form.
         largest: The largest root mean square of the numbers of ``mean``.
         largest_sigma: The largest ``sigma``.
+        covariance: That of the first candidates where ``sigma`` is 1, shape (n, n); None for the
+            identity, with which the separable form begins.
 
     Attributes:
         mean: The best guess until now, shape (n,).
@@ -42,11 +44,11 @@ class CMA:
         separable: bool = False,
         largest: float = math.inf,
         largest_sigma: float = math.inf,
+        covariance: FloatArray | None = None,
     ) -> None:
-        self.mean, self.sigma = mean, sigma
+        self.mean = mean
         self._rng, self._separable, self._rounds = rng, separable, 0
         self._shape, n = (population, mean.size), mean.size
-        self._limits = largest * math.sqrt(n), largest_sigma
         ranks = math.log((population + 1) / 2) - np.log(np.arange(1, population // 2 + 1))
         self._weights = ranks / ranks.sum()
         self._mass = mass = 1 / (self._weights @ self._weights)
@@ -58,8 +60,13 @@ class CMA:
         rate = speed * 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)
         self._rate_many = min(1 - self._rate_one, rate)
         self._path, self._white_path = np.zeros(n), np.zeros(n)
-        self._covariance = np.ones(n) if separable else np.eye(n)
-        self._axes, self._scales = np.eye(n), np.ones(n)
+        whole = np.eye(n) if covariance is None else covariance.copy()
+        self._covariance: FloatArray = np.ones(n) if separable else whole
+        self._axes: FloatArray = np.eye(n)
+        self._scales: FloatArray = np.ones(n)
+        self._find_axes()
+        growth = self._normalize()
+        self.sigma, self._limits = growth * sigma, (largest * math.sqrt(n), growth * largest_sigma)
 
     def ask(self) -> FloatArray:
         """Draw the candidates of a round, shape (population, n)."""
@@ -106,11 +113,18 @@ class CMA:
         if self._separable:
             added = self._rate_many * (self._weights @ best**2) + self._rate_one * self._path**2
             self._covariance = kept * self._covariance + added
-            self._scales = np.sqrt(self._covariance)
+            self._find_axes()
             return
         many = self._rate_many * (best.T * self._weights) @ best
         one = self._rate_one * np.outer(self._path, self._path)
         self._covariance = kept * self._covariance + many + one
         if self._rounds % max(1, self.mean.size // 20) == 0:
+            self._find_axes()
+
+    def _find_axes(self) -> None:
+        """Find the axes of the candidates, and the length of each."""
+        if self._separable:
+            self._scales = np.sqrt(self._covariance)
+        else:
             values, self._axes = np.linalg.eigh(self._covariance)
             self._scales = np.sqrt(np.maximum(values, 1e-300))

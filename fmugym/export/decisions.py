@@ -84,10 +84,11 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
     def decide(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
         rows = seen.cast(np.float64).T
         base, state = _of_controller(policy, rows, memory[len(past) :])
-        given = ask if network else constants
-        action, past_now = policy.step(rows.T, tuple(memory[: len(past)]), base, given)
+        given = (lambda features: ask(features.T)) if network else constants
+        before = tuple(one.T for one in memory[: len(past)])
+        action, past_now = policy.step(rows, before, base, given)
         chosen = policy._as_actions(np.stack(action, axis=-1))
-        return np.moveaxis(chosen, 0, -1), [*past_now, *state]
+        return np.moveaxis(chosen, 0, -1), [*(one.T for one in past_now), *state]
 
     return Decision(network, decide, starts)
 

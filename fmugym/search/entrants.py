@@ -56,6 +56,7 @@ class Entrant:
         best: Its numbers, shape (n,).
         gained: The round in which it was found, or in which something was changed.
         starts: How often the search has started anew.
+        then: Makes larger controllers, which enter when these gain nothing; None for none.
     """
 
     cma: CMA
@@ -67,6 +68,7 @@ class Entrant:
     best: FloatArray = field(default_factory=lambda: np.empty(0))
     gained: int = 0
     starts: int = 0
+    then: Any = None
     agreement: float = 1.0
 
     def play(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> Merit:

@@ -6,7 +6,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "scale_of"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -30,6 +30,13 @@ _FADE: Final = 0.05
 
 _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
+
+
+_REGULARIZATION: Final = 0.1
+"""What is added to the variances of observations, of 1, before correlations are inverted."""
+
+_MANY: Final = 48
+"""The correlations of more observations than this are not looked at."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,39 @@ class Form:
         """The number of weights."""
         return sum(before * after for before, after in self.shapes(observed, acting))
 
+    def covariance(self, correlations: FloatArray | None, observed: int, acting: int) -> FloatArray:
+        """Covariances of weights by which all parts of what is observed change outputs alike.
+
+        Observations that go together would otherwise move the outputs more than what differs
+        between them: the weights of the first layer get the inverse of their correlations.
+
+        Args:
+            correlations: Of the k observations, shape (k, k); None if they are not known.
+            observed: The number of observations.
+            acting: The number of outputs.
+
+        Returns:
+            Shape (n, n), with n from ``size``.
+        """
+        found = np.eye(self.size(observed, acting))
+        if correlations is not None and correlations.any():
+            inverse = np.linalg.inv(correlations + _REGULARIZATION * np.eye(observed))
+            inverse *= observed / np.trace(inverse @ correlations)
+            after = self.shapes(observed, acting)[0][1]
+            place = observed * after
+            found[:place, :place] = np.kron(inverse, np.eye(after))
+        return found
+
+    def extended(self, weights: FloatArray, observed: int, acting: int) -> FloatArray:
+        """The weights that decide as those of a linear policy without a history, shape (n,).
+
+        This form is linear, too.
+        """
+        found = np.zeros(self.shapes(observed, acting)[0])
+        given = weights.reshape(observed + 1, acting) * math.sqrt(len(found) / (observed + 1))
+        found[:observed], found[-1] = given[:-1], given[-1]
+        return found.ravel()
+
     def layers(self, weights: FloatArray, observed: int, acting: int) -> Iterator[FloatArray]:
         """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
 
@@ -83,16 +123,38 @@ class Form:
 CONSTANT: Final = Form("constant action", blind=True)
 
 
-def scale_of(moments: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean and divisor of each feature, shape (f,); constant ones are not made larger.
+class Scale(NamedTuple):
+    """What features are like.
 
-    Args:
-        moments: The sums of what ``Policy.moments`` gives in each step, shape (1 + 2 f,).
+    Attributes:
+        mean: Of each feature, shape (f,).
+        divisor: Its standard deviation, shape (f,); constant ones are not made larger.
+        correlations: Of the observations, the first k features, shape (k, k); None for many.
     """
-    mean, square = np.split(moments[1:] / moments[0], 2)
-    deviation = np.sqrt(np.maximum(square - mean**2, 0.0))
-    is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
-    return mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
+
+    mean: FloatArray
+    divisor: FloatArray
+    correlations: FloatArray | None
+
+    @classmethod
+    def of(cls, moments: FloatArray, features: int) -> Self:
+        """Compute them.
+
+        Args:
+            moments: The sums of what ``Policy.moments`` gives in each step.
+            features: The number f.
+        """
+        mean, squares, products = np.split(moments[1:] / moments[0], [features, 2 * features])
+        deviation = np.sqrt(np.maximum(squares - mean**2, 0.0))
+        is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
+        divisor = np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
+        if not products.size:
+            return cls(mean, divisor, None)
+        size = math.isqrt(products.size)
+        together = products.reshape(size, size) - np.outer(mean[:size], mean[:size])
+        correlations = together / np.outer(divisor[:size], divisor[:size])
+        correlations[is_constant[:size]] = correlations[:, is_constant[:size]] = 0.0
+        return cls(mean, divisor, correlations)
 
 
 class Policy(Controller):
@@ -181,27 +243,31 @@ class Policy(Controller):
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:
             self.baseline.reset(mask)
-        starts = [np.repeat(one[:, None], self.count, axis=1) for one in self.starts]
+        starts = [np.repeat(one[None], self.count, axis=0) for one in self.starts]
         if mask.all():
             self._memory = tuple(starts)
         else:
             pairs = zip(starts, self._memory, strict=True)
-            self._memory = tuple(np.where(mask, start, now) for start, now in pairs)
-
-    # What it decides; observations and features come first, environments last.
+            self._memory = tuple(np.where(mask[:, None], start, now) for start, now in pairs)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         if self.baseline is None:
             base = np.repeat(np.array(self.middle)[:, None], self.count, axis=1)
         else:
             base = self.baseline._decide(rows).reshape(self.count, -1).T
-        action, self._memory = self.step(rows.T, self._memory, base, self._network)
+        action, self._memory = self.step(rows, self._memory, base, self._network)
         return np.stack(action, axis=-1)
 
     @property
     def moments(self) -> FloatArray:
-        """One, the features of the last decision and their squares, shape (1 + 2 f, N)."""
-        return np.concatenate([np.ones((1, self.count)), self._shown, self._shown**2])
+        """One, the features of the last decision, their squares, and products of observations.
+
+        The shape is (1 + 2 f + k^2, N); where k would be large, it is 0.
+        """
+        k = len(self.names) if len(self.names) <= _MANY else 0
+        shown, observed = self._shown.T, self._shown[:, :k].T
+        products = (observed[:, None] * observed).reshape(-1, self.count)
+        return np.concatenate([np.ones((1, self.count)), shown, shown**2, products])
 
     @property
     def middle(self) -> list[float]:
@@ -222,11 +288,11 @@ class Policy(Controller):
         """Decide once; all values may be arrays or symbols.
 
         Args:
-            observed: Shape (k, ...).
+            observed: Shape (..., k).
             memory: What the last step has returned, or ``starts``.
-            base: What the controller has decided, shape (m, ...).
-            network: Gives the corrections for features of shape (f, ...). If actions are discrete,
-                it gives the chosen elements.
+            base: What the controller has decided: the m elements of the action.
+            network: Gives the m corrections for features of shape (..., f). If actions are
+                discrete, it gives the chosen elements.
 
         Returns:
             The elements of the action, and what to keep.
@@ -242,12 +308,13 @@ class Policy(Controller):
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
         """What the network sees, and what it shall see of this step in the next one."""
         if not memory:
-            return (observed[:0],) if self.form is not None and self.form.blind else (observed,)
+            is_blind = self.form is not None and self.form.blind
+            return (observed[..., :0] if is_blind else observed,)
         last, leaky, told = memory
         is_first = np.isnan(last)
         change = np.where(is_first, 0.0, observed - last)
         leaky = np.where(is_first, observed, leaky + _FADE * (observed - leaky))
-        return np.concatenate([observed, change, leaky, told]), observed, leaky
+        return np.concatenate([observed, change, leaky, told], axis=-1), observed, leaky
 
     def _told(self, action: Sequence[Any]) -> Any:
         """The action as the network sees it in the next step.
@@ -256,19 +323,18 @@ class Policy(Controller):
         """
         if self.parts:
             told = [one == n for one, all_ in zip(action, self._choices, strict=True) for n in all_]
-            return 1.0 * np.stack(told)
-        pairs = zip(action, self.limits, strict=True)
-        return np.stack(
-            [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in pairs]
-        )
+        else:
+            pairs = zip(action, self.limits, strict=True)
+            told = [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in pairs]
+        return 1.0 * np.stack(told, axis=-1)
 
     def _network(self, features: FloatArray) -> Any:
-        """The outputs for features of shape (f, N), row by row, so that groups do not matter.
+        """The outputs for features of shape (N, f), row by row, so that groups do not matter.
 
         Rows are contiguous, as products of rows with gaps may be rounded in another way.
         """
         self._shown, (mean, divisor) = features, self.scale
-        rows = np.ascontiguousarray(features.T)
+        rows = np.ascontiguousarray(features)
         values = np.clip((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
         *hidden, last = self._layers
         for layer in hidden:

@@ -16,7 +16,7 @@ from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
 from fmugym.search.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
-from fmugym.search.policy import CONSTANT, Form, Policy, scale_of
+from fmugym.search.policy import CONSTANT, Form, Policy, Scale
 
 __all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
 
@@ -33,7 +33,7 @@ _LAST: Final = 100
 _EVERY: Final = 5
 """Rounds from one validation to the next."""
 
-_TUNING: Final = 20
+_TUNING: Final = 15
 """Rounds for the numbers of a controller."""
 
 _TRYING: Final = 5
@@ -61,7 +61,7 @@ _LINEAR, _HISTORY = Form("linear"), Form("linear with history", history=True)
 _NETWORK = Form("network", hidden=(16,))
 
 _SIGMAS: Final = {_LINEAR: 1.0, _HISTORY: 1.0, _NETWORK: 4.0, CONSTANT: 1.0}
-_CORRECTION: Final = 0.25
+_CORRECTION: Final = 0.4
 """The first steps of the weights, and the part of them where they correct a controller."""
 
 
@@ -88,6 +88,7 @@ class _Policies:
     under: Agent
     form: Form
     scale: Any
+    correlations: FloatArray | None = None
 
     def __call__(self, rows: FloatArray) -> Controller:
         return self.agent(rows).policy()
@@ -136,7 +137,8 @@ class Search:
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
         self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
         if not (fixed or tunable or guesses):
-            make = _Policies(Agent("", None), CONSTANT, (np.empty(0), np.empty(0)))
+            nothing = np.empty(0)
+            make = _Policies(Agent("", None), CONSTANT, (nothing, nothing))
             self._tuned = [replace(self._entrant(make), quota=_TRYING)]
         self._contenders: list[Entrant] = []
         self._gone: list[Entrant] = []
@@ -172,7 +174,7 @@ class Search:
             )
             self._enter(arena, self.baseline)
         else:
-            leaders = sorted(self._contenders, key=lambda one: one.merit)[-2:]
+            leaders = self._leaders()
             self._play(self._next(leaders), arena)
             self._let_go(leaders)
 
@@ -186,6 +188,11 @@ class Search:
             self._tuned[-1].quota, self._guesses = _TUNING, []
             return self._waiting()
         return None
+
+    def _leaders(self) -> list[Entrant]:
+        """The best two; one that is not better than the baseline leads only if none is."""
+        ranked = sorted(self._contenders, key=lambda one: one.merit)
+        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[-2:]
 
     def _next(self, leaders: Sequence[Entrant]) -> Entrant:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
@@ -204,6 +211,12 @@ class Search:
                 one.starts += 1
                 one.cma = self._cma(one.make, one.best)
             one.gained = one.rounds
+            if one.then is not None:
+                start = one.then.form.extended(one.best, *self._sizes)
+                self._contenders.append(
+                    Entrant(self._cma(one.then, start), one.then, self._episodes)
+                )
+                one.then = None
             if one.starts == _STARTS:
                 self._contenders.remove(one)
                 self._gone.append(one)
@@ -234,32 +247,43 @@ class Search:
 
     def _cma(self, make: _Policies, start: FloatArray) -> CMA:
         sigma = _SIGMAS[make.form] * (1.0 if make.under.text is None else _CORRECTION)
+        is_large = len(start) > _MANY
+        alike = None if is_large else make.form.covariance(make.correlations, *self._sizes)
         return CMA(
             start,
             sigma,
             self._population,
             self._rng,
-            separable=len(start) > _MANY,
+            separable=is_large,
             largest=_LARGEST,
             largest_sigma=_GROWTH * sigma,
+            covariance=alike,
         )
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
         middle = Agent("", None)
-        mean, divisor = self._scale(arena, baseline, middle)
-        over = [] if baseline.text is None else [(baseline, _LINEAR), (baseline, _HISTORY)]
-        alone = [(middle, _LINEAR), *([] if over else [(middle, _HISTORY)]), (middle, _NETWORK)]
-        for under, form in [*over, *alone]:
-            count = form.features(*self._sizes)
-            make = _Policies(under, form, (mean[:count], divisor[:count]))
-            self._contenders.append(self._entrant(make))
+        scale = self._scale(arena, baseline, middle)
 
-    def _scale(self, arena: Arena, *agents: Agent) -> tuple[FloatArray, FloatArray]:
+        def make(under: Agent, form: Form, correlations: FloatArray | None = None) -> _Policies:
+            count = form.features(*self._sizes)
+            parts = scale.mean[:count], scale.divisor[:count]
+            return _Policies(under, form, parts, correlations)
+
+        if baseline.text is None:
+            alone = [_LINEAR, _HISTORY, _NETWORK]
+        else:  # only these observations are like those that were seen
+            alone = [_LINEAR, _NETWORK]
+            first = self._entrant(make(baseline, _LINEAR, scale.correlations))
+            first.then = make(baseline, _HISTORY, scale.correlations)
+            self._contenders.append(first)
+        self._contenders += [self._entrant(make(middle, form)) for form in alone]
+
+    def _scale(self, arena: Arena, *agents: Agent) -> Scale:
         """What observations are like while each candidate adds another constant."""
         size, acting = _HISTORY.size(*self._sizes), self._sizes[1]
         count = _HISTORY.features(*self._sizes)
-        moments = np.zeros(1 + 2 * count)
+        moments: FloatArray = np.zeros(())
         for agent in agents:
             rows = np.zeros((self._population, size))
             rows[:, -acting:] = self._rng.uniform(-1, 1, (self._population, acting))
@@ -267,9 +291,9 @@ class Search:
             make = _Policies(agent, _HISTORY, (np.zeros(count), np.ones(count)))
             seeds = self._training(self._episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
-            moments += outcome.watched.sum(axis=(0, 1))
+            moments = moments + outcome.watched.sum(axis=(0, 1))
             self.rounds += 1
-        return scale_of(moments)
+        return Scale.of(moments, count)
 
     # Who wins.
 
