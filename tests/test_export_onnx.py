@@ -61,7 +61,10 @@ def difference(env, network, agent, path, steps):
     runner = Runner(write_onnx(agent, path))
     for name, value in drawn_in(env, agent.logic).items():
         runner.memory[name][:] = value
-    step = lambda measured: runner.step([measured])[0]  # noqa: E731
+
+    def step(measured):
+        return runner.step([measured])[0]
+
     return largest_difference(env, network, agent.logic, step, steps)
 
 

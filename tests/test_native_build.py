@@ -15,7 +15,7 @@ import pytest
 from fmugym.pool import has_native_pool
 from fmugym.vector.hooks import program
 
-pytest.importorskip("ziglang")
+pytest.importorskip("ziglang", reason="needs ziglang: the extra test")
 
 NATIVE = Path(__file__).resolve().parent.parent / "native"
 CORE = sorted(NATIVE.glob("*.c"))
