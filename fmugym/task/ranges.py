@@ -46,7 +46,7 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
     ends = support_of(value) if is_distribution(value) else (value, value)
     if all(_lies_in(low, end, high) for end in ends):
         return value
-    unit = f" {variable.unit}" if variable.unit else ""
+    unit = "" if variable.unit in (None, "", "1") else f" {variable.unit}"
     text = f"{low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
     if all(map(math.isfinite, ends)):
         found = shown(value) if ends[0] == ends[1] else f"{ends[0]} to {ends[1]} of {shown(value)}"
