@@ -1,0 +1,43 @@
+"""Results that stay as they were: those of a second implementation, which is to go.
+
+``golden/make.py`` has written them at revision 179b934. They are exact on x86-64 Linux; elsewhere
+compilers and libraries of mathematics round in other ways.
+"""
+
+import json
+import platform
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+GOLDEN = Path(__file__).parent / "golden"
+RESULTS = json.loads((GOLDEN / "results.json").read_text(encoding="utf-8"))
+IS_EXACT = sys.platform == "linux" and platform.machine() == "x86_64"
+
+sys.path.insert(0, str(GOLDEN))
+import cases  # noqa: E402 (its folder is no package)
+
+CASES = cases.cases()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("golden")
+
+
+def test_every_result_has_its_case():
+    assert list(RESULTS) == list(CASES)
+
+
+@pytest.mark.parametrize("native", [True, False], ids=["native", "python"])
+@pytest.mark.parametrize("name", RESULTS)
+def test_is_as_it_was(name, native, folder):
+    found = CASES[name](folder, native=native)
+    values = [float.fromhex(text) for text in RESULTS[name]["values"]]
+    expected = np.reshape(values, RESULTS[name]["shape"])
+    if IS_EXACT:
+        np.testing.assert_array_equal(found, expected)
+    else:
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
