@@ -1,20 +1,25 @@
-"""What the golden results are of: pools that play a few steps of many FMUs.
+"""What the golden results are of: pools and tasks that play a few steps of many FMUs.
 
-Each case is a function of a folder for FMUs and of the keyword arguments of ``local_pool``. It
-returns the outputs after each call: those of a reset and of some steps of two instances, a reset of
-the first of them alone, more steps, and the steps after a snapshot once more.
+Each case is a function of a folder for FMUs and of the keyword arguments of ``local_pool``. Of a
+pool it returns the outputs after each call: those of a reset and of some steps of two instances, a
+reset of the first of them alone, more steps, and the steps after a snapshot once more. Of a task it
+returns what is observed, rewards and ends.
 """
 
 import logging
+import sys
 from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
+from pathlib import Path
 
 import exchange_tools
+import gymnasium as gym
 import numpy as np
 import system_tools
 
+import fmugym
 from fmugym import FMU, FMUGymError
 from fmugym.archive.bundled import BUNDLED, bundled_fmu
 from fmugym.pool import PoolSpec
@@ -22,6 +27,10 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.spec import SOLVERS
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import c_fmus
+import user_tasks
 
 LOG = logging.getLogger("fmugym.test")
 PLANTS = {
@@ -119,6 +128,67 @@ def linear(folder, version):
     return system_tools.linear_fmu(folder / f"linear{version}.fmu", version)
 
 
+# Tasks.
+
+
+def flat(value):
+    """The numbers of an observation or action of any space."""
+    if isinstance(value, dict):
+        return np.concatenate([flat(value[key]) for key in sorted(value)])
+    return np.asarray(value, np.float64).ravel()
+
+
+def single(make, folder, **_):
+    """Two episodes of at most 15 steps."""
+    rows = []
+    with closing(make(folder)) as env:
+        env.action_space.seed(3)
+        for seed in (5, 6):
+            observation, _ = env.reset(seed=seed)
+            rows.append([*flat(observation), 0.0, 0.0, 0.0])
+            for _ in range(15):
+                observation, reward, *ends, _ = env.step(env.action_space.sample())
+                rows.append([*flat(observation), reward, *map(float, ends)])
+                if any(ends):
+                    break
+    return np.array(rows)
+
+
+def vector(make, folder, **_):
+    """25 steps of three environments."""
+    with closing(fmugym.FMUVectorEnv(partial(make, folder), 3)) as envs:
+        envs.action_space.seed(3)
+        observations, _ = envs.reset(seed=7)
+        rows = [flat(observations)]
+        for _ in range(25):
+            observations, rewards, *ends, _ = envs.step(envs.action_space.sample())
+            rows.append(np.concatenate([flat(observations), rewards, *map(flat, ends)]))
+    return np.concatenate(rows)
+
+
+def made(name, folder):
+    return gym.make(f"fmugym/{name}").unwrapped
+
+
+def of_user(name, folder):
+    if name != "Building":
+        return getattr(user_tasks, name)()
+    return user_tasks.Building(building(folder))
+
+
+@cache
+def building(folder):
+    return c_fmus.build_building(folder)
+
+
+def tasks():
+    """Functions that make environments, by name."""
+    ids = ("CartPole-v0", "CloudPendulum-v0", "House-v0", "ModelicaCartPole-v0", "Pendulum-v0")
+    found = {name: partial(made, name) for name in ids}
+    names = ("SwingUp", "Tracking", "Uncompiled", "Goal", "Building")
+    return found | {name: partial(of_user, name) for name in names}
+
+
 def cases():
     """The functions by name."""
     found = {f"bundled {m} {v}": partial(bundled, m, v) for m, v in BUNDLED}
@@ -126,4 +196,6 @@ def cases():
         found[f"exchange {model} {version} {solver}"] = partial(exchange, model, version, solver)
     for name, version, master in product(("pendulum", "masses", "tank"), (2, 3), MASTERS):
         found[f"system {name} {version} {master}"] = partial(system, name, version, master)
+    for name, make in tasks().items():
+        found |= {f"single {name}": partial(single, make), f"vector {name}": partial(vector, make)}
     return found
