@@ -20,8 +20,6 @@ MOST_ENVS: Final = 512
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
-_NOTHING: Final = np.empty((0, 0))
-
 Make = Callable[[FloatArray], Controller]
 """Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
 
@@ -84,7 +82,7 @@ class Arena:
         make: Make,
         numbers: FloatArray,
         seeds: Sequence[int],
-        watch: Callable[[Any], FloatArray] = lambda controller: _NOTHING,
+        watch: Callable[[Any], FloatArray] | None = None,
     ) -> Outcome:
         """Let candidates play.
 
@@ -131,7 +129,9 @@ class Arena:
             actions = controller.act(observations, infos)
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             costs = (infos["costs"][name] for name in self._costs)
-            each = np.stack([rewards, *costs, *watch(controller)])
+            each = np.stack([rewards, *costs])
+            if watch is not None:
+                each = np.concatenate([each, watch(controller)])
             totals = totals + np.where(running, each, 0.0)
             self.steps += len(seeds)
             running &= ~(terminated | truncated)
