@@ -201,6 +201,19 @@ class TestArena:
                     assert outcome.costs[row, column].tolist() == cost
         assert len(lengths) > 3  # some have ended before others
 
+    def test_environments_are_not_opened_again_and_again(self):
+        """Where there may be no more of them, a few episodes play in many environments."""
+        opened = []
+        make = load()
+        with closing(Arena(lambda: opened.append(1) or make(), 15)) as arena:
+            for _ in range(3):
+                arena.play(pid, GAINS, SEEDS)
+                arena.play(pid, GAINS[:1], SEEDS[:1])
+            first = len(opened)
+            arena.play(pid, GAINS, SEEDS)
+            assert len(opened) == first
+            assert list(arena._envs) == [15]
+
     @pytest.mark.parametrize("most_envs", [1, 4, 7, 14, 15, 512])
     def test_groups_change_nothing(self, most_envs):
         expected, _ = played(load(), costs=["effort"])

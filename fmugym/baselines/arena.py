@@ -15,7 +15,10 @@ from fmugym.vector import FMUVectorEnv
 __all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Outcome"]
 
 MOST_ENVS: Final = 512
-"""As many environments step together, unless the caller says less."""
+"""As many environments there are, unless the caller says less."""
+
+_WIDEST: Final = 256
+"""More environments than this need not step together: they would hardly be faster."""
 
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
@@ -50,7 +53,7 @@ class Arena:
 
     Args:
         make_env: A function that makes the environment, or its class.
-        most_envs: The largest number of environments.
+        most_envs: The largest number of environments, of all sizes together.
         most_steps: Steps after which an episode is stopped.
         costs: The names of costs to add up.
 
@@ -109,10 +112,13 @@ class Arena:
 
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
-        size = min(jobs, self._most_envs)
+        size = min(jobs, self._most_envs, _WIDEST)
+        if size not in self._envs and sum(self._envs) + size > self._most_envs:
+            larger = [count for count in self._envs if count > size]
+            if larger:
+                return self._envs[min(larger)]
+            self.close()
         if size not in self._envs:
-            if sum(self._envs) + size > self._most_envs:
-                self.close()
             self._envs[size] = FMUVectorEnv(self._make_env, size)
         return self._envs[size]
 

@@ -137,8 +137,7 @@ class Search:
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
         self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
         if not (fixed or tunable or guesses):
-            nothing = np.empty(0)
-            make = _Policies(Agent("", None), CONSTANT, (nothing, nothing))
+            make = _Policies(Agent("", None), CONSTANT, (np.empty(0), np.empty(0)))
             self._tuned = [replace(self._entrant(make), quota=_TRYING)]
         self._contenders: list[Entrant] = []
         self._gone: list[Entrant] = []
