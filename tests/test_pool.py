@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, edited_fmu
+from plants import PLANTS
 from wine_tools import for_windows
 
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
@@ -22,12 +23,6 @@ from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
 
-PLANTS = {
-    "CartPole": ("f", ["x", "x_dot", "theta", "theta_dot"], "theta_0", 10.0),
-    "Pendulum": ("tau", ["theta", "theta_dot"], "q_0", 0.1),
-    "DoublePendulum": ("tau2", ["q1", "q1_dot", "q2", "q2_dot"], "q1_0", 0.1),
-    "House": ("u", ["T_m", "T_w", "T_air"], "T_w_0", 1.0),
-}
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
 

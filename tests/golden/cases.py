@@ -7,17 +7,18 @@ returns what is observed, rewards and ends.
 """
 
 import logging
-import sys
 from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
-from pathlib import Path
 
+import c_fmus
 import exchange_tools
 import gymnasium as gym
 import numpy as np
 import system_tools
+import user_tasks
+from plants import PLANTS
 
 import fmugym
 from fmugym import FMU, FMUGymError
@@ -28,17 +29,7 @@ from fmugym.pool.spec import SOLVERS
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import c_fmus
-import user_tasks
-
 LOG = logging.getLogger("fmugym.test")
-PLANTS = {
-    "CartPole": ("f", ["x", "x_dot", "theta", "theta_dot"], "theta_0", 10.0),
-    "Pendulum": ("tau", ["theta", "theta_dot"], "q_0", 0.1),
-    "DoublePendulum": ("tau2", ["q1", "q1_dot", "q2", "q2_dot"], "q1_0", 0.1),
-    "House": ("u", ["T_m", "T_w", "T_air"], "T_w_0", 1.0),
-}
 MODELS = {
     "dahlquist": ("u", 0.25),
     "ball": (None, 0.1),
@@ -139,14 +130,14 @@ def flat(value):
 
 
 def single(make, folder, **_):
-    """Two episodes of at most 15 steps."""
+    """Two episodes of at most 6 steps."""
     rows = []
     with closing(make(folder)) as env:
         env.action_space.seed(3)
         for seed in (5, 6):
             observation, _ = env.reset(seed=seed)
             rows.append([*flat(observation), 0.0, 0.0, 0.0])
-            for _ in range(15):
+            for _ in range(6):
                 observation, reward, *ends, _ = env.step(env.action_space.sample())
                 rows.append([*flat(observation), reward, *map(float, ends)])
                 if any(ends):
@@ -155,12 +146,12 @@ def single(make, folder, **_):
 
 
 def vector(make, folder, **_):
-    """25 steps of three environments."""
-    with closing(fmugym.FMUVectorEnv(partial(make, folder), 3)) as envs:
+    """8 steps of two environments."""
+    with closing(fmugym.FMUVectorEnv(partial(make, folder), 2)) as envs:
         envs.action_space.seed(3)
         observations, _ = envs.reset(seed=7)
         rows = [flat(observations)]
-        for _ in range(25):
+        for _ in range(8):
             observations, rewards, *ends, _ = envs.step(envs.action_space.sample())
             rows.append(np.concatenate([flat(observations), rewards, *map(flat, ends)]))
     return np.concatenate(rows)

@@ -1,10 +1,10 @@
 """Write the golden results: what the pool in Python gave for all cases before it went.
 
     git worktree add BEFORE 179b934
-    python tests/golden/make.py RESULTS
+    PYTHONPATH=BEFORE:BEFORE/tests:tests:benchmarks python -P -m golden.make RESULTS
 
 RESULTS is the file to write. The package that Python imports makes them, so run this with the
-environment of that revision, and with its tests beside it (PYTHONPATH=BEFORE/tests).
+environment of that revision; its own tests come first.
 """
 
 import json
@@ -12,18 +12,18 @@ import sys
 import tempfile
 from pathlib import Path
 
-import cases
+from golden.cases import cases
 
 
 def written(values):
-    """Numbers as texts that lose nothing."""
-    return [float(value).hex() for value in values.ravel()]
+    """Numbers as a text that loses nothing."""
+    return " ".join(float(value).hex() for value in values.ravel())
 
 
 def main():
     results = {}
     with tempfile.TemporaryDirectory() as folder:
-        for name, case in cases.cases().items():
+        for name, case in cases().items():
             values = case(Path(folder), native=False)
             results[name] = {"shape": values.shape, "values": written(values)}
     Path(sys.argv[1]).write_text(json.dumps(results, indent=0), encoding="utf-8")
