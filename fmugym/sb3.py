@@ -19,16 +19,17 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.extras import lacking
 from fmugym.pool.base import MaskArray
+from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
 from fmugym.vector.libraries import make_vector_env
 
 try:
-    from stable_baselines3.common.vec_env import VecEnv, VecMonitor
+    from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
 except ImportError as error:
     raise ImportError(lacking("fmugym.sb3", "Stable-Baselines3", "sb3"), name=error.name) from error
 
-__all__ = ["FMUVecEnv", "make_sb3_env"]
+__all__ = ["FMUVecEnv", "ScaledActions", "make_sb3_env"]
 
 Indices = int | Iterable[int] | None
 StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
@@ -268,3 +269,29 @@ class FMUVecEnv(VecEnv):
             warnings.warn(f"no pictures in the render mode {self.render_mode}", stacklevel=2)
             return [None] * self.num_envs
         return self.env_method("render")
+
+
+class ScaledActions(VecEnvWrapper):
+    """Gives each action the range from -1 to 1, which algorithms expect.
+
+    Agents that were trained so act in the task itself: all of fmugym that takes them, such as
+    ``export`` and ``evaluate``, brings actions from -1 to 1 to the ranges of the task.
+
+    Args:
+        venv: Environments with a bounded Box of actions.
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv, action_space=scaled_space(venv.action_space))
+
+    def reset(self) -> Any:
+        """See ``FMUVecEnv.reset``."""
+        return self.venv.reset()
+
+    def step_async(self, actions: npt.NDArray[Any]) -> None:
+        """See ``FMUVecEnv.step_async``."""
+        self.venv.step_async(unscaled(actions, self.venv.action_space))
+
+    def step_wait(self) -> Any:
+        """See ``FMUVecEnv.step_wait``."""
+        return self.venv.step_wait()

@@ -3,19 +3,23 @@
 import csv
 import errno
 import json
+import pickle
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
 from fmugym.tools.cli import main
-from fmugym.tools.evaluation import confidence, evaluate, warning_of_one_reward
+from fmugym.tools.evaluation import HELD_OUT_SEED, confidence, evaluate, warning_of_one_reward
 from fmugym.tools.simulation import Player, action_of
-from fmugym.tools.training import arguments_of
+from fmugym.tools.training import Plan, arguments_of, train
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 SCENARIOS = {
@@ -33,6 +37,33 @@ SCENARIOS = {
         "late": {"start": "01-02 12:00", "length": "0.5s"},
     },
 }
+
+
+class Parts(fmugym.FMI2CSEnv):
+    """A pendulum with a number and a choice as observations."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "tau",
+            "model_output_names": ["q", "q_dot"],
+            "time_step": 0.05,
+            "max_episode_steps": 20,
+        }
+        super().__init__(fmugym.bundled_fmu("Pendulum", "2.0"), config)
+
+    def _get_action_space(self):
+        return spaces.Box(-2, 2, (1,), np.float32)
+
+    def _get_observation_space(self):
+        angle = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        return spaces.Dict({"angle": angle, "side": spaces.Discrete(2)})
+
+    def _get_observation(self):
+        angle = np.array(self.state[:1], np.float32)
+        return {"angle": angle + np.float32(1000), "side": np.int64(angle[0] > 0)}
+
+    def _is_done(self):
+        return False
 
 
 def run(capsys, *arguments):
@@ -277,6 +308,47 @@ class TestTrain:
         assert code == 0
         assert err.count("the reward was 0") == 1
         assert err.count("in evaluation") > 2
+
+    @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+    def test_actions_are_scaled_and_observations_normalized(self, algorithm, tmp_path, capsys):
+        """Gymnasium's wrapper of the same model gives the rewards that are told."""
+        from stable_baselines3 import PPO, SAC
+
+        task = SCENARIOS | {"variables": {"tau": {"min": -50, "max": 150}}}
+        del task["scenarios"], task["clock"], task["data"]
+        task |= {"agent": {"actions": ["tau"], "observations": ["q", "q_dot"]}, "reward": "-abs(q)"}
+        fmugym.Task.from_dict(task).write(tmp_path / "a.toml")
+        own = ["n_steps=16", "batch_size=32"] if algorithm == "PPO" else ["learning_starts=10"]
+        options = "--steps", "64", "--envs", "2", "--episodes", "1", "--json"
+        folder = tmp_path / "agent"
+        chosen = "--algorithm", algorithm, "--output", folder
+        code, out, _ = trained(capsys, tmp_path / "a.toml", *own, *options, *chosen)
+        assert code == 0
+        model = {"PPO": PPO, "SAC": SAC}[algorithm].load(folder / "model.zip")
+        normalization = pickle.loads((folder / "normalization.pkl").read_bytes())
+        normalization.training = False
+        env = fmugym.load(tmp_path / "a.toml")
+        outer = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
+        assert model.action_space == outer.action_space
+        seen, _ = outer.reset(seed=HELD_OUT_SEED)
+        total, is_over = 0.0, False
+        while not is_over:
+            action, _ = model.predict(normalization.normalize_obs(seen), deterministic=True)
+            seen, reward, *ends, _ = outer.step(action)
+            total, is_over = total + reward, any(ends[:2])
+        env.close()
+        assert json.loads(out)["scores"][0]["mean_reward"] == pytest.approx(total, rel=1e-4)
+
+    def test_parts_of_observations_are_normalized(self, tmp_path):
+        """Numbers are, and choices are not."""
+        from stable_baselines3 import PPO
+
+        plan = Plan(Parts, {"held out": Parts}, tmp_path / "agent", steps=64, num_envs=2)
+        train(replace(plan, arguments={"n_steps": 16, "batch_size": 32}, episodes=1))
+        normalization = pickle.loads((tmp_path / "agent" / "normalization.pkl").read_bytes())
+        assert normalization.norm_obs_keys == ["angle"]
+        assert normalization.obs_rms["angle"].mean == pytest.approx(1000.0, rel=0.01)
+        assert PPO.load(tmp_path / "agent" / "model.zip").action_space.high == [1.0]
 
     def test_an_interruption_keeps_the_best_agent(self, tmp_path, capsys, monkeypatch):
         def train(self):

@@ -17,6 +17,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Layer, Network, Scaling
 from fmugym.export.policies import network_of_model
+from fmugym.scaling import are_scaled
 from fmugym.search.agent import Agent
 from fmugym.search.policy import LIMIT, Policy
 
@@ -65,6 +66,8 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
         policy = deepcopy(model) if isinstance(model, Policy) else Policy(deepcopy(model))
         return _of_policy(policy.bind(env), env.observation_space)
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
+    if are_scaled(network.space, env.action_space):
+        network = network.unscaled(env.action_space)
     if isinstance(network.space, spaces.Box):
         return Decision(network, lambda seen, memory, ask: (network.limited(ask(seen)), ()))
     return Decision(network)

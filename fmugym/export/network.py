@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -176,6 +176,14 @@ class Network:
                 f"the agent is for another task: its actions are {self.space}, those of the task "
                 f"are {space}"
             )
+
+    def unscaled(self, space: Any) -> Network:
+        """The same policy with actions in a bounded ``space``, which its own from -1 to 1 mean."""
+        if self.squashed:
+            return replace(self, space=space)
+        low, high = space.low.ravel().astype(np.float64), space.high.ravel().astype(np.float64)
+        half, middle = (((high + sign * low) / 2).astype(self.dtype) for sign in (-1, 1))
+        return replace(self, layers=(*self.layers, Layer(np.diag(half), middle)), space=space)
 
     def values(self, observation: FloatArray) -> FloatArray:
         """The last values for an observation of shape (k,)."""

@@ -20,6 +20,7 @@ from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import imported
+from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.agent import AGENT, Agent
 from fmugym.signals import ordinary
 from fmugym.tools.simulation import Player, Policy, policy_of_controller
@@ -210,13 +211,16 @@ def _names(what: str, env: FMUEnv) -> str:
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
     """Make the policy that a model is: its best action, and masked ones only where it knows masks.
 
+    Actions from -1 to 1 stand for the ranges of the environment's.
+
     Args:
         model: The model.
         normalization: A ``VecNormalize`` that does not learn now, or None.
         env: The environment to act in.
     """
     masks = "action_masks" in inspect.signature(model.predict).parameters
-    memory: dict[str, Any] = {}
+    space, memory = env.action_space, dict[str, Any]()
+    scaled = space if are_scaled(model.action_space, space) else None
 
     def begin() -> None:
         memory.clear()
@@ -232,6 +236,8 @@ def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:
             deterministic=True,
             **more,
         )
+        if scaled is not None:
+            return unscaled(action, scaled)
         return action if action.ndim else int(action)
 
     return Policy(choose, begin)

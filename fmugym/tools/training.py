@@ -20,6 +20,7 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.scaling import can_be_scaled
 from fmugym.signals import ordinary
 from fmugym.tools.agents import (
     FACTS,
@@ -74,7 +75,8 @@ class Plan:
         seed: Of the environments and of the algorithm.
         episodes: Episodes of an evaluation in each environment of ``held_out``.
         most_steps: The steps after which an episode of an evaluation is stopped.
-        normalize: Whether observations and rewards are normalized by running statistics.
+        normalize: Whether observations and rewards are normalized by running statistics. Actions
+            with other ranges are scaled to -1 to 1 in any case.
         arguments: Arguments of the algorithm.
         diary: What to record; None for nothing.
     """
@@ -170,22 +172,35 @@ def train(
             few to learn once, or there is no such training to resume.
         FileExistsError: If the folder exists, unless a training is resumed.
     """
-    make_sb3_env = imported_for_training("fmugym.sb3").make_sb3_env
+    sb3 = imported_for_training("fmugym.sb3")
     algorithm_of(plan.algorithm)
     if resume:
         _require_same(plan)
     else:
         require_new(plan.folder)
     wrap = _recorder(plan, resume)
-    venv = make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed, wrap=wrap)
+    venv = sb3.make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed, wrap=wrap)
     try:
-        if plan.normalize and isinstance(venv.observation_space, spaces.Box):
-            venv = import_module("stable_baselines3.common.vec_env").VecNormalize(venv)
+        if can_be_scaled(venv.action_space):
+            venv = sb3.ScaledActions(venv)
+        if plan.normalize:
+            venv = _normalized(venv)
         with closing(_Training(plan, venv, watch or Watch(tell), resume)) as training:
             training.run()
             return training.scores_of_kept()
     finally:
         venv.close()
+
+
+def _normalized(venv: Any) -> Any:
+    """Normalize all numbers that are observed, and rewards."""
+    space, names = venv.observation_space, None
+    if isinstance(space, spaces.Dict):
+        names = [name for name, part in space.spaces.items() if isinstance(part, spaces.Box)]
+    if not names and not isinstance(space, spaces.Box):
+        return venv
+    make = import_module("stable_baselines3.common.vec_env").VecNormalize
+    return make(venv, norm_obs_keys=names)
 
 
 def _recorder(plan: Plan, resume: bool) -> Callable[[FMUVectorEnv], Any]:

@@ -135,7 +135,7 @@ def _other_advices(env: FMUEnv, recommended: Mapping[str, Any]) -> Iterator[Advi
     if _has_limits(space):
         size = np.abs([space.low, space.high]).max()
         if not _EXPLORED[0] <= size <= _EXPLORED[1]:
-            why = f"actions reach {size:.3g}, but --algorithm explores by steps of about 1"
+            why = f"actions reach {size:.3g}, which algorithms of other libraries do not expect"
             yield Advice("agent", "rescale", True, why)
     if "isolation" in recommended:
         yield Advice("config", "isolation", "process", "instances disturb each other, or crash")
