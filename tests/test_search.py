@@ -136,6 +136,37 @@ class TestCMA:
         assert told < 1.5 * rounds_of(sphere, made())
         assert told < 0.8 * rounds_of(turned_ellipsoid, made())
 
+    @pytest.mark.parametrize("separable", [False, True])
+    def test_few_candidates_go_in_directions_at_right_angles(self, separable):
+        """Their lengths are those of normal numbers, and no direction is preferred."""
+        cma = CMA(np.zeros(6), 0.5, 6, np.random.default_rng(0), separable=separable)
+        steps = np.array([cma.ask() / cma.sigma for _ in range(500)])
+        products = steps @ steps.transpose(0, 2, 1)
+        lengths = np.diagonal(products, axis1=1, axis2=2)
+        assert np.abs(products - lengths[:, None] * np.eye(6)).max() < 1e-12
+        assert lengths.mean() == pytest.approx(6.0, rel=0.05)  # of chi squared
+        assert lengths.var() == pytest.approx(12.0, rel=0.15)
+        assert np.abs(steps.mean(axis=(0, 1))).max() < 0.1
+        assert np.cov(steps.reshape(-1, 6).T) == pytest.approx(np.eye(6), abs=0.1)
+
+    def test_directions_at_right_angles_help_against_noise(self):
+        """Independent ones need more rounds."""
+
+        class Independent(CMA):
+            def _drawn(self):
+                return self._rng.standard_normal(self._shape)
+
+        def reached(kind, seed):
+            cma, noise = kind(np.zeros(24), 0.5, 24, np.random.default_rng(seed)), seed + 100
+            rng, target = np.random.default_rng(noise), np.linspace(-1, 1, 24)
+            for _ in range(60):
+                values = ((cma.ask() - target) ** 2).sum(axis=1)
+                cma.tell(np.argsort(values + values.std() * rng.standard_normal(24)))
+            return np.sum((cma.mean - target) ** 2)
+
+        ours, others = ([reached(kind, i) for i in range(8)] for kind in (CMA, Independent))
+        assert np.mean(ours) < 0.8 * np.mean(others)
+
     def test_only_the_order_counts(self):
         """Not how much better a candidate is."""
         logarithm = minimized(lambda points: np.log(1e-300 + rosenbrock(points)), 50)
