@@ -2,22 +2,28 @@
 
 Each case is a function of a folder for FMUs and of the keyword arguments of ``local_pool``. Of a
 pool it returns the outputs after each call: those of a reset and of some steps of two instances, a
-reset of the first of them alone, more steps, and the steps after a snapshot once more. Of a task it
-returns what is observed, rewards and ends.
+reset of the first of them alone, more steps, and the steps after a snapshot once more; where FMUs
+fail, the statuses of all calls, too. Of a task it returns what is observed, rewards and ends.
 """
 
 import logging
+import re
+import shutil
 from contextlib import closing
 from dataclasses import replace
 from functools import cache, partial
 from itertools import product
+from pathlib import Path
 
 import c_fmus
+import clocks_tools
 import exchange_tools
 import gymnasium as gym
 import numpy as np
 import system_tools
 import user_tasks
+import values_tools
+import zoo_tools
 from plants import PLANTS
 
 import fmugym
@@ -25,11 +31,12 @@ from fmugym import FMU, FMUGymError
 from fmugym.archive.bundled import BUNDLED, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
-from fmugym.pool.spec import SOLVERS
+from fmugym.pool.spec import SOLVERS, START_TIME
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS
 
 LOG = logging.getLogger("fmugym.test")
+ROOT = Path(__file__).parents[2]
 MODELS = {
     "dahlquist": ("u", 0.25),
     "ball": (None, 0.1),
@@ -75,10 +82,10 @@ def play(pool, variables, inputs, seed=0):
 
 def played(fmu, inputs, outputs, starts, time_step, options, **spec):
     """Open a pool of two instances and play."""
-    variables = [tuple(map(fmu.variable, names)) for names in (inputs, outputs, starts)]
-    made = PoolSpec(variables[0], variables[1], time_step, **spec)
-    with closing(local_pool(fmu, made, 2, LOG, **options)) as pool:
-        return play(pool, variables[2], len(inputs))
+    given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
+    start = tuple(START_TIME if name is START_TIME else fmu.variable(name) for name in starts)
+    with closing(local_pool(fmu, PoolSpec(given, read, time_step, **spec), 2, LOG, **options)) as p:
+        return play(p, start, len(inputs))
 
 
 def bundled(model, version, folder, **options):
@@ -117,6 +124,94 @@ def system(name, version, master, folder, **options):
 @cache
 def linear(folder, version):
     return system_tools.linear_fmu(folder / f"linear{version}.fmu", version)
+
+
+WAYS = {
+    "means": {"samplings": ("mean", "max")},
+    "integrals": {"samplings": ("integral", "min")},
+    "warm-up": {"warm_up_steps": 3, "start_time": 2.0, "stop_time": 9.0, "tolerance": 1e-5},
+}
+
+
+def way(name, version, folder, **options):
+    """Co-simulation: what a step gives of its substeps, and how an episode begins."""
+    fmu = FMU(bundled_fmu("Pendulum", version))
+    starts = [START_TIME] if name == "warm-up" else ["theta_0"]
+    spec = {"substeps": 4, **WAYS[name]}
+    return played(fmu, ["tau"], ["q", "q_dot"], starts, 0.05, options, **spec)
+
+
+def linear_inputs(version, folder, **options):
+    """Co-simulation of FMI 1.0 and 2.0 with inputs that change within a step."""
+    path = folder / f"linear inputs {version}.fmu"
+    able = 'canInterpolateInputs="true"'
+    fmu = FMU(exchange_tools.exchange_fmu(path, "dahlquist", version, ("CoSimulation",), able))
+    return played(fmu, ["u"], ["x"], [], 0.1, options, ramped=(fmu.variable("u"),))
+
+
+CLOCKED = {
+    "in equations": ("ModelExchange", False),
+    "in event mode": ("CoSimulation", True),
+}
+KINDS = {"decimals": clocks_tools.CLOCKS, "fractions": clocks_tools.FRACTIONS}
+
+
+def clocks(where, kind, folder, **options):
+    """Clocks of FMI 3.0, and events between them."""
+    interface, event_mode = CLOCKED[where]
+    path = folder / f"clocks {where} {kind}.fmu"
+    fmu = FMU(clocks_tools.clocks_fmu(path, interface, event_mode, clocks=KINDS[kind]))
+    counts = [f"{what} {name}" for what in ("count of", "last") for name in clocks_tools.CLOCKS]
+    outputs = ["x", "sample", "alarms", *counts]
+    return played(fmu, ["command", "plain"], outputs, ["period"], 0.17, options)
+
+
+def arrays(interface, folder, **options):
+    """Arrays of FMI 3.0."""
+    path = folder / f"arrays {interface}.fmu"
+    fmu = FMU(values_tools.state_space_fmu(path, (interface,)))
+    outputs = ["y[1]", "y[2]", "x[1]", "x[2]"]
+    return played(fmu, ["u[1]"], outputs, ["A[1,1]", "A[2,1]"], 0.1, options, max_step=0.01)
+
+
+def types(version, folder, **options):
+    """Numbers of all types."""
+    fmu = FMU(values_tools.feedthrough_fmu(folder / f"types {version}.fmu", version))
+    kinds, whats = values_tools.TYPES[version], ("in", "out", "parameter")
+    names = [[f"{kind}_{what}" for kind in kinds] for what in whats]
+    return played(fmu, *names, 0.1, options)
+
+
+FAULTS = {
+    **{f"status {n} of {c}": ("status", c, n) for n in (1, 2, 3) for c in ("step", "set", "get")},
+    "status 3 of reset": ("status", "reset", 3),
+    "not a number": ("not_a_number", "step", 0),
+    "infinite": ("infinite", "step", 0),
+}
+
+
+def fault(name, version, folder, **options):
+    """Both instances begin to fail in their second step."""
+    path = folder / f"zoo{version}"
+    path.mkdir(exist_ok=True)
+    fmu = FMU(zoo_tools.zoo_fmu(path, version))
+    what, call, status = FAULTS[name]
+    wrong = zoo_tools.parameters(what, call, status=status)
+    variables = tuple(map(fmu.variable, ("u", "y", *wrong)))
+    made = PoolSpec(variables[:1], variables[1:2], 0.5, fault_retries=int(version > 1))
+    starts = np.repeat([[value] for value in wrong.values()], 2, axis=1)
+    with closing(local_pool(fmu, made, 2, LOG, **options)) as pool:
+        calls = [
+            partial(pool.reset, variables[2:], starts),
+            *[partial(pool.step, np.ones((1, 2)))] * 3,
+        ]
+        return np.array([faulty(*call()) for call in calls * 2])
+
+
+def faulty(outputs, statuses):
+    """The outputs of a call and its faults, without warnings, which the pools tell in other ways."""
+    faults = np.where(statuses > 1, statuses, 0)
+    return [*np.where(faults > 2, np.nan, outputs), faults]
 
 
 # Tasks.
@@ -161,6 +256,20 @@ def made(name, folder):
     return gym.make(f"fmugym/{name}").unwrapped
 
 
+def of_docs(name, folder):
+    """A task file that stands in a page, or in the examples."""
+    page, _, title = name.partition(" ")
+    path = folder / f"{page}-{title}.toml"
+    if page == "examples":
+        path.write_text((ROOT / page / title).read_text(encoding="utf-8"), encoding="utf-8")
+    else:
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        found = re.findall(r"```toml\n(.*?)```", text, re.S)
+        path.write_text(next(one for one in found if title in one), encoding="utf-8")
+        shutil.copy(bundled_fmu("House"), folder / "house.fmu")
+    return fmugym.load(path)
+
+
 def of_user(name, folder):
     if name != "Building":
         return getattr(user_tasks, name)()
@@ -177,7 +286,10 @@ def tasks():
     ids = ("CartPole-v0", "CloudPendulum-v0", "House-v0", "ModelicaCartPole-v0", "Pendulum-v0")
     found = {name: partial(made, name) for name in ids}
     names = ("SwingUp", "Tracking", "Uncompiled", "Goal", "Building")
-    return found | {name: partial(of_user, name) for name in names}
+    found |= {name: partial(of_user, name) for name in names}
+    pages = ("systems.md [system]", "task-file.md fmu =")
+    files = ("examples cart_pole.toml", "examples pendulum.toml")
+    return found | {name: partial(of_docs, name) for name in (*pages, *files)}
 
 
 def cases():
@@ -187,6 +299,15 @@ def cases():
         found[f"exchange {model} {version} {solver}"] = partial(exchange, model, version, solver)
     for name, version, master in product(("pendulum", "masses", "tank"), (2, 3), MASTERS):
         found[f"system {name} {version} {master}"] = partial(system, name, version, master)
+    for name, version in product(WAYS, ("1.0", "2.0", "3.0")):
+        found[f"way {name} {version}"] = partial(way, name, version)
+    for where, kind in product(CLOCKED, KINDS):
+        found[f"clocks {where} {kind}"] = partial(clocks, where, kind)
+    for name, version in product(FAULTS, (1, 2, 3)):
+        found[f"fault {name} {version}"] = partial(fault, name, version)
+    found |= {f"linear inputs {v}": partial(linear_inputs, v) for v in (1, 2)}
+    found |= {f"types {v}": partial(types, v) for v in (1, 2, 3)}
+    found |= {f"arrays {i}": partial(arrays, i) for i in ("CoSimulation", "ModelExchange")}
     for name, make in tasks().items():
         found |= {f"single {name}": partial(single, make), f"vector {name}": partial(vector, make)}
     return found
