@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from golden.cases import cases
+from golden.texts import texts
 
 GOLDEN = Path(__file__).parent / "golden"
 RESULTS = json.loads((GOLDEN / "results.json").read_text(encoding="utf-8"))
@@ -38,6 +39,11 @@ def test_is_as_it_was(name, folder):
 @pytest.mark.parametrize("name", [name for name in RESULTS if not name.startswith(TASKS)])
 def test_of_the_pool_in_python_is_as_it_was(name, folder):
     require_same(name, CASES[name](folder, native=False))
+
+
+def test_texts_of_mistakes_are_as_they_were(tmp_path):
+    expected = json.loads((GOLDEN / "texts.json").read_text(encoding="utf-8"))
+    assert texts(tmp_path) == expected
 
 
 def require_same(name, found):

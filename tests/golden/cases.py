@@ -209,7 +209,7 @@ def fault(name, version, folder, **options):
 
 
 def faulty(outputs, statuses):
-    """The outputs of a call and its faults, without warnings, which the pools tell in other ways."""
+    """The outputs of a call and its faults; warnings are not told by all pools."""
     faults = np.where(statuses > 1, statuses, 0)
     return [*np.where(faults > 2, np.nan, outputs), faults]
 
