@@ -81,12 +81,12 @@ class CMA:
         So they tell more than independent ones, above all if there is noise (H. Wang, M. Emmerich
         and T. Baeck, Evolutionary Computation 27, 2019).
         """
-        drawn = self._rng.standard_normal(self._shape)
-        if len(drawn) > self.mean.size:
-            return drawn
-        axes, triangle = np.linalg.qr(drawn.T)
-        signed = np.copysign(np.linalg.norm(drawn, axis=1), np.diagonal(triangle))
-        return axes.T * signed[:, None]
+        drawn: FloatArray = self._rng.standard_normal(self._shape)
+        if len(drawn) <= self.mean.size:
+            axes, triangle = np.linalg.qr(drawn.T)
+            signed = np.copysign(np.linalg.norm(drawn, axis=1), np.diagonal(triangle))
+            drawn = axes.T * signed[:, None]
+        return drawn
 
     def tell(self, order: npt.NDArray[np.int64]) -> None:
         """Learn from the order of the candidates, the best one first."""
