@@ -21,7 +21,7 @@ from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.description import INTERFACES
 from fmugym.archive.executable import check_library
 from fmugym.archive.loadable import LoadableFMU
-from fmugym.archive.packages import describe_missing
+from fmugym.archive.missing import describe_missing
 from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough

@@ -14,7 +14,7 @@ import fmpy
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.packages import describe_missing
+from fmugym.archive.missing import describe_missing
 from fmugym.errors import FMULoadError
 
 __all__ = ["ExtractedFMU", "LoadableFMU"]

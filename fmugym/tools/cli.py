@@ -49,7 +49,7 @@ or changes its meaning. What the FMU does not give is null, or ``""`` for a text
 - ``in_wine``: whether its library is one for Windows, which runs in Wine here
 - ``obstacles``: texts, what keeps the FMU from being loaded and what to do about it
 - ``missing_libraries``: the shared libraries that it needs and this machine lacks (Linux), each
-  with ``name``, the packages ``debian`` and ``conda`` that have it, and a ``note``
+  with ``name`` and a ``note``
 - ``missing_tool``: the tool that must be installed as well; null if none is known to be missing
 - ``trial``: what the first meeting on this machine has shown: ``deterministic``, the
   ``noisy_outputs``, the grades of ``resets`` by method, the ``reset_method``, the

@@ -13,7 +13,7 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.packages import missing_tool, source_of
+from fmugym.archive.missing import missing_tool, note_on
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, printable
 from fmugym.pool.base import first_of
@@ -110,7 +110,7 @@ def _missing_libraries(fmu: FMU) -> tuple[str, ...]:
 
 
 def _library_row(name: str) -> dict[str, str]:
-    return {"name": name, **source_of(name)._asdict()}
+    return {"name": name, "note": note_on(name)}
 
 
 _TEXTS: Final = (
