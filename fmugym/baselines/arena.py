@@ -127,7 +127,8 @@ class Arena:
     ) -> FloatArray:
         """Rewards, costs and what is watched, summed over an episode, shape (1 + c + r, N)."""
         observations, infos = envs.reset(seed=seeds)
-        totals: FloatArray = np.zeros(())
+        totals: FloatArray = np.zeros((1 + len(self._costs), len(seeds)))
+        watched: FloatArray = np.empty((0, len(seeds)))
         running = np.ones(len(seeds), dtype=bool)
         for _ in range(self._most_steps):
             if self.steps + len(seeds) > self.ceiling:
@@ -135,12 +136,14 @@ class Arena:
             actions = controller.act(observations, infos)
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             costs = (infos["costs"][name] for name in self._costs)
-            each = np.stack([rewards, *costs])
+            for total, values in zip(totals, (rewards, *costs), strict=True):
+                np.add(total, values, out=total, where=running)
             if watch is not None:
-                each = np.concatenate([each, watch(controller)])
-            totals = totals + np.where(running, each, 0.0)
+                seen = watch(controller)
+                watched = watched if len(watched) else np.zeros(seen.shape)
+                np.add(watched, seen, out=watched, where=running)
             self.steps += len(seeds)
             running &= ~(terminated | truncated)
             if not running.any():
                 break
-        return totals
+        return np.concatenate([totals, watched])
