@@ -293,6 +293,8 @@ Status part_judge(Composite *me, size_t index, Status status);
 /* Sets the inputs of a part to its slots; and fills the slots of its outputs. The caller judges the
  * status. */
 Status part_set_inputs(Composite *me, size_t index);
+/* Differentiates variables of a part, after its inputs were set. */
+Status part_derive(Composite *me, size_t index, const Derivation *derivation, double *values);
 Status part_read(Composite *me, size_t index);
 /* A scalar, or the array of an element as a whole, which has slots. The place of the element must
  * stay the same: solvers compare that of its reference. */

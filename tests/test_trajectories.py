@@ -13,7 +13,7 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 import fmugym
 from fmugym import ConfigError, SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
-from fmugym.fmi.instance import Instance
+from fmugym.pool.native import NativePool
 from fmugym.vector.trajectories import discrete
 
 TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
@@ -360,12 +360,12 @@ class TestTimeDependentFMU:
 def test_wrong_derivatives_are_told(monkeypatch, caplog):
     along(exact)
     assert not caplog.records
-    kept = Instance.jacobian
+    kept = NativePool.differentiate
 
     def wrong(self, unknowns, knowns):
         return 1.5 * kept(self, unknowns, knowns)
 
-    monkeypatch.setattr(Instance, "jacobian", wrong)
+    monkeypatch.setattr(NativePool, "differentiate", wrong)
     along(exact)
     (record,) = caplog.records
     assert "Pendulum" in record.getMessage()

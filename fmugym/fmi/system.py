@@ -297,11 +297,13 @@ class SystemInstance(Instance, Repeatable):
         behind = [
             [self._layout.ends_of(variable) for variable in some] for some in (unknowns, knowns)
         ]
-        return chained_jacobian(
+        found: npt.NDArray[np.float64] = chained_jacobian(
             self._layout,
-            lambda part, of, by: self._parts.all[part].instance.jacobian(of, by),
+            lambda part, of, by: self._parts.all[part].instance.jacobian(of, by)[None],
+            1,
             *behind,
-        )
+        )[0]
+        return found
 
     # States and resets
 

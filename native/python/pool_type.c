@@ -250,6 +250,7 @@ static PyMethodDef methods[] = {
     FAST("restore", py_restore),
     FAST("read", py_read),
     FAST("write", py_write),
+    FAST("differentiate", py_differentiate),
     {"failure", py_failure, METH_O, NULL},
     FAST("knows_start", py_knows_start),
     {"pack", py_pack, METH_O, NULL},

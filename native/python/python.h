@@ -102,6 +102,7 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);

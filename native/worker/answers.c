@@ -59,7 +59,7 @@ void write_failure(Worker *w, Writer *writer, size_t index) {
         write_integer(writer, failure.in_warm_up);
         write_integer(writer, failure.status);
         write_number(writer, failure.time);
-        write_integer(writer, failure.string_reference);
+        write_integer(writer, failure.reference);
         write_text(writer, failure.said);
         write_integer(writer, failure.values != NULL);
         write_block(writer, failure.values, failure.number_of_values * sizeof(double));

@@ -3,10 +3,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "../derivatives.h"
 #include "../records.h"
 #include "../texts.h"
 #include "answers.h"
-#include "derivatives.h"
 
 /* Windows' own header of this function needs another library. */
 typedef struct {
@@ -213,9 +213,11 @@ static void answer_question(Worker *w, const Question *question) {
     const size_t size =
         question->seeded->count * question->others->count * w->settings.count * sizeof(double);
     double *derivatives = memory_for(NULL, size);
+    const Matrix inputs = {(const char *)w->shared.inputs,
+                           (ptrdiff_t)(w->shared.stride * sizeof(double)), sizeof(double)};
 
     pool_enter(&w->pool);
-    const ptrdiff_t failed = worker_differentiate(w, question, derivatives);
+    const ptrdiff_t failed = pool_differentiate(&w->pool, inputs, question, derivatives);
     pool_leave(&w->pool);
     worker_report(w);
     if (failed >= 0) {
@@ -232,7 +234,7 @@ static void answer_differentiate(Worker *w, Reader *reader) {
 
     if (read_access(reader, w->settings.fmi, &seeded) &&
         read_access(reader, w->settings.fmi, &others)) {
-        const Question question = {adjoint, &seeded, &others};
+        const Question question = {adjoint, 0, &seeded, &others};
         answer_question(w, &question);
     } else {
         send_error("a list of variables is damaged");
