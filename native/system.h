@@ -1,8 +1,7 @@
 /* A system: several FMUs that look like one. Its instances have an instance of each FMU.
  *
  * All values of a system are FLOAT64; its parts convert them to the types of their FMUs. A value
- * reference is an index of its variables. fmugym/fmi/system.py does the same operation by
- * operation. */
+ * reference is an index of its variables. */
 
 #ifndef FMUGYM_SYSTEM_H
 #define FMUGYM_SYSTEM_H

@@ -1,8 +1,7 @@
 """The pool in C: it steps thousands of instances in one call, on several threads.
 
-Its results equal those of ``PythonPool`` bit for bit, for any number of threads. Beyond the
-contract of ``Pool``, it offers the vector environment its internal arrays and calls without any
-conversion:
+Its results do not depend on the number of threads. Beyond the contract of ``Pool``, it offers the
+vector environment its internal arrays and calls without any conversion:
 
 * write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
   ``pool.observations``;

@@ -20,7 +20,14 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, text_of, with_texts
 from fmugym.archive.variable import Variable, unlisted
 from fmugym.pool.bundle import Record
-from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
+from fmugym.pool.spec import (
+    DEFAULT_TOLERANCE,
+    SAMPLINGS,
+    START_TIME,
+    PoolSpec,
+    ResetMethod,
+    is_start_time,
+)
 from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
@@ -173,14 +180,15 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         ramps = np.array([v.value_reference for v in spec.ramped], np.uint32).tobytes()
         by_fmu = b"by_fmu", 1.0, math.inf, 0, 0, False, None, None
         return (*by_fmu, *clocks, ramps, spec.time_step)
-    solving, states, rates = spec.solving, None, None
+    states, rates = None, None
+    tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
         rates = np.array(model.derivative_references, np.uint32).tobytes()
     return (
-        solving.solver.encode(),
-        solving.tolerance,
-        solving.max_step,
+        spec.solver.encode(),
+        tolerance,
+        spec.max_step or math.inf,
         model.number_of_states,
         model.number_of_event_indicators,
         model.needs_completed_integrator_step,

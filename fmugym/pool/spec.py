@@ -11,8 +11,6 @@ from typing import Final
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.archive.variable import Variable
-from fmugym.fmi.methods import METHODS
-from fmugym.fmi.solver import Solving
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -41,11 +39,11 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
 
-SOLVERS: Final = tuple(METHODS)
-"""The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
+FIXED_STEP_SOLVERS: Final = ("euler", "rk4")
+"""The methods of integration whose steps do not depend on the tolerance."""
 
-FIXED_STEP_SOLVERS: Final = tuple(name for name, method in METHODS.items() if not method.order)
-"""Those whose steps do not depend on the tolerance."""
+SOLVERS: Final = ("dormand_prince", "euler", "rk4", "rosenbrock")
+"""The methods of integration for model exchange; see ``native/methods.h``."""
 
 DEFAULT_TOLERANCE: Final = 1e-6
 """Relative tolerance of the solver where neither the config nor the FMU gives one: float32
@@ -236,20 +234,6 @@ class PoolSpec:
         # there are no samplings if all are "last"
         pairs = enumerate(zip(self.outputs, self.samplings, strict=False))
         return tuple(i for i, (output, name) in pairs if output.updated and name != "last")
-
-    @property
-    def solving(self) -> Solving:
-        """How the equations of FMUs of model exchange are solved."""
-        tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
-        ramps = tuple(v.value_reference for v in self.ramped)
-        return Solving(
-            self.solver,
-            tolerance,
-            self.max_step or math.inf,
-            ramps,
-            self.time_step,
-            tuple(self.outputs[place] for place in self.watched),
-        )
 
     @property
     def communication_step_size(self) -> float:

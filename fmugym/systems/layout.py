@@ -1,7 +1,6 @@
 """Where the values of a system are: slots of inputs and outputs, and the routes between them.
 
-Both engines read this: ``fmugym.fmi.system`` directly, ``native/system.c`` by way of
-``fmugym.pool.systems``.
+``fmugym.pool.systems`` tells it to ``native/system.c``.
 """
 
 from __future__ import annotations

@@ -260,7 +260,7 @@ class _Life:
     def __init__(self, fmu: FMU, spec: PoolSpec, starts: Starts, index: int) -> None:
         self._variables, self._values = starts.variables, starts.apart().column(index)
         self._inputs = _inputs_of_two(spec, 1.0)[index, :_CALLS]
-        self._pool = local_pool(_lent(fmu), spec, 1, logger, native=True, threads=1)
+        self._pool = local_pool(_lent(fmu), spec, 1, logger, threads=1)
         self.end = self._pool.close
 
     def play(self, barrier: threading.Barrier | None = None) -> bytes:
