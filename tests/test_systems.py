@@ -1,17 +1,16 @@
 """Systems: what the masters compute, and that a system does what an FMU does."""
 
-import contextlib
 import pickle
 from dataclasses import replace
 
 import container_tools
 import exchange_tools
 import fmpy
+import fmpy_master
 import fmu_tools
 import numpy as np
 import pytest
 import system_tools
-from fresh import FreshInstance
 from system_tools import (
     LOG,
     by_each_master,
@@ -128,39 +127,6 @@ def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2
 PENDULUM_OUTPUTS = ["a.theta", "b.theta_dot", "c.q", "c.tau"]
 
 
-def in_a_loop_over_fmpy(plan, count, time_step, start_time=0.0):
-    """What a master does, written once more; the outputs shape is (count + 1, k)."""
-
-    def outputs():
-        return [parts[n].get([v])[0] for n, _, v in (o.partition(".") for o in PENDULUM_OUTPUTS)]
-
-    def told(link):
-        return parts[link.source].get([link.output])[0]
-
-    def drive(link, value):
-        parts[link.target].set({link.input: link.gain * value + link.offset})
-
-    with contextlib.ExitStack() as stack:
-        parts = {
-            one.name: stack.enter_context(
-                FreshInstance(one.path, dict(one.starts), start_time=start_time)
-            )
-            for one in plan.components
-        }
-        for link in plan.links:
-            drive(link, told(link))
-        rows = [outputs()]
-        for number in range(count):
-            before = {link: told(link) for link in plan.links}
-            for one in plan.components:
-                for link in (link for link in plan.links if link.target == one.name):
-                    drive(link, before[link] if plan.master == "jacobi" else told(link))
-                for inner in range(one.steps):
-                    parts[one.name].step(number * one.steps + inner, time_step / one.steps)
-            rows.append(outputs())
-    return np.array(rows)
-
-
 @by_each_master
 @pytest.mark.parametrize("versions", [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])
 @pytest.mark.parametrize("substeps", [1, 3])
@@ -169,8 +135,9 @@ def test_steps_are_those_of_a_loop_over_fmpy(make, master, versions, substeps, w
     plan = pendulums(master, versions)
     options = {"substeps": substeps, "start_time": 0.5, "warm_up_steps": warm_up}
     rows = play(make(plan, (), PENDULUM_OUTPUTS, time_step=0.02, **options), 50)
-    count = substeps * (50 + warm_up)
-    expected = in_a_loop_over_fmpy(plan, count, 0.02 / substeps, 0.5)[::substeps][warm_up:]
+    steps = [{}] * substeps * (50 + warm_up)
+    expected = fmpy_master.play(plan, PENDULUM_OUTPUTS, steps, 0.02 / substeps, 0.5)
+    expected = expected[::substeps][warm_up:]
     assert np.abs(rows).max() > 0.1
     np.testing.assert_allclose(rows, expected, rtol=1e-12, atol=1e-12)
 
