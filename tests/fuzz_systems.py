@@ -212,7 +212,7 @@ def play(rng, system, versions):
     spec = spec_of(rng, fmu, versions)
     starts = tuple(fmu.variable(f"{n}.x1_0") for n in system.components if rng.random() < 0.5)
     with contextlib.closing(Pools(system, spec)) as pools:
-        reset(rng, pools, spec, starts)
+        pools.all("reset", lambda pool, _: pool.reset((), np.zeros((0, pool.num_instances))))
         for _ in range(CALLS):
             rng.choice(ACTIONS)(rng, pools, spec, starts)
 
