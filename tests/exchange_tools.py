@@ -32,7 +32,7 @@ OTHERS = {
     "circuit": ["duty", "limit", "source", "discharges", "period", "tau"],
     "tank": ["u", "discards"],
     "prothero": ["k"],
-    "relay": ["turns", "last", "speed"],
+    "relay": ["turns", "last", "speed", "steps"],
     "sun": ["now", "sine", "seconds", "u"],
     "season": ["u"],
     "updating": ["u", "k", "mischief", "y", "calls", "tentative"],
@@ -41,7 +41,7 @@ OTHERS = {
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
-OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
+OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns", "steps"}
 OUTPUTS |= {"y", "calls", "now", "sine", "seconds"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},

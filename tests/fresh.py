@@ -1,6 +1,7 @@
 """Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library."""
 
 import contextlib
+import ctypes
 import math
 import os
 import shutil
@@ -19,8 +20,6 @@ from fmpy.simulation import (
     settable_in_initialization_mode,
     settable_in_instantiated,
 )
-
-from fmugym.fmi.fmi1 import FMI1Instance
 
 
 class FreshInstance:
@@ -66,8 +65,9 @@ class FreshInstance:
 
     def _instantiate(self):
         fmu = instantiate_fmu(self._folder, self.description, "CoSimulation")
-        if self._version == 1:
-            FMI1Instance.mend(fmu)
+        if self._version == 1:  # FMPy declares strings, and dereferences every status except OK
+            for name in ("fmi1InitializeSlave", "fmi1DoStep"):
+                fmu._functions[name].restype = ctypes.c_int
         if not fmu.component:
             raise RuntimeError("it could not be instantiated")
         return fmu

@@ -121,7 +121,6 @@ def test_all_pools_give_the_same_numbers(make_pool, version):
         random = np.random.default_rng(2)
         rows.append([step(pool, random.uniform(-1, 1, 2)) for _ in range(20)])
     np.testing.assert_array_equal(rows[0], rows[1])
-    np.testing.assert_array_equal(rows[0], rows[2])
 
 
 @both_versions
