@@ -408,8 +408,8 @@ def test_what_is_no_backend(backend, text):
 
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
-    env = RigEnv("python")
-    assert type(env._pool).__name__ == "PythonPool"
+    env = RigEnv("native")
+    assert type(env._pool).__name__ == "NativePool"
     env.close()
 
 
@@ -515,7 +515,7 @@ class Simulated:
 
     def __init__(self, spec):
         self.fmu = FMU(PENDULUM)
-        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "python")
+        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"))
 
     def reset(self, start_values):
         variables = tuple(map(self.fmu.variable, start_values))
