@@ -115,6 +115,7 @@ EVERY_IN_CI = {
     "test_isolated_rollouts": 3,
     "test_isolated_single": 4,
     "test_nested_fmus": 5,
+    "test_pool": 7,
     "test_quirks": 4,
     "test_reference_models": 17,
     "test_start_times": 5,
