@@ -500,6 +500,14 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
+def test_hooks_of_real_plants_are_not_compiled():
+    with pytest.raises(ConfigError, match="the pool is not the native one"):
+        FMUVectorEnv(lambda: RigEnv(Oscillator()), 1, hooks="compiled")
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", backend=Oscillator())
+    with env, pytest.raises(ConfigError, match="the pool is not a native one"):
+        env.reset()
+
+
 class Twin:
     """A function of the number of rigs that makes rigs in one thread, by Python's iterators."""
 
