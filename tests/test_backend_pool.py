@@ -408,8 +408,8 @@ def test_what_is_no_backend(backend, text):
 
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
-    env = RigEnv("python")
-    assert type(env._pool).__name__ == "PythonPool"
+    env = RigEnv("native")
+    assert type(env._pool).__name__ == "NativePool"
     env.close()
 
 
@@ -500,6 +500,14 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
+def test_hooks_of_real_plants_are_not_compiled():
+    with pytest.raises(ConfigError, match="the pool is not the native one"):
+        FMUVectorEnv(lambda: RigEnv(Oscillator()), 1, hooks="compiled")
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", backend=Oscillator())
+    with env, pytest.raises(ConfigError, match="the pool is not a native one"):
+        env.reset()
+
+
 class Twin:
     """A function of the number of rigs that makes rigs in one thread, by Python's iterators."""
 
@@ -515,7 +523,7 @@ class Simulated:
 
     def __init__(self, spec):
         self.fmu = FMU(PENDULUM)
-        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "python")
+        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"))
 
     def reset(self, start_values):
         variables = tuple(map(self.fmu.variable, start_values))

@@ -12,7 +12,6 @@ from plants import PLANTS
 from wine_tools import for_windows
 
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym import pool as pools
 from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi.status import Status
@@ -28,22 +27,19 @@ with_state = pytest.mark.parametrize("version", [2, 3])
 
 
 OPTIONS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 2},
     "wine": {"backend": "auto", "workers": 2},
 }
 """Of ``make_pool``, by implementation."""
 
-OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("python", "native", "process")}
+OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("native", "process")}
 """With the FMU as a component of a system."""
 
 
 @pytest.fixture(params=OPTIONS)
 def make_pool(request, tmp_path):
     """Make pools of one implementation that are closed after the test."""
-    if "native" in request.param and not pools.has_native_pool():
-        pytest.skip("the C extension was not built")
     in_wine = request.param == "wine"
     if in_wine:
         request.getfixturevalue("wine")

@@ -105,9 +105,7 @@ class TestChoice:
         (text,) = FMU(path).obstacles
         assert "32-bit Windows" in text
 
-    @pytest.mark.parametrize(
-        "wish", [{"backend": "python"}, {"isolation": "none"}, {"private_libraries": True}]
-    )
+    @pytest.mark.parametrize("wish", [{"isolation": "none"}, {"private_libraries": True}])
     def test_what_is_impossible_in_wine_is_refused(self, cart_pole, wish):
         with pytest.raises(FMULoadError, match=next(iter(wish))):
             open_pool(cart_pole, **wish)
