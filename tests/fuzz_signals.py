@@ -32,6 +32,7 @@ from fuzz_driver import Case, CaseError, main, require
 
 import fmugym
 from fmugym.envs import CartPoleEnv
+from fmugym.trial.opening import PYTHON_POOL
 
 NUM_ENVS = 3
 LOGGING = {"model_parameters": {"log_status": 1}}
@@ -125,15 +126,15 @@ class Talkative(fmu_tools.PlainEnv):
 
 WAYS = {
     "logs": Talkative,
-    "logs in Python": functools.partial(Talkative, backend="python"),
+    "logs in Python": functools.partial(Talkative, backend=PYTHON_POOL),
     "single": single,
-    "single in Python": functools.partial(single, backend="python"),
+    "single in Python": functools.partial(single, backend=PYTHON_POOL),
     "single isolated": functools.partial(single, isolation="process"),
     "compiled": functools.partial(vector, hooks="compiled", threads=2),
     "array": functools.partial(vector, hooks="array"),
     "per_env": functools.partial(vector, hooks="per_env"),
     "same step": functools.partial(vector, autoreset_mode="same_step"),
-    "vector in Python": functools.partial(vector, backend="python"),
+    "vector in Python": functools.partial(vector, backend=PYTHON_POOL),
     "isolated": functools.partial(vector, isolation="process", workers=2),
 }
 

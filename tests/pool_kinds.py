@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from fmugym.trial.opening import PYTHON_POOL
+
 POOLS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 1},
 }

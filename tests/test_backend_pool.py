@@ -399,7 +399,7 @@ def test_a_rig_is_recorded(tmp_path):
         (object(), "a backend needs the methods reset, step and stop"),
         ([Oscillator(), Oscillator()], "1 backends are needed, got 2"),
         (lambda count: [], "1 backends are needed, got 0"),
-        ("fpu", "unknown backend 'fpu'; did you mean 'fmu'"),
+        ("fpu", "unknown backend 'fpu'; did you mean 'fm(py|u)'"),
     ],
 )
 def test_what_is_no_backend(backend, text):
@@ -408,8 +408,8 @@ def test_what_is_no_backend(backend, text):
 
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
-    env = RigEnv("python")
-    assert type(env._pool).__name__ == "PythonPool"
+    env = RigEnv("fmpy")
+    assert not env._pool.is_real
     env.close()
 
 
@@ -515,7 +515,7 @@ class Simulated:
 
     def __init__(self, spec):
         self.fmu = FMU(PENDULUM)
-        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "python")
+        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "fmpy")
 
     def reset(self, start_values):
         variables = tuple(map(self.fmu.variable, start_values))

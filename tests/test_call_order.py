@@ -27,7 +27,7 @@ from hypothesis.stateful import (
 
 from fmugym import FMU, FMUGymError
 from fmugym.pool import PoolSpec, has_native_pool
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import PYTHON_POOL, make_pool
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")
@@ -52,7 +52,7 @@ GAINS = st.sampled_from([1.0, 2.0])
 ACTIONS = st.sampled_from([0.5, 0.5, -1.0, -1.0, np.nan])
 MASKS = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
 BACKENDS = [
-    "python",
+    PYTHON_POOL,
     pytest.param(
         "native",
         marks=pytest.mark.skipif(not has_native_pool(), reason="the C extension was not built"),

@@ -170,7 +170,7 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
         assert play(env) == expected
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native", "fmpy"])
 def test_a_replaced_instance_plays_it_again(copying, backend):
     """Copies are no reason to keep an instance that leaks."""
     with copying(backend=backend, leak_limit=1000) as env:

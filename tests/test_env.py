@@ -13,6 +13,7 @@ import fmugym
 from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
 from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.testing import check_fmu_env
+from fmugym.trial.opening import PYTHON_POOL
 
 ENV_IDS = [
     "fmugym/CartPole-v0",
@@ -463,7 +464,7 @@ class TestTolerance:
     def path(self, tmp_path, request):
         return probe_fmu(tmp_path, request.param, {"<TypeDefinitions>": self.EXPERIMENT})
 
-    @pytest.fixture(params=["native", "python", "process"])
+    @pytest.fixture(params=["native", PYTHON_POOL, "process"])
     def seen(self, make_env, path, request):
         """Make what the FMU sees with a config."""
         way = {"isolation": "process"} if request.param == "process" else {}

@@ -168,14 +168,14 @@ except fmugym.FMULoadError as error:
 
     STEPPED = "[0.10000000149011612, 1.0]"
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
+    @pytest.mark.parametrize("backend", ["native", "fmpy"])
     def test_are_named(self, fmu_path, temp_root, backend):
         said = self.run(fmu_path, backend)
         assert "Probe.fmu needs shared libraries that are not found here: libgave.so" in said
         assert "name their files in preload=[...]" in said
         assert list(temp_root.iterdir()) == []
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
+    @pytest.mark.parametrize("backend", ["native", "fmpy"])
     def test_are_preloaded(self, fmu_path, needy, backend):
         preload = [str(needy / "libgave.so")]
         assert self.run(fmu_path, backend, preload=preload) == self.STEPPED
@@ -186,7 +186,7 @@ except fmugym.FMULoadError as error:
         add = {beside: (needy / "libgave.so").read_bytes(), library_name(2): self.content(needy)}
         assert self.run(edited_fmu(fmu_path, tmp_path / "other", add=add)) == self.STEPPED
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
+    @pytest.mark.parametrize("backend", ["native", "fmpy"])
     def test_beside_the_library_where_the_loader_does_not_look(
         self, fmu_path, needy, tmp_path, backend
     ):

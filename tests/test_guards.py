@@ -23,7 +23,7 @@ from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.arithmetic import restore_arithmetic
 from fmugym.pool.memory import grown_bytes, heap_is_known
 from fmugym.pool.spec import DEFAULT_LEAK_LIMIT
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import PYTHON_POOL, make_pool
 from fmugym.vector import FMUVectorEnv
 
 LOG = logging.getLogger("fmugym.test")
@@ -31,7 +31,7 @@ MB = 2**20
 every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
 WAYS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "process": {"isolation": "process", "workers": 2},
 }
@@ -154,7 +154,7 @@ class RoundedUp(PlainEnv):
             "time_step": 0.5,
             "bounds": {"u": (-1, 1)},
         }
-        super().__init__(path, config, logging.CRITICAL, backend="python")
+        super().__init__(path, config, logging.CRITICAL, backend=PYTHON_POOL)
 
 
 class TestArithmetic:
@@ -180,7 +180,9 @@ class TestArithmetic:
         def rollout(fault):
             fmu = FMU(zoo_tools.zoo_fmu(tmp_path, 2))
             spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
-            pool = opened(make_pool(fmu, spec, 2, LOG, backend="python", private_libraries=False))
+            pool = opened(
+                make_pool(fmu, spec, 2, LOG, backend=PYTHON_POOL, private_libraries=False)
+            )
             values = np.zeros((4, 2))
             values[:, 0] = list(zoo_tools.parameters(fault).values())
             pool.reset(tuple(map(fmu.variable, zoo_tools.PARAMETERS)), values)
@@ -346,7 +348,7 @@ class TestHealth:
             _ = env.health
 
 
-@pytest.fixture(name="backend", params=["python", "native"])
+@pytest.fixture(name="backend", params=[PYTHON_POOL, "native"])
 def fixture_backend(request):
     """The options of ``make_pool`` for each pool of this process."""
     if request.param == "native" and not has_native_pool():

@@ -184,7 +184,7 @@ class TestControlCharacters:
             raise SimulationError(f"step of {EVIL}\n failed")
         assert "\n" not in str(caught.value)
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
+    @pytest.mark.parametrize("backend", ["native", "fmpy"])
     @pytest.mark.parametrize("version", [1, 2, 3])
     def test_messages_in_log_error_and_info(self, probe, caplog, backend, version):
         label = "\x1b[31m\x07red\x9b\nforged line"

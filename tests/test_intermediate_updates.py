@@ -23,10 +23,11 @@ from fmugym import pool as pools
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.trial import opening
+from fmugym.trial.opening import PYTHON_POOL
 
 LOG = logging.getLogger("fmugym.test")
 OPTIONS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 1},
 }

@@ -147,8 +147,8 @@ def test_snapshots_rollouts_and_parameters(make, cls):
 
 def test_python_workers_leave_hooks_on_arrays(make):
     with pytest.raises(ConfigError, match="the pool is not the native one"):
-        make(CART_POLE, backend="python")
-    assert not isinstance(make(CART_POLE, backend="python", hooks="auto")._engine, CompiledEngine)
+        make(CART_POLE, backend="fmpy")
+    assert not isinstance(make(CART_POLE, backend="fmpy", hooks="auto")._engine, CompiledEngine)
 
 
 def test_a_process_that_is_killed(make):

@@ -26,6 +26,7 @@ from fmugym import ConfigError, SimulationError
 from fmugym.pool import has_native_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.series import RecordSeries
+from fmugym.trial.opening import PYTHON_POOL
 from fmugym.vector.making import make_with_pool
 
 pytestmark = pytest.mark.skipif(
@@ -135,7 +136,7 @@ def test_hooks_that_cannot_be_compiled():
 
 
 def test_workers_of_python_run_no_compiled_hooks():
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process", backend="python")
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process", backend=PYTHON_POOL)
     with pytest.raises(ConfigError, match="pool"):
         env.reset(seed=0)
     env.close()

@@ -20,10 +20,11 @@ from fmugym.trial import rehearsal
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import default_spec
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
-WAYS = ["native", "python"]
+WAYS = ["native", PYTHON_POOL]
 TOKENS = ["licensed", "licensed at initialization"]
 
 
@@ -107,7 +108,7 @@ EXPECTED = expected_outputs(1.5, [0.5] * 3)[-1]
 
 class TestSeats:
     @pytest.mark.parametrize("token", TOKENS)
-    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"backend": "python"}])
+    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"backend": PYTHON_POOL}])
     def test_one_is_enough_for_one_environment(self, folder, seats, token, config):
         env = DemandingEnv(make_fmu(folder, token), max_instances=1, **config)
         assert [play(env), play(env)] == [EXPECTED, EXPECTED]
@@ -215,7 +216,7 @@ class TestRefusal:
 class TestWaiting:
     @pytest.mark.parametrize("token", TOKENS)
     @pytest.mark.parametrize(
-        "config", [{}, {"backend": "python"}, {"isolation": "process"}, {"probe_timeout": None}]
+        "config", [{}, {"backend": PYTHON_POOL}, {"isolation": "process"}, {"probe_timeout": None}]
     )
     def test_ends_when_another_program_returns_its_seat(
         self, folder, seats, other_program, token, config, caplog
@@ -250,7 +251,7 @@ class TestWaiting:
 
 
 class TestPace:
-    @pytest.mark.parametrize("config", [{"backend": "native"}, {"backend": "python"}])
+    @pytest.mark.parametrize("config", [{"backend": "native"}, {"backend": PYTHON_POOL}])
     def test_of_one_environment(self, folder, seats, config):
         env = DemandingEnv(
             make_fmu(folder, "licensed"), max_initializations_per_second=20, **config

@@ -639,7 +639,7 @@ class TestIsolation:
         envs.close()
         single.close()
         with pytest.raises(FMULoadError, match="which only the native pool or isolation='process'"):
-            fmugym.FMUVectorEnv(Counting, 3, backend="python", isolation="none")
+            fmugym.FMUVectorEnv(Counting, 3, backend="fmpy", isolation="none")
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

@@ -11,6 +11,7 @@ from fmpy.container_fmu.config import Component, Configuration, Connection
 from fmpy.model_description import CoSimulation, ModelDescription, ModelVariable
 
 import fmugym
+from fmugym.trial.opening import PYTHON_POOL
 
 STEP = 0.1
 CONFIG = {
@@ -21,7 +22,7 @@ CONFIG = {
     "time_step": STEP,
 }
 WAYS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "isolated": {"isolation": "process"},
 }

@@ -105,7 +105,7 @@ def test_vector_environments(number, hooks):
 
 @types
 def test_native_and_python(number):
-    env = make_with_pool(lambda: Cart(number), backend="python")
+    env = make_with_pool(lambda: Cart(number), backend="fmpy")
     assert alone(env) == alone(Cart(number))
 
 

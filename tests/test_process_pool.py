@@ -44,6 +44,7 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.worker import BlockWorker
 from fmugym.trial import opening
+from fmugym.trial.opening import PYTHON_POOL
 
 LOG = logging.getLogger("fmugym.test")
 HERE = Path(__file__).parent
@@ -538,7 +539,7 @@ class WorkerThread:
 
 
 @posix_only
-@pytest.mark.parametrize("backend", ["auto", "python"])
+@pytest.mark.parametrize("backend", ["auto", PYTHON_POOL])
 def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
     here = make_pool(3, isolation="none")
     monkeypatch.setattr("fmugym.pool.process.transport.launch", WorkerThread)

@@ -29,6 +29,7 @@ from fmugym.trial import plan as trial_plan
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.inputs import moving_inputs, neighbour_inputs, start_inputs
 from fmugym.trial.known import known_verdict
+from fmugym.trial.opening import PYTHON_POOL
 from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -185,7 +186,7 @@ def test_verdict(make_fmu, version, quirk, caplog):
     assert bool(warnings) == bool(quirk.log)
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native", PYTHON_POOL])
 def test_outputs_before_the_first_step_are_start_values(make_fmu, backend):
     """In each episode, restored ones included; the model description may give other ones than 0."""
     fmu = fmugym.FMU(make_fmu("no reading before a step"))
@@ -205,7 +206,7 @@ def test_outputs_before_the_first_step_are_start_values(make_fmu, backend):
 START_OUTPUTS = {"y": "0.75", "calls": None}
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native", PYTHON_POOL])
 def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
     env = QuirkEnv(make_fmu("no reading before a step"), way=backend, probe_timeout=None)
     with pytest.raises(fmugym.SimulationError, match="reading the outputs returned Error"):
@@ -213,7 +214,7 @@ def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
     env.close()
 
 
-@pytest.mark.parametrize("way", ["native", "python", "process"])
+@pytest.mark.parametrize("way", ["native", PYTHON_POOL, "process"])
 def test_reading_what_can_only_be_written(make_fmu, way):
     """The message names it; the FMU then needs a reset, as the standard says."""
     options = {"isolation": "process"} if way == "process" else {"way": way}
@@ -338,7 +339,7 @@ class TestConfig:
             QuirkEnv(make_fmu("well behaved"), reset_method="restoer")
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
+@pytest.mark.parametrize("backend", [PYTHON_POOL, "native"])
 class TestPromiseAboutStates:
     """FMI 2.0 tells an FMU in each step whether a state of an earlier time may be restored."""
 

@@ -12,13 +12,14 @@ import fmugym
 from fmugym.pool import tape
 from fmugym.pool.tape import Rehearsals
 from fmugym.trial.known import known_verdict
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
 STEP = 0.5
 WAYS = {
     "native": {"backend": "native"},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "isolated": {"backend": "native", "isolation": "process"},
 }
 all_ways = pytest.mark.parametrize("way", WAYS)

@@ -19,7 +19,7 @@ NUM_ENVS = 3
 STEPS = 60
 """Long enough for random actions to let poles fall, and for tanks to run to their limit."""
 
-PYTHON = {"backend": "python"}
+PYTHON = {"backend": "fmpy"}
 SINGLE = {
     "native": {},
     "process": {"isolation": "process"},

@@ -9,13 +9,14 @@ from test_snapshots import Track, vector_of
 import fmugym
 from fmugym import ConfigError, SimulationError
 from fmugym.envs import CartPoleEnv, PendulumEnv
+from fmugym.trial.opening import PYTHON_POOL
 
 N, HORIZON = 5, 9
 WAYS = {
     "compiled": {"hooks": "compiled"},
     "array": {"hooks": "array"},
     "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "process": {"isolation": "process"},
 }
 

@@ -9,12 +9,12 @@ import fmugym
 from fmugym import FMU, ConfigError, FMUVectorEnv, bundled_fmu
 from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.spec import SAMPLINGS
-from fmugym.trial.opening import make_pool
+from fmugym.trial.opening import PYTHON_POOL, make_pool
 
 SUBSTEPS, STEP = 5, 0.1
 OUTPUTS = ("x", "x_dot", "theta", "theta_dot", "f")
 POOLS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "process": {"isolation": "process", "workers": 1},
 }

@@ -19,6 +19,7 @@ from fmugym.pool import has_native_pool, pacing
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec
+from fmugym.trial.opening import PYTHON_POOL
 
 PROGRAM = """
 import os
@@ -30,7 +31,7 @@ print("open", flush=True)
 sys.stdin.readline()
 {end}
 """
-BACKENDS = ["native", "python"] if has_native_pool() else ["python"]
+BACKENDS = ["native", PYTHON_POOL] if has_native_pool() else [PYTHON_POOL]
 
 
 class SeatedEnv(fmugym.FMI2CSEnv):

@@ -12,6 +12,7 @@ from demanding_tools import DemandingEnv, expected_outputs, make_fmu
 import fmugym
 from fmugym.pool import progress
 from fmugym.trial import attempt, known, trial
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -99,7 +100,7 @@ class TestProgress:
         caplog.set_level(logging.INFO, "fmugym")
 
     @pytest.mark.parametrize(
-        "config", [{}, {"backend": "python"}, {"isolation": "process", "call_timeout": 60.0}]
+        "config", [{}, {"backend": PYTHON_POOL}, {"isolation": "process", "call_timeout": 60.0}]
     )
     def test_of_an_initialization_is_logged(self, folder, caplog, config):
         path = make_fmu(folder, "slow")

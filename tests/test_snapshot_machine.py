@@ -10,6 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_sta
 from test_snapshots import Track
 
 import fmugym
+from fmugym.trial.opening import PYTHON_POOL
 
 N = 3
 ACTIONS = np.linspace(-0.01, 0.01, 5, dtype=np.float32)
@@ -132,7 +133,7 @@ WAYS = {
     "compiled": {"hooks": "compiled", "threads": 2},
     "array": {"hooks": "array", "threads": 1},
     "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "processes": {"isolation": "process", "workers": 2},
 }
 

@@ -19,10 +19,11 @@ import fmugym
 from fmugym import ConfigError, SimulationError, Snapshot
 from fmugym.envs import CartPoleEnv, PendulumEnv
 from fmugym.pool.bundle import SaveMethod
+from fmugym.trial.opening import PYTHON_POOL
 
 POOLS = {
     "native": {},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "process": {"isolation": "process"},
 }
 VERSIONS = ("1.0", "2.0", "3.0")
@@ -140,7 +141,7 @@ class TestSingle:
     def test_goes_on_in_another_environment_that_was_never_reset(self, halfway, version):
         env = halfway(fmi_version=version)
         copied = pickle.loads(pickle.dumps(env.save_state()))
-        other = Track(fmi_version=version, backend="python")
+        other = Track(fmi_version=version, backend=PYTHON_POOL)
         other.restore_state(copied)
         assert other.time == env.time
         assert dict(other.parameters) == dict(env.parameters)
@@ -574,7 +575,7 @@ class TestZoo:
 
 def test_records_have_a_limit_and_say_so(halfway, monkeypatch):
     """What is kept of an episode without saved states cannot be saved if it is not whole."""
-    env = halfway(fmi_version="1.0", backend="python")
+    env = halfway(fmi_version="1.0", backend=PYTHON_POOL)
     env._pool._slots[0]._played = None
     with pytest.raises(SimulationError, match="too long"):
         env.save_state()

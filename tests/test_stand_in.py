@@ -92,7 +92,7 @@ def compiler(request, monkeypatch):
 
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
     (name,) = stand_in.replaceable(FMU(fmu_path))
-    for backend in ("native", "python"):
+    for backend in ("native", "fmpy"):
         assert f"not found here: {name} (no current" in play(fmu_path, backend)
     (command,) = re.findall(r"^fmugym (stand-in model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE)
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
@@ -103,7 +103,7 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
     assert f'"preload": {json.dumps(preload)}' in said
     assert f"preload = {json.dumps(preload)}" in said
     assert FMU(fmu_path, preload=preload).runs_here
-    for backend in ("native", "python"):
+    for backend in ("native", "fmpy"):
         assert play(fmu_path, backend, preload=preload) == STEPPED
     assert play(fmu_path, "native", preload=preload, isolation="process") == STEPPED
     for symbol in {*SYMBOLS} - {"_gfortran_matmul_r8"}:

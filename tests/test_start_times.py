@@ -20,10 +20,11 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.spec import START_TIME
 from fmugym.series import RecordSeries
 from fmugym.trial import opening
+from fmugym.trial.opening import PYTHON_POOL
 
 LOG = logging.getLogger("fmugym.test")
 KINDS = {
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 2},
     "wine": {},

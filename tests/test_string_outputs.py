@@ -29,6 +29,7 @@ from fmugym.pool import PoolSpec, has_native_pool
 from fmugym.pool.local import local_pool
 from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
 from fmugym.task.quantity import Quantity
+from fmugym.trial.opening import PYTHON_POOL
 
 WORDS = test_strings.WORDS
 pools, versions = test_strings.pools, test_strings.versions
@@ -278,7 +279,7 @@ def test_a_backend_that_mixes_texts_and_numbers_fails(feedthrough, given, facts)
 
 def test_long_and_foreign_texts(feedthrough):
     texts = ["x" * 199, "日本語", "\n\t"]
-    for backend in ("native", "python"):
+    for backend in ("native", PYTHON_POOL):
         env = Echo(feedthrough[3], words=Choice(texts), backend=backend)
         for _ in range(5):
             _, info = env.reset()

@@ -45,6 +45,7 @@ from fmugym.systems.plan import Component as Planned
 from fmugym.systems.plan import Connector, End, Link, Loop
 from fmugym.tools import cli
 from fmugym.trial import opening
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = where_they_run
 
@@ -287,7 +288,7 @@ class TestWhereAnFMUStands:
 
     def test_python_refuses_it_by_name(self):
         with pytest.raises(FMULoadError, match="component 'a'"):
-            Chain(chain(bundled_fmu("Pendulum"), isolate=True), backend="python")
+            Chain(chain(bundled_fmu("Pendulum"), isolate=True), backend=PYTHON_POOL)
 
     @pytest.mark.parametrize("value", [2, "yes", None])
     def test_the_argument_is_a_flag(self, value):

@@ -29,6 +29,7 @@ from fmugym import (
 )
 from fmugym.fmi.status import Status
 from fmugym.tools import cli
+from fmugym.trial.opening import PYTHON_POOL
 
 PLANT = {
     "A": np.array([[0.0, 1.0], [-4.0, -0.4]]),
@@ -267,7 +268,7 @@ def own_arrays(path, **options):
 
 
 class TestOwnArrays:
-    @pytest.mark.parametrize("backend", ["python", "native"])
+    @pytest.mark.parametrize("backend", [PYTHON_POOL, "native"])
     def test_an_environment_has_them_by_name(self, path, backend):
         env = Plant(own_arrays(path), backend=backend)
         assert env.observation_names == ("seen[1]", "seen[2]", "seen[3]", "plant.x[2]")

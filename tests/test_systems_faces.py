@@ -14,6 +14,7 @@ from fmugym.identification import Trajectory, fit_parameters
 from fmugym.systems.placing import layout_of
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
+from fmugym.trial.opening import PYTHON_POOL
 
 HOUSE = bundled_fmu("House")
 
@@ -488,7 +489,7 @@ class TestPictures:
         FMUSystem({"$x$": HOUSE}, name="$\\alpha").plot(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native", PYTHON_POOL])
 def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units(backend):
     """273.15 K are 0 degC, by definition; and half a pendulum is a gain of 2."""
     system = fmugym.FMUSystem(

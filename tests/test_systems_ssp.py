@@ -32,6 +32,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.systems.order import order_of
 from fmugym.systems.plan import Link, Loop
+from fmugym.trial.opening import PYTHON_POOL
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
 
@@ -803,7 +804,7 @@ class TestLarge:
         fmu = FMUSystem.read(pack(self.chain(20))).as_fmu(probe_timeout=None)
         assert len({id(part) for part in fmu.description.parts}) == 1
 
-    @pytest.mark.parametrize("backend", ["python", None])
+    @pytest.mark.parametrize("backend", [PYTHON_POOL, None])
     def test_three_hundred_components_play(self, pack, backend):
         names = {"model_input_names": "T", "model_output_names": "c299.T_air"}
         config = names | {"bounds": {"T": (0, 30)}, "time_step": 60.0}

@@ -12,6 +12,7 @@ from system_tools import (
 
 from fmugym import Component, ConfigError, Connection, FMUEnv, FMUSystem, FMUVectorEnv
 from fmugym.tools import cli
+from fmugym.trial.opening import PYTHON_POOL
 
 VERSIONS = (1, 2, 3)
 
@@ -64,7 +65,7 @@ def test_each_component_has_its_own(make, fmus, native):
     assert play(make(system, (), LENGTHS, native), 1).tolist() == [[4, 0, 11]] * 2
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
+@pytest.mark.parametrize("backend", [PYTHON_POOL, "native"])
 def test_those_of_an_environment_win(fmus, backend):
     parameters = {"a.String_parameter": "longer", "b.String_parameter": "b"}
     env = Env(three(fmus, a="four", c="c"), backend, **parameters)
@@ -74,7 +75,7 @@ def test_those_of_an_environment_win(fmus, backend):
     env.close()
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
+@pytest.mark.parametrize("backend", [PYTHON_POOL, "native"])
 def test_one_parameter_of_the_system_is_that_of_several(fmus, backend):
     env = Env(labelled(fmus, b="b", c="short"), backend, label="the same")
     env.reset()

@@ -59,7 +59,7 @@ def make(probe, tmp_path):
 
 def runs(path, expected=0.3, **config):
     """Play an episode with both pools, from the same config."""
-    for backend in ("native", "python"):
+    for backend in ("native", "fmpy"):
         env = make_with_pool(lambda: PlainEnv(path, probe_config(**config)), backend=backend)
         env.reset(seed=0)
         for _ in range(3):

@@ -97,7 +97,7 @@ def test_plain_arithmetic_is_compiled():
     for cls in (fmugym.envs.CartPoleEnv, fmugym.envs.ModelicaCartPoleEnv, PushedCart):
         FMUVectorEnv(cls, 2, hooks="compiled").close()
     with pytest.raises(ConfigError, match="the pool is not the native one"):
-        FMUVectorEnv(fmugym.envs.CartPoleEnv, 2, hooks="compiled", backend="python")
+        FMUVectorEnv(fmugym.envs.CartPoleEnv, 2, hooks="compiled", backend="fmpy")
 
 
 class Arithmetic(Drawing):

@@ -167,7 +167,7 @@ def test_what_was_made_is_closed_if_a_later_one_cannot_be_made(temp_root):
 
 
 def test_a_pool_of_other_options():
-    env = make_with_pool(Drawing, backend="python")
+    env = make_with_pool(Drawing, backend="fmpy")
     native = Drawing()
     require_equal(env.reset(seed=3)[0], native.reset(seed=3)[0])
     env.close()

@@ -168,7 +168,7 @@ class Waiting(Drawing):
 @pytest.fixture
 def waiting():
     Waiting.gate.set()
-    envs = FMUVectorEnv(Waiting, 2, hooks="array", backend="python")
+    envs = FMUVectorEnv(Waiting, 2, hooks="array", backend="fmpy")
     envs.reset(seed=0)
     Waiting.gate.clear()
     yield envs

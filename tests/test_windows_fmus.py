@@ -106,7 +106,7 @@ class TestChoice:
         assert "32-bit Windows" in text
 
     @pytest.mark.parametrize(
-        "wish", [{"backend": "python"}, {"isolation": "none"}, {"private_libraries": True}]
+        "wish", [{"backend": "fmpy"}, {"isolation": "none"}, {"private_libraries": True}]
     )
     def test_what_is_impossible_in_wine_is_refused(self, cart_pole, wish):
         with pytest.raises(FMULoadError, match=next(iter(wish))):

@@ -11,14 +11,15 @@ from words_tools import WordsEnv, words_fmu
 import fmugym
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.words import as_messages, quoted, telling, unpacked
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
 WAYS = {
     "native": {"backend": "native"},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "isolated": {"backend": "native", "isolation": "process"},
-    "isolated python": {"backend": "python", "isolation": "process"},
+    "isolated python": {"backend": PYTHON_POOL, "isolation": "process"},
 }
 LEVELS = (logging.INFO, logging.WARNING, logging.CRITICAL)
 all_ways = pytest.mark.parametrize("way", WAYS)

@@ -8,6 +8,7 @@ import pytest
 from gymnasium import spaces
 
 import fmugym
+from fmugym.trial.opening import PYTHON_POOL
 
 SIZES = {"m": 1, "n": 2, "r": 3}
 MATRICES = {
@@ -199,9 +200,9 @@ STEP = 0.1
 
 POOLS = {
     "native": {},
-    "python": {"backend": "python"},
+    "python": {"backend": PYTHON_POOL},
     "isolated": {"isolation": "process"},
-    "isolated python": {"isolation": "process", "backend": "python"},
+    "isolated python": {"isolation": "process", "backend": PYTHON_POOL},
 }
 
 pools = pytest.mark.parametrize("options", POOLS.values(), ids=POOLS)

@@ -11,11 +11,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import fmugym
 from fmugym import Uniform
 from fmugym.pool import has_native_pool
-from fmugym.pool.python import PythonPool
+from fmugym.pool.backend.pool import BackendPool
 from fmugym.vector import FMUVectorEnv
 
-BACKENDS = ("python", "native") if has_native_pool() else ("python",)
-POOLS = {"python": PythonPool}
+BACKENDS = ("fmpy", "native") if has_native_pool() else ("fmpy",)
+POOLS = {"fmpy": BackendPool}
 if has_native_pool():
     from fmugym.pool.native import NativePool
 

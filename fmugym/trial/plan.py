@@ -35,7 +35,7 @@ class Plan:
     state_files: str = ""
     own_files: bool = False
 
-    def checked(self, fmu: FMU, backend: str) -> Plan:
+    def checked(self, fmu: FMU) -> Plan:
         """Refuse unknown names; in Wine, refuse what is not possible there."""
         if self.isolation not in (None, *ISOLATIONS):
             raise unknown_name("isolation", self.isolation, ISOLATIONS)
@@ -44,7 +44,7 @@ class Plan:
         if not fmu.in_wine:
             _prepare_components(fmu)
             return self
-        _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
+        _prepare_wine(fmu, self.private_libraries, self.isolation)
         return replace(self, native=True, threads=1, private_libraries=None, isolation="process")
 
     @property
@@ -143,16 +143,13 @@ class Plan:
         return replace(self, reset_method=method)
 
 
-def _prepare_wine(
-    fmu: FMU, backend: str, private_libraries: bool | None, isolation: str | None
-) -> None:
+def _prepare_wine(fmu: FMU, private_libraries: bool | None, isolation: str | None) -> None:
     """Refuse what is not possible in Wine, and make ready what every worker needs.
 
     Raises:
         FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
     """
     wishes = {
-        "backend='python'": backend == "python",
         "private_libraries": private_libraries,
         "isolation='none'": isolation == "none",
         "preload": fmu.preload,

@@ -18,6 +18,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.starting import start_variable
+from fmugym.trial.opening import PYTHON_POOL
 from fmugym.vector.env import FMUVectorEnv
 from fmugym.vector.perturbations import Matrices, differentiate_by_starts
 from fmugym.vector.sensitivities import (
@@ -228,7 +229,7 @@ def _by_directional_derivatives(
     """Play the trajectory with an instance in Python or Wine, in this process or in a worker."""
     env = envs._maker.make()
     try:
-        opening = env._opening if env.fmu.in_wine else replace(env._opening, backend="python")
+        opening = env._opening if env.fmu.in_wine else replace(env._opening, backend=PYTHON_POOL)
         env._use(opening.open(1, rehearse=False))
         env.restore_state(start)
         follower = _Follower(env, states)
