@@ -20,6 +20,7 @@ from measure import MissingError, Run, Sample, Stopwatch, repeated
 
 import fmugym
 from fmugym.pool import has_native_pool
+from fmugym.trial.opening import PYTHON_POOL
 
 __all__ = [
     "FMUGYM",
@@ -126,7 +127,7 @@ def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, An
     Raises:
         MissingError: If there is no native pool.
     """
-    if options.get("backend") != "python":
+    if options.get("backend") != PYTHON_POOL:
         require_native_pool()
     return gym.make_vec(FMUGYM, num_envs, **options)
 

@@ -26,6 +26,7 @@ from tables import Table, rate, share, times
 from user_tasks import Tracking
 
 import fmugym
+from fmugym.trial.opening import PYTHON_POOL
 
 __all__ = ["tables"]
 
@@ -81,7 +82,7 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
         yield f"fmugym, {mode}, {text}", lambda o=options: _fmugym(stack, size, **o)
     arrays = {"hooks": "array", "threads": most}
     yield f'fmugym, hooks="array", {text}', lambda: _fmugym(stack, size, **arrays)
-    yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend="python")
+    yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend=PYTHON_POOL)
     yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
     yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
     yield "Gymnasium AsyncVectorEnv", lambda: _gymnasium(stack, size, "async", context="spawn")

@@ -146,7 +146,7 @@ class TestEpisodes:
             assert "t = 0.1 s returned Error; the FMU said: step 1 of" in info["fault"]
         assert env.health["errors"] == 2
         env.close()
-        assert caplog.text.count("step 1 of probe is 100%") == 2
+        assert caplog.text.count("[probe] step 1 of probe is 100%") == 2
 
 
 class TestRefusals:
@@ -154,7 +154,7 @@ class TestRefusals:
         ("changes", "name"),
         [
             ({"fault_retries": 1}, "fault_retries"),
-            ({"samplings": {"q": "mean"}}, "samplings"),
+            ({"samplings": {"theta": "mean"}}, "samplings"),
             ({"reset_method": "reset"}, "reset_method"),
             ({"isolation": "process"}, "isolation"),
             ({"keep_initial_states": True}, "keep_initial_states"),
