@@ -563,9 +563,9 @@ class TestPool:
             np.testing.assert_allclose(pools[0].observations, pools[0].outputs.T, atol=1e-6)
 
     def test_there_are_no_states(self, pools):
-        with pytest.raises(SimulationError, match="no state that could be saved"):
+        with pytest.raises(SimulationError, match="no states that could be saved"):
             pools[0].save()
-        with pytest.raises(SimulationError, match="no state that could be restored"):
+        with pytest.raises(SimulationError, match="no states that could be restored"):
             pools[0].restore(None)
 
     def test_closed(self, pools):

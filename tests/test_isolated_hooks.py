@@ -21,6 +21,7 @@ import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError
 from fmugym.pool import has_native_pool
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.trial.opening import PYTHON_POOL
 from fmugym.vector.engines.compiled import CompiledEngine
 
 if has_native_pool():
@@ -147,8 +148,9 @@ def test_snapshots_rollouts_and_parameters(make, cls):
 
 def test_python_workers_leave_hooks_on_arrays(make):
     with pytest.raises(ConfigError, match="the pool is not the native one"):
-        make(CART_POLE, backend="fmpy")
-    assert not isinstance(make(CART_POLE, backend="fmpy", hooks="auto")._engine, CompiledEngine)
+        make(CART_POLE, backend=PYTHON_POOL)
+    envs = make(CART_POLE, backend=PYTHON_POOL, hooks="auto")
+    assert not isinstance(envs._engine, CompiledEngine)
 
 
 def test_a_process_that_is_killed(make):

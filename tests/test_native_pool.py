@@ -23,6 +23,7 @@ from fmugym.pool import PoolSpec, PythonPool
 from fmugym.trial import opening
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.opening import PYTHON_POOL
 
 pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
 if pools.has_native_pool():
@@ -639,7 +640,7 @@ class TestIsolation:
         envs.close()
         single.close()
         with pytest.raises(FMULoadError, match="which only the native pool or isolation='process'"):
-            fmugym.FMUVectorEnv(Counting, 3, backend="fmpy", isolation="none")
+            fmugym.FMUVectorEnv(Counting, 3, backend=PYTHON_POOL, isolation="none")
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

@@ -19,18 +19,16 @@ NUM_ENVS = 3
 STEPS = 60
 """Long enough for random actions to let poles fall, and for tanks to run to their limit."""
 
-PYTHON = {"backend": "fmpy"}
 SINGLE = {
     "native": {},
     "process": {"isolation": "process"},
-    "process, python": {"isolation": "process"} | PYTHON,
+    "fmpy": {"backend": "fmpy"},
 }
 VECTOR = {
-    "python": PYTHON,
+    "fmpy": {"backend": "fmpy"},
     **{f"{threads} threads": {"threads": threads} for threads in (1, 2, 3)},
     "per env": {"hooks": "per_env"},
     **{f"{n} workers": {"isolation": "process", "workers": n} for n in (1, 2, 3)},
-    "2 workers, python": {"isolation": "process", "workers": 2} | PYTHON,
 }
 """Options of single and of vector environments, each a way to run the same FMU."""
 
@@ -62,7 +60,7 @@ def task(request, tank_fmu):
         make = functools.partial(cls, fmi_version=version)
     else:
         make = functools.partial(cls, tank_fmu, max_episode_steps=25)
-    return make, [alone(make, index, **PYTHON)[0] for index in range(NUM_ENVS)]
+    return make, [alone(make, index, backend="fmpy")[0] for index in range(NUM_ENVS)]
 
 
 def actions_in(space, index):

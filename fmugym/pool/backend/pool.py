@@ -240,7 +240,7 @@ class BackendPool(CountedPool):
 
     def _stateless(self, done: str) -> SimulationError:
         if self._is_real:
-            return SimulationError(f"a backend has no state that could be {done}")
+            return SimulationError(f"a backend has no states that could be {done}")
         return SimulationError(f"states are {done} by the C extension only (backend='native')")
 
     def failure(self, index: int) -> str:
