@@ -348,7 +348,7 @@ class TestHealth:
             _ = env.health
 
 
-@pytest.fixture(name="backend", params=[PYTHON_POOL, "native"])
+@pytest.fixture(name="backend", params=["python", "native"])
 def fixture_backend(request):
     """The options of ``make_pool`` for each pool of this process."""
     if request.param == "native" and not has_native_pool():

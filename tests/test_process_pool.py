@@ -171,7 +171,7 @@ class TestSingle:
     @pytest.mark.parametrize(
         ("backend", "said"),
         [
-            ("python", "Faulty_1: [last words] this is fault 1"),
+            (PYTHON_POOL, "Faulty_1: [last words] this is fault 1"),
             ("native", "[last words] this is fault 1"),
         ],
     )
