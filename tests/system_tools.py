@@ -16,7 +16,7 @@ from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
 LOG = logging.getLogger("fmugym.test")
-in_each_engine = pytest.mark.parametrize("native", [False, True])
+in_each_engine = pytest.mark.parametrize("native", [True])
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 
 STATES = {

@@ -219,6 +219,17 @@ class TestOutputError:
         with pytest.raises(fmugym.FMULoadError, match="libgave"):
             fit_parameters(preloading, {"b": 1e-3}, noisy(0, 1.0))
 
+    def test_both_pools_give_the_same(self, fit):
+        again = fit_parameters(
+            PENDULUM,
+            {"l": (0.05, 0.2), "b": 1e-3, "c": (1e-3, 0.0, 0.01)},
+            noisy(1, 2.0, -1.0, 2.8),
+            initial_states=START,
+            scales={"q": 0.01, "q_dot": 0.1},
+            backend="fmpy",
+        )
+        assert again.values == pytest.approx(fit.values, rel=1e-9)
+
     def test_parameters_that_the_data_do_not_tell(self):
         """A free swing without friction tells the length but not the mass."""
         time, q, _ = swing(2.0)

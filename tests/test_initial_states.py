@@ -19,7 +19,7 @@ from fmugym.trial.verdict import Grade
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
-WAYS = [{}, {"backend": "python"}, {"isolation": "process"}]
+WAYS = [{}, {"isolation": "process"}]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ class TestSingle:
 
     def test_native_and_python_share_them(self, folder, initializations):
         path = make_fmu(folder, "slow")
-        for backend in ("native", "python", "native"):
+        for backend in ("native", "native"):
             env = DemandingEnv(path, keep_initial_states=True, backend=backend)
             assert play_and_close(env) == EXPECTED
         assert len(state_files()) == 1
@@ -136,9 +136,7 @@ def make_vector(path, autoreset_mode="Disabled", max_episode_steps=None, **optio
 
 
 class TestVector:
-    @pytest.mark.parametrize(
-        "options", [{}, {"backend": "python"}, {"isolation": "process", "workers": 1}]
-    )
+    @pytest.mark.parametrize("options", [{}, {"isolation": "process", "workers": 1}])
     def test_is_initialized_once_for_each_start(self, folder, options, initializations):
         path = make_fmu(folder, "slow")
         make_vector(path, **options).close()  # so that there is a verdict

@@ -26,7 +26,6 @@ from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
 OPTIONS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 1},
 }

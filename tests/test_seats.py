@@ -15,7 +15,7 @@ import pytest
 
 import fmugym
 from fmugym.errors import ConfigError, LicenceError
-from fmugym.pool import has_native_pool, pacing
+from fmugym.pool import pacing
 from fmugym.pool.pacing import Pacer
 from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec
@@ -30,7 +30,7 @@ print("open", flush=True)
 sys.stdin.readline()
 {end}
 """
-BACKENDS = ["native", "python"] if has_native_pool() else ["python"]
+BACKENDS = ["native"]
 
 
 class SeatedEnv(fmugym.FMI2CSEnv):

@@ -53,7 +53,7 @@ def run(plan, names, step, count, native=True, instances=1, stop=False):
     """The values before the first step and after each, shape (count + 1, names)."""
     fmu = SystemFMU(plan)
     outputs = tuple(map(fmu.variable, names))
-    pool = local_pool(fmu, PoolSpec((), outputs, step), instances, LOG, native=native)
+    pool = local_pool(fmu, PoolSpec((), outputs, step), instances, LOG)
     try:
         rows = [pool.reset((), np.zeros((0, instances)))[0][:, 0].copy()]
         for _ in range(count):
@@ -223,7 +223,7 @@ class TestStates:
         spec = PoolSpec((), tuple(map(fmu.variable, ("first.y1", *STATISTICS))), 0.3)
         for method in ("restore", "reset", "instance"):
             own = replace(spec, reset_method=fmugym.pool.spec.ResetMethod(method))
-            pool = local_pool(SystemFMU(plan), own, 2, LOG, native=native)
+            pool = local_pool(SystemFMU(plan), own, 2, LOG)
             try:
                 rows = []
                 for _ in range(4):
@@ -238,7 +238,7 @@ class TestStates:
         plan = controlled(masses([fmus[2], fmus[2]]), 1e-5)
         fmu = SystemFMU(plan)
         spec = PoolSpec((), tuple(map(fmu.variable, ("first.y1", *STATISTICS))), 0.3)
-        pools = [local_pool(SystemFMU(plan), spec, 2, LOG, native=native) for _ in range(2)]
+        pools = [local_pool(SystemFMU(plan), spec, 2, LOG) for _ in range(2)]
         one, other = pools
         try:
             for pool in pools:

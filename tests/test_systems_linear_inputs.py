@@ -53,7 +53,7 @@ def test_a_component_does_what_the_fmu_does_alone(fmus, native, version, substep
     fmu = FMU(fmus[version], probe_timeout=None)
     u = fmu.variable("u")
     spec = PoolSpec((u,), (fmu.variable("x"),), 0.1, substeps=substeps, ramped=(u,))
-    alone = local_pool(fmu, spec, 2, LOG, native=native)
+    alone = local_pool(fmu, spec, 2, LOG)
     system = FMUSystem({"d": fmus[version]})
     pool = ramped_pool(system, "d.u", ["d.x"], native, substeps)
     try:
@@ -68,7 +68,7 @@ def ramped_pool(system, name, outputs, native, substeps=1):
     fmu = system.as_fmu()
     u = fmu.variable(name)
     spec = PoolSpec((u,), tuple(map(fmu.variable, outputs)), 0.1, substeps=substeps, ramped=(u,))
-    return local_pool(fmu, spec, 2, LOG, native=native)
+    return local_pool(fmu, spec, 2, LOG)
 
 
 def two(fmus, versions=(1, 2)):

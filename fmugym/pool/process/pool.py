@@ -1,8 +1,8 @@
 """The pool of processes: an FMU may harm its own process, but not the caller's.
 
-Each worker process has a block of the instances in a ``NativePool`` of its own and shares its inputs
-and outputs through memory. A worker that dies or hangs is replaced. Its instances have the status
-``FATAL``, with the cause, until the next reset makes them anew. The instances of other workers go on.
+Each worker process has a block of the instances in a ``NativePool`` of its own, and shares its
+inputs and outputs through memory. A worker that dies or hangs is replaced. Its instances have the
+status ``FATAL``, with the cause, until the next reset makes them anew. Those of other workers go on.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
-from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
@@ -254,7 +253,7 @@ class ProcessPool(SavingPool):
     @property
     def can_play(self) -> bool:
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
-        return has_native_pool() and self._setup.native and not self._spec.licence_wait
+        return not self._spec.licence_wait
 
     def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., Played]:
         """See ``Pool.prepare_play``."""
