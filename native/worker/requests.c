@@ -40,19 +40,6 @@ enum {
 
 /* Steps */
 
-void worker_publish(Worker *w) {
-    const Shared *shared = &w->shared;
-    const size_t count = w->settings.count;
-
-    for (size_t i = 0; i < w->outputs.count; i++) {
-        memcpy(shared->outputs + i * shared->stride, w->output_values + i * count,
-               count * sizeof(double));
-    }
-    memcpy(shared->observations, w->observations,
-           count * w->settings.num_observed * sizeof(float));
-    memcpy(shared->statuses, w->statuses, count);
-}
-
 static Matrix shared_inputs(const Worker *w) {
     return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
                     sizeof(double)};
@@ -213,11 +200,9 @@ static void answer_question(Worker *w, const Question *question) {
     const size_t size =
         question->seeded->count * question->others->count * w->settings.count * sizeof(double);
     double *derivatives = memory_for(NULL, size);
-    const Matrix inputs = {(const char *)w->shared.inputs,
-                           (ptrdiff_t)(w->shared.stride * sizeof(double)), sizeof(double)};
 
     pool_enter(&w->pool);
-    const ptrdiff_t failed = pool_differentiate(&w->pool, inputs, question, derivatives);
+    const ptrdiff_t failed = pool_differentiate(&w->pool, shared_inputs(w), question, derivatives);
     pool_leave(&w->pool);
     worker_report(w);
     if (failed >= 0) {

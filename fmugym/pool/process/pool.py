@@ -2,7 +2,7 @@
 
 Each worker process has a block of the instances in a ``NativePool`` of its own, and shares its
 inputs and outputs through memory. A worker that dies or hangs is replaced. Its instances have the
-status ``FATAL``, with the cause, until the next reset makes them anew. Those of other workers go on.
+status ``FATAL`` and the cause, until the next reset makes them anew. Those of other workers go on.
 """
 
 from __future__ import annotations
