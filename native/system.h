@@ -268,8 +268,6 @@ Status part_choose_messages(Composite *me, size_t index);
 bool part_reload(Composite *me, size_t index);
 
 /* The start that parts return to. */
-bool start_allocate(Composite *me);
-void start_free(Composite *me);
 /* Notes what is set before the initialization that comes. */
 bool start_note(Composite *me, double start_time);
 /* Whether this initialization can return to the last one. */

@@ -169,7 +169,7 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
 
 
 def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
-    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    """What ``take_solving`` of ``native/python/solving.c`` takes; None in co-simulation."""
     if isinstance(description, SystemDescription):  # its components have their own
         return None
     model = description.model_exchange

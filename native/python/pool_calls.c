@@ -6,13 +6,6 @@
 #include "derivatives.h"
 #include "python.h"
 
-bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
-    if (given != expected) {
-        PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", expected, given);
-    }
-    return given == expected;
-}
-
 /* A call and its result. */
 typedef struct {
     int operation;
