@@ -34,6 +34,7 @@ from fmugym.pool.spec import (
     SOLVERS,
     ResetMethod,
 )
+from fmugym.retired import without_retired
 from fmugym.signals import ordinary
 
 __all__ = ["EnvConfig"]
@@ -51,7 +52,6 @@ _POSITIVE: Final = (
     "call_timeout",
     "tolerance",
     "max_step",
-    "max_initializations_per_second",
 )
 _NAMES: Final = ("model_input_names", "model_output_names", "monitor_names", "preload")
 
@@ -113,10 +113,8 @@ class EnvConfig:
             ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take in a worker process. A
             reset or an instantiation may take ten times as long. None for no limit.
-        max_instances: How many instances of the FMU may exist at once on this machine, for FMUs
-            with licences: each instance may take a seat. None for no limit.
-        max_initializations_per_second: How many instantiations and initializations may begin in a
-            second of real time on this machine, counted together; None for no limit.
+        max_instances: How many instances of the FMU this process and its workers may have at once,
+            for FMUs with licences: each instance may take a seat. None for no limit.
         keep_initial_states: Whether to keep the state after initialization and warm-up, for other
             instances and on disk, where this gives the same results to the last bit. For models
             that take long to initialize.
@@ -167,7 +165,6 @@ class EnvConfig:
     isolation: str | None = None
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
     max_instances: int | None = None
-    max_initializations_per_second: float | None = None
     keep_initial_states: bool = False
     licence_wait: float = 0.0
     samplings: Mapping[str, str] = field(default_factory=dict)
@@ -193,7 +190,7 @@ class EnvConfig:
             return config
         if not isinstance(config, Mapping):
             raise ConfigError(f"config must be a dict, got {type(config).__name__}")
-        items = check_mapping("config", config)
+        items = without_retired(check_mapping("config", config))
         known = [f.name for f in fields(cls)]
         for key in items:
             if key in _ELSEWHERE:

@@ -74,7 +74,6 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     if (status > STATUS_WARNING) {
         return status;
     }
-    pace_wait(&pool->settings.pace);
     instance_begin_turn(pool);
     atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);

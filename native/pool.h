@@ -14,7 +14,6 @@
 #include "log.h"
 #include "mark.h"
 #include "methods.h"
-#include "pace.h"
 #include "platform.h"
 #include "play.h"
 #include "tape.h"
@@ -47,7 +46,6 @@ typedef struct {
     bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
-    Pace pace;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;

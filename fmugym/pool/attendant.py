@@ -18,7 +18,6 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce, hears_calls, progress
-from fmugym.pool.seats import Claim
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["Attendant", "AttendedPool"]
@@ -134,15 +133,15 @@ class AttendedPool(CountedPool):
         """See ``Pool.is_attended``."""
         return self._attendant is not None
 
-    _claim: Claim | None = None
+    _release: Callable[[], None] | None = None
 
-    def hold(self, claim: Claim | None) -> None:
-        """Keep the seats of the instances until ``close``."""
-        self._claim = claim
+    def hold(self, release: Callable[[], None]) -> None:
+        """Keep the seats of the instances until ``close``, which releases them."""
+        self._release = release
 
     def _return_seats(self) -> None:
-        if self._claim is not None:
-            self._claim.release()
+        if self._release is not None:
+            self._release()
 
     def attend(self, attendant: Attending | None) -> None:
         """Let somebody go with all calls of ``reset`` from now on."""

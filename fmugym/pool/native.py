@@ -43,7 +43,6 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
-from fmugym.pool.pacing import last_initialization
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
@@ -188,7 +187,6 @@ class NativePool(SavingPool):
                     "statuses": self.statuses,
                     "observations": self.observations,
                     "health": self._counts,
-                    "last_initialization": last_initialization(spec),
                 },
                 count=self.num_instances,
                 threads=self.threads,

@@ -24,7 +24,6 @@ from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import END, RESET, STEP, Mark, calling
-from fmugym.pool.pacing import Pacer
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.slot import Slot, Snapshot
 from fmugym.pool.spec import ResetMethod
@@ -75,11 +74,10 @@ class PythonPool(SavingPool):
             self._library = open_library(
                 fmu, log, spec.solving, spec.inputs, spec.outputs, spec.component_resets
             )
-        pacer = Pacer(spec)
         try:
             with fmu_calls, self._resetting:
                 self._slots = [
-                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i], pacer)
+                    Slot(self._library, spec, input_rows[i], output_rows[i], self._counts[i])
                     for i in range(num_instances)
                 ]
         except BaseException:

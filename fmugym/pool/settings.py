@@ -147,7 +147,6 @@ def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
         "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
         "reloads": method == ResetMethod.LIBRARY,
         "one_initialization": spec.one_initialization,
-        "pace": spec.initialization_interval,
         "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
     }
 

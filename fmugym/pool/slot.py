@@ -18,7 +18,6 @@ from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, PoolSpec, names_of
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
-from fmugym.pool.pacing import Pacer
 from fmugym.pool.retries import step_with_retries
 from fmugym.pool.samples import Samples
 from fmugym.pool.spec import REUSING, ResetMethod, is_start_time
@@ -69,7 +68,6 @@ class Slot:
         input_row: The inputs of the instance, shape (k_in,).
         output_row: Its outputs, shape (k,).
         counts: Its counts, shape (HEALTH_COUNTS,).
-        pacer: Waits before an instance is made or initialized.
 
     Attributes:
         failure: Why the last status was worse than a warning.
@@ -85,13 +83,12 @@ class Slot:
         input_row: FloatArray,
         output_row: FloatArray,
         counts: HealthArray,
-        pacer: Pacer,
     ) -> None:
         self.failure = ""
         self.is_due = self.keeps_record = False
         self._played: tuple[Record, list[bytes]] | None = None
         self._unexplained = False
-        self._counts, self._pacer = counts, pacer
+        self._counts = counts
         self._count = self._counted = 0
         self._library = library
         self._spec = spec
@@ -105,7 +102,6 @@ class Slot:
         self._build()
 
     def _build(self, *, hear_all: bool = False) -> None:
-        self._pacer.wait()
         self._instance = self._library.instantiate(hear_all=hear_all)
         self._inputs = Access(self._instance, self._spec.inputs, self._input_row)
         self._outputs = Access(self._instance, self._spec.outputs, self._output_row)
@@ -254,7 +250,6 @@ class Slot:
             self._start_variables = variables
         self._start.values[:] = values[self._own_starts]
         spec = self._spec
-        self._pacer.wait()
         self._instance.initialize(
             self.start_time, spec.stop_time, spec.tolerance, self._set_start_values
         )

@@ -135,11 +135,8 @@ class PoolSpec:
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
         one_initialization: Whether only one instance in a process may be made, initialized, reset
             or freed at a time. Steps run in parallel all the same.
-        initialization_interval: The least real time in seconds from one instantiation or
-            initialization to the next; see ``fmugym.pool.pacing``.
-        max_instances: How many instances may exist at once on this machine; None for no limit.
-        locks: The beginning of the paths of the files by which all environments of the FMU keep
-            to these two limits; "" for none.
+        max_instances: How many instances of the FMU this process may have at once; None for no
+            limit.
         keep_states: Whether initial states are kept for other instances and processes, if the trial
             shows that they work there.
         state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
@@ -171,9 +168,7 @@ class PoolSpec:
     component_resets: tuple[ResetMethod, ...] = ()
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
-    initialization_interval: float = 0.0
     max_instances: int | None = None
-    locks: str = ""
     licence_wait: float = 0.0
     keep_states: bool = False
     state_files: str = ""

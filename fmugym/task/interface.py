@@ -167,7 +167,6 @@ class Interface:
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
-            initialization_interval=_interval(config.max_initializations_per_second),
             max_instances=config.max_instances,
             licence_wait=config.licence_wait,
             keep_states=bool(config.keep_initial_states),
@@ -364,7 +363,3 @@ def _check_inputs_are_whole(inputs: Sequence[Variable], started: Sequence[Variab
                 f"{variable.name!r} cannot be given a start value while other elements of "
                 f"{array.name!r} are inputs; let all of {array.name!r} be inputs"
             )
-
-
-def _interval(frequency: float | None) -> float:
-    return 0.0 if frequency is None else 1.0 / frequency

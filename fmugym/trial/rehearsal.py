@@ -155,7 +155,7 @@ class Rehearsal:
         self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
         self.noisy: tuple[str, ...] = ()
         self.reason = ""
-        self.is_frugal = spec.initialization_interval > 0.0 or spec.licence_wait > 0.0
+        self.is_frugal = spec.licence_wait > 0.0
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
         self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance_of(spec)), False

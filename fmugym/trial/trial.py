@@ -18,12 +18,12 @@ from typing import Any, Final
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError
 from fmugym.pool.patience import speaks_of_licence
-from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.attempt import Outcome, Request, Stage, run
 from fmugym.trial.cache import recall, remember
 from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.known import known_verdict, with_harm
+from fmugym.trial.seats import taking
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 __all__ = ["examine", "meet"]
@@ -89,7 +89,7 @@ def examine(
     request = Request(candidate, spec, starts, several, alone)
     if known is not None and known.complete and _answers(known, spec, several=False):
         request = replace(request, known=known, check_memory=not known.isolate)
-    with taking(Seats.of(candidate.path.name, spec), 2 if several else 1, "a trial"):
+    with taking(candidate, spec, 2 if several else 1, "a trial"):
         found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())

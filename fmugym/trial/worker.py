@@ -185,9 +185,6 @@ def _try_alone(request: Request, notes: Notes) -> bool:
 def _step_once(request: Request, native: bool, notes: Notes) -> None:
     fmu = request.candidate.open()
     spec = default_spec(fmu)
-    if request.spec is not None:
-        interval, locks = request.spec.initialization_interval, request.spec.locks
-        spec = replace(spec, initialization_interval=interval, locks=locks)
     notes.stage("loading and instantiation")
     pool = trial_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native)
     try:

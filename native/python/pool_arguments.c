@@ -17,7 +17,6 @@ typedef struct {
     long long substeps, warm_up_steps, retries;
     const char *sampling;
     Py_ssize_t samplings;
-    double pace;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -48,13 +47,12 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
                             "rebuilds",   "reloads",       "one_initialization",
-                            "pace",       "start_outputs", NULL};
+                            "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLppppdz#:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLppppz#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &a->pace, &s->start_outputs,
-                       &a->start_outputs_size);
+                       &a->one_initialization, &s->start_outputs, &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -67,11 +65,10 @@ static bool parse_variables(PyObject *group, Arguments *a) {
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
     static char *names[] = {"inputs",       "outputs", "statuses",
-                            "observations", "health",  "last_initialization", NULL};
+                            "observations", "health",  NULL};
     PyObject **arrays = self->arrays;
-    return parse_group(group, "$OOOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
-                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
-                       &arrays[LAST_INITIALIZATION]);
+    return parse_group(group, "$OOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
+                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH]);
 }
 
 static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
@@ -248,9 +245,7 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
            take_matrix(arrays[OBSERVATIONS], &buffers[OBSERVATIONS], WRITTEN, "observations",
                        ITEM_FLOAT32, n, a->num_observed) &&
            take_matrix(arrays[HEALTH], &buffers[HEALTH], WRITTEN, "health", ITEM_INT64, n,
-                       HEALTH_COUNTS) &&
-           take_vector(arrays[LAST_INITIALIZATION], &buffers[LAST_INITIALIZATION], WRITTEN,
-                       "last_initialization", ITEM_INT64, 1);
+                       HEALTH_COUNTS);
 }
 
 static bool settle(PyPool *self, const Arguments *a) {
@@ -287,8 +282,6 @@ static bool settle(PyPool *self, const Arguments *a) {
         self->system->private_libraries = s->private_libraries;
         self->system->largest_state = STATES_LIMIT / s->count;
     }
-    s->pace.interval = (uint64_t)(a->pace * 1e9);
-    s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
            take_watched(a, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&

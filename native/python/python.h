@@ -14,7 +14,7 @@
 #include "pool.h"
 #include "system.h"
 
-enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, LAST_INITIALIZATION, BUFFERS };
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 
 typedef struct {
     PyObject_HEAD Access access;

@@ -53,15 +53,6 @@ static void *place(const Shared *shared, Reader *reader, size_t element, size_t 
     return shared->base + offset + element * first;
 }
 
-/* When the last instance was made or initialized; all processes that limit it map one file. */
-static bool share_pace(Worker *w, const char *path) {
-    static Atomic own;
-    Pace *pace = &w->settings.pace;
-
-    pace->last = *path == '\0' ? &own : (Atomic *)map_file(path, sizeof own);
-    return pace->last != NULL;
-}
-
 static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
     Shared *shared = &w->shared;
     const char *path = read_text(reader);
@@ -85,7 +76,7 @@ static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
         log_echo_to(echo, echo_size);
         frames_watch((const Atomic *)(echo + echo_size));
     }
-    return reader->sound && share_pace(w, read_text(reader));
+    return reader->sound;
 }
 
 /* Settings, in the order of fmugym/pool/process/windows.py */
@@ -190,7 +181,6 @@ static void read_experiment(Reader *reader, Settings *s) {
     s->rebuilds = read_flag(reader);
     s->reloads = read_flag(reader);
     s->one_initialization = read_flag(reader);
-    s->pace.interval = (uint64_t)(read_number(reader) * 1e9);
 }
 
 /* The outputs of which the FMU may tell more than their values at the ends of steps. */
