@@ -381,17 +381,6 @@ class Pool:
     def knows_start(self, index: int, start: Access, values: bytes, /) -> bool:
         """Whether a reset with these start values (float64) restores a state."""
 
-    def pack(self, index: int, /) -> bytes | None:
-        """Serialize the state of an instance that has just been reset."""
-
-    def adopt(
-        self, index: int, start: Access, values: bytes, outputs: bytes, state: bytes, /
-    ) -> bool:
-        """Let an instance restore a serialized state at its next reset with these start values.
-
-        ``outputs`` are those just after the initialization: with others, it is initialized.
-        """
-
     def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
         """Tell what failed last.
 

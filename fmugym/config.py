@@ -115,9 +115,6 @@ class EnvConfig:
             reset or an instantiation may take ten times as long. None for no limit.
         max_instances: How many instances of the FMU this process and its workers may have at once,
             for FMUs with licences: each instance may take a seat. None for no limit.
-        keep_initial_states: Whether to keep the state after initialization and warm-up, for other
-            instances and on disk, where this gives the same results to the last bit. For models
-            that take long to initialize.
         licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
             give up at once.
         samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
@@ -165,7 +162,6 @@ class EnvConfig:
     isolation: str | None = None
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
     max_instances: int | None = None
-    keep_initial_states: bool = False
     licence_wait: float = 0.0
     samplings: Mapping[str, str] = field(default_factory=dict)
     input_interpolation: str | Mapping[str, str] = "hold"
@@ -219,10 +215,6 @@ class EnvConfig:
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))
-        if not isinstance(self.keep_initial_states, bool | np.bool_):
-            raise ConfigError(
-                f"keep_initial_states must be True or False, got {shown(self.keep_initial_states)}"
-            )
         if self.archive_limits is not None:
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()

@@ -41,14 +41,11 @@ class Seats:
         self.limit = lambda count: monkeypatch.setenv("SEATS_LIMIT", str(count))
         self.limit(1)
 
-    def _numbers(self, suffix):
-        path = self._path.with_name(f"{self._path.name}.{suffix}")
-        return [float(line) for line in path.read_text().split()] if path.exists() else []
-
     @property
     def most(self):
         """The most seats that were taken at once."""
-        return max(self._numbers("most"), default=0)
+        path = self._path.with_name(f"{self._path.name}.most")
+        return max(map(int, path.read_text().split())) if path.exists() else 0
 
     @property
     def taken(self):

@@ -81,7 +81,6 @@ SLOW_MODULES = {
 
 EVERY = {
     "test_hostile_archive": 19,
-    "test_initial_states": 13,
     "test_licences": 23,
     "test_neighbours": 7,
     "test_pool": 23,
@@ -183,15 +182,6 @@ SLOW_TESTS = (
     "test_identification.py::TestOutputError",
     "test_identification.py::test_example",
     "test_identification.py::test_odd",
-    "test_initial_states.py::TestFiles::test_of_an_environment",
-    "test_initial_states.py::TestSingle::test_by_default",
-    "test_initial_states.py::TestSingle::test_drawn",
-    "test_initial_states.py::TestSingle::test_is_initialized_once_for_all",
-    "test_initial_states.py::TestSingle::test_native",
-    "test_initial_states.py::TestSingle::test_other",
-    "test_initial_states.py::TestTrial::test_finds",
-    "test_initial_states.py::TestTrial::test_says",
-    "test_initial_states.py::TestVector",
     "test_lab_recording.py::test_temporary_videos",
     "test_lab_sessions.py::TestNothingLeaks",
     "test_licences.py::TestInitializations::test_of_a_vector_environment",

@@ -26,7 +26,6 @@ from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -290,23 +289,6 @@ class NativePool(SavingPool):
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
         return self._open_pool().knows_start(index, self._access(variables), values.tobytes())
-
-    def pack(self, index: int) -> InitialState | None:
-        """See ``AttendedPool.pack``."""
-        data = self._open_pool().pack(index)
-        return None if data is None else InitialState(self.outputs[:, index].tobytes(), data)
-
-    def adopt(
-        self,
-        index: int,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        state: InitialState,
-    ) -> bool:
-        """See ``AttendedPool.adopt``."""
-        return self._open_pool().adopt(
-            index, self._access(variables), values.tobytes(), state.outputs, state.data
-        )
 
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""

@@ -18,7 +18,6 @@ from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import Status
 from fmugym.fmi.system_library import open_library
 from fmugym.pool.arithmetic import restore_arithmetic
-from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
 from fmugym.pool.health import HealthArray, no_counts, note
@@ -236,28 +235,6 @@ class PythonPool(SavingPool):
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
         return self._slots[index].knows_start(variables, values)
-
-    def pack(self, index: int) -> InitialState | None:
-        """See ``AttendedPool.pack``."""
-        try:
-            with fmu_calls:
-                return self._slots[index].pack()
-        finally:
-            restore_arithmetic()
-
-    def adopt(
-        self,
-        index: int,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        state: InitialState,
-    ) -> bool:
-        """See ``AttendedPool.adopt``."""
-        try:
-            with fmu_calls:
-                return self._slots[index].adopt(variables, values, state)
-        finally:
-            restore_arithmetic()
 
     def _count_steps(self) -> None:
         for slot in self._slots:

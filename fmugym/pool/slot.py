@@ -14,7 +14,6 @@ from fmugym.fmi.access import Access
 from fmugym.fmi.instance import SavedState
 from fmugym.fmi.library import Library
 from fmugym.fmi.status import Phase, Status
-from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray, PoolSpec, names_of
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import Column, HealthArray
@@ -195,30 +194,6 @@ class Slot:
         """See ``AttendedPool.knows_start``."""
         alive = self._saved is not None and self._instance.phase is not Phase.DEAD
         return alive and self._start_key == (variables, values.tobytes())
-
-    def pack(self) -> InitialState | None:
-        """See ``AttendedPool.pack``."""
-        if not self._restores:
-            return None
-        try:
-            data = self._instance.serialize(self._instance.save_state())
-        except SimulationError:
-            return None
-        return InitialState(self._output_row.tobytes(), data)
-
-    def adopt(
-        self, variables: tuple[Variable, ...], values: FloatArray, state: InitialState
-    ) -> bool:
-        """See ``AttendedPool.adopt``."""
-        if not self._restores or self._instance.phase is Phase.DEAD:
-            return False
-        try:
-            self._saved = self._instance.deserialize(state.data)
-        except SimulationError:
-            return False
-        self._start_key = (variables, values.tobytes())
-        self._first_outputs = state.outputs
-        return True
 
     def _kept_state(self, key: tuple[tuple[Variable, ...], bytes], stepped: bool) -> bool:
         """Keep the state if a later reset can use it; returns whether the instance can step."""

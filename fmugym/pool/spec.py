@@ -137,9 +137,6 @@ class PoolSpec:
             or freed at a time. Steps run in parallel all the same.
         max_instances: How many instances of the FMU this process may have at once; None for no
             limit.
-        keep_states: Whether initial states are kept for other instances and processes, if the trial
-            shows that they work there.
-        state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
@@ -170,8 +167,6 @@ class PoolSpec:
     one_initialization: bool = False
     max_instances: int | None = None
     licence_wait: float = 0.0
-    keep_states: bool = False
-    state_files: str = ""
     blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False

@@ -169,7 +169,6 @@ class Interface:
             input_limits=tuple(map(self._limits, self.inputs)),
             max_instances=config.max_instances,
             licence_wait=config.licence_wait,
-            keep_states=bool(config.keep_initial_states),
             samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),

@@ -83,7 +83,6 @@ def verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
         spec,
         max_instances=None,
         licence_wait=0.0,
-        keep_states=False,
     )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
     return f"{content_key(candidate)}-{asked}"

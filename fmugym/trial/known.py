@@ -33,7 +33,7 @@ def known_verdict(fmu: FMU) -> Verdict | None:
 
 
 def state_files(fmu: FMU) -> str:
-    """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
+    """Where states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
         return str(cache_folder("states") / content_key(Candidate.of(fmu)))
     except ordinary(OSError):  # there is no folder for caches

@@ -122,8 +122,6 @@ def make_pool(
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
-        if spec.keep_states:
-            completed = completed.with_states(fmu, verdict, log)
 
         def note_crash(how: str) -> None:
             _note_crash(fmu, spec, starts, verdict, how, log)
@@ -156,7 +154,6 @@ def _open(
         reset_method=plan.method,
         component_resets=plan.component_resets,
         one_initialization=plan.one_initialization,
-        state_files=plan.state_files,
     )
     claim = take(Candidate.of(fmu), spec, num_instances, "an environment")
     try:

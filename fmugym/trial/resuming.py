@@ -151,7 +151,6 @@ def _open(request: Request) -> SavingPool:
         leak_limit=None,
         fault_retries=0,
         reset_method=ResetMethod.RESTORE,
-        state_files="",
     )
     return trial_pool(request.candidate.open(), spec, 1, logger)
 
