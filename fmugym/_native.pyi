@@ -200,8 +200,6 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     sampling: bytes
-    watched: Access | None
-    watched_places: bytes
 
 class Arrays(TypedDict):
     """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""

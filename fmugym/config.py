@@ -39,7 +39,6 @@ from fmugym.signals import ordinary
 
 __all__ = ["EnvConfig"]
 
-INTERPOLATIONS: Final = ("hold", "linear")
 ON_FAULT: Final = ("truncate", "terminate", "raise")
 MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
@@ -119,11 +118,7 @@ class EnvConfig:
             give up at once.
         samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
             default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
-            values after each substep, and of those within that the FMU tells in intermediate
-            updates (FMI 3.0). After a reset an integral is 0.
-        input_interpolation: How inputs change within a step: ``"hold"`` (the default) at once, or
-            ``"linear"`` from the value of the last step; one for all inputs, or by name. The FMU
-            must be able to interpolate inputs, in co-simulation.
+            values after each substep. After a reset an integral is 0.
         interface: How the FMU is run: ``"co_simulation"`` or ``"model_exchange"``; by default
             co-simulation where the FMU offers it, or as the class says.
         solver: The method of integration for model exchange: ``"dormand_prince"``, ``"euler"``,
@@ -164,7 +159,6 @@ class EnvConfig:
     max_instances: int | None = None
     licence_wait: float = 0.0
     samplings: Mapping[str, str] = field(default_factory=dict)
-    input_interpolation: str | Mapping[str, str] = "hold"
     interface: str | None = None
     solver: str = SOLVERS[0]
     max_step: float | None = None
@@ -248,27 +242,6 @@ class EnvConfig:
         samplings = check_mapping("samplings", self.samplings).items()
         checked = {name: check_option("sampling", value, SAMPLINGS) for name, value in samplings}
         self._set("samplings", checked)
-        self._set("input_interpolation", self._interpolations())
-
-    def _interpolations(self) -> dict[str, str]:
-        """One for each input that is named, or for all."""
-        given = self.input_interpolation
-        if isinstance(given, str):
-            given = dict.fromkeys(self.model_input_names, given)
-        for name in check_mapping("input_interpolation", given):
-            if name not in self.model_input_names:
-                raise unknown_name("input in 'input_interpolation'", name, self.model_input_names)
-        return {
-            name: check_option("input interpolation", value, INTERPOLATIONS)
-            for name, value in given.items()
-        }
-
-    @property
-    def ramped_inputs(self) -> tuple[str, ...]:
-        """The inputs that change linearly within each step."""
-        given = self.input_interpolation
-        assert not isinstance(given, str)  # it was taken apart
-        return tuple(name for name in self.model_input_names if given.get(name) == "linear")
 
     def _take_floats(self) -> None:
         for key in _REWARDS:

@@ -11,6 +11,7 @@ __all__ = ["RETIRED", "without_retired"]
 _Value = TypeVar("_Value")
 
 RETIRED: Final = {
+    "input_interpolation": "inputs hold their values within a step; take a shorter 'time_step'",
     "keep_initial_states": "leave it out; each instance keeps its own state after initialization",
     "max_initializations_per_second": "leave it out; 'max_instances' and 'licence_wait' stay",
 }

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
 from typing import ClassVar
 
 from fmpy.fmi3 import FMU3Slave
 
-from fmugym.fmi.access import Access
-from fmugym.fmi.clocks import CallError
 from fmugym.fmi.exchange import ExchangeInstance
 from fmugym.fmi.exchange_calls import FMI3Events, SetClocked
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance
-from fmugym.fmi.status import Status
 
 __all__ = ["FMI3EventsInstance"]
 
@@ -28,7 +24,6 @@ class _Steps(FMI3Events):
         self._begin(instance, set_clocked)
         self.number_of_states = self.number_of_indicators = 0
         self.completes = False
-        self._updates = instance.updates
 
     def enter_continuous(self) -> None:
         """See ``Equations.enter_continuous``: enter step mode."""
@@ -40,20 +35,6 @@ class _Steps(FMI3Events):
 
     def step(self, time: float, size: float) -> tuple[float, bool, bool]:
         """See ``Equations.step``."""
-        updates = self._updates
-        if updates is None:
-            return self._step_once(time, size)
-        try:
-            with updates.begin(time, size):
-                result = self._step_once(time, size)
-        except CallError as failure:
-            raise CallError(updates.judge(failure.status), failure.reason) from None
-        status = updates.judge(Status.OK)
-        if status > Status.WARNING:
-            raise CallError(status)
-        return result
-
-    def _step_once(self, time: float, size: float) -> tuple[float, bool, bool]:
         flags, reached = (ctypes.c_bool * 3)(), ctypes.c_double(time + size)
         first = ctypes.addressof(flags)  # event handling needed, terminate, early return
         self._call(
@@ -73,8 +54,3 @@ class FMI3EventsInstance(ExchangeInstance, FMI3Instance):
     slave_class = FMU3Slave
     equations_class = _Steps
     _event_mode: ClassVar = True
-
-    def _prepare_step(self) -> Callable[[float, float], int]:
-        if self.updates is not None:
-            self.updates.access = Access(self, self.updates.variables)
-        return super()._prepare_step()

@@ -8,13 +8,12 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
-from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback, fmi3ValueReference
+from fmpy.fmi3 import FMU3Slave, fmi3IntermediateUpdateCallback
 
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import MessageLog, catching, fmi3_log_message
 from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Status
-from fmugym.fmi.updates import Updates, decline
 
 __all__ = ["FMI3Instance"]
 
@@ -23,7 +22,11 @@ __all__ = ["FMI3Instance"]
 @catching
 def _ignore_intermediate_update(*arguments: Any) -> None:
     """Want no early return. FMUs may call this without asking whether it is there."""
-    decline(arguments[1], *arguments[6:])
+    requested, time = arguments[6:8]
+    if requested:
+        requested[0] = False
+    if time:
+        time[0] = arguments[1]
 
 
 class FMI3Instance(Instance):
@@ -48,9 +51,6 @@ class FMI3Instance(Instance):
     _event_mode: ClassVar = False
 
     def _instantiate(self, log: MessageLog, logging: bool) -> None:
-        self._prepare_updates()
-        updates = self.updates
-        wanted = () if updates is None else updates.references
         resources = os.path.join(self._slave.unzipDirectory, "resources", "")
         self._slave.component = self._slave.fmi3InstantiateCoSimulation(
             self._slave.instanceName.encode(),
@@ -60,19 +60,12 @@ class FMI3Instance(Instance):
             logging,
             self._event_mode,
             self._event_mode,  # early return allowed
-            (fmi3ValueReference * len(wanted))(*wanted) if wanted else None,
-            len(wanted),
+            None,
+            0,
             log.environment,
             fmi3_log_message,
-            _ignore_intermediate_update if updates is None else updates.callback,
+            _ignore_intermediate_update,
         )
-
-    def _prepare_updates(self) -> None:
-        solving = self._solving
-        if solving is not None and (solving.ramps or solving.watched):
-            self.updates = Updates(
-                solving.watched, solving.ramps, self._log.environment, self._complain
-            )
 
     def _function_name(self, name: str) -> str:
         return f"fmi3{name}"

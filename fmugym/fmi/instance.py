@@ -26,7 +26,6 @@ from fmugym.fmi.log import Hearing, MessageLog
 from fmugym.fmi.solver import Solving
 from fmugym.fmi.span import Initialize, Span
 from fmugym.fmi.status import Phase, Status, sane
-from fmugym.fmi.updates import Updates
 from fmugym.signals import ordinary
 
 __all__ = ["Instance", "SavedState"]
@@ -50,9 +49,6 @@ class Instance(ABC):
     enumeration_type: ClassVar = "Integer"
     """The C type of enumerations in this FMI version."""
     _deserialize: ClassVar = "Deserialize"
-
-    updates: Updates | None = None
-    """The intermediate updates of FMI 3.0, if anything is wanted of them."""
 
     exchange: Callable[[], None] | None = None
     """Called in Initialization Mode, to exchange values with other FMUs. FMI 1.0 has none."""
@@ -482,8 +478,6 @@ class Instance(ABC):
         """
         if self.phase is Phase.DEAD:
             raise SimulationError(f"{self._log.instance_name}: no restore after a fatal error")
-        if self.updates is not None:
-            self.updates.clear()
         self._log.recent.clear()
         set_state = self._function(self._state_function("Set"))
         self.check("restoring the FMU state", set_state(self._component, state.pointer))

@@ -24,7 +24,6 @@ from fmugym.fmi.fmi2 import FMI2Instance
 from fmugym.fmi.fmi3 import FMI3Instance
 from fmugym.fmi.instance import Instance
 from fmugym.fmi.log import Hearing
-from fmugym.fmi.ramps import RAMPED_CLASSES
 from fmugym.fmi.solver import Solving
 from fmugym.signals import ordinary
 
@@ -41,11 +40,9 @@ _INSTANCE_CLASSES: Final[dict[tuple[int, str], type[Instance]]] = {
 _load_lock = threading.Lock()
 
 
-def _instance_class(description: ModelDescription, solving: Solving | None) -> type[Instance]:
+def _instance_class(description: ModelDescription) -> type[Instance]:
     if description.uses_event_mode:
         return FMI3EventsInstance
-    if solving is not None and (solving.ramps or solving.watched):
-        return RAMPED_CLASSES[description.fmi_major_version]
     return _INSTANCE_CLASSES[description.fmi_major_version, description.interface]
 
 
@@ -65,7 +62,7 @@ class Library:
         self, fmu: LoadableFMU, target: logging.Logger, solving: Solving | None = None
     ) -> None:
         description = fmu.description
-        self._instance_class = _instance_class(description, solving)
+        self._instance_class = _instance_class(description)
         self._solving = solving
         self._fmu = fmu
         self._target = target

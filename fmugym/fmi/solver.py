@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Final
 
-from fmugym.archive.variable import Variable
 from fmugym.fmi.clocks import TICKS_SIZE, CallError, Ticks, Timetable
 from fmugym.fmi.crossings import Bracket, crosses
 from fmugym.fmi.equations import Equations
@@ -46,17 +45,11 @@ class Solving:
         solver: The method, one of ``METHODS``.
         tolerance: Relative.
         max_step: The longest step in seconds; infinite for no limit.
-        ramps: The value references of inputs that change linearly, in co-simulation.
-        ramp_duration: How long each change takes, in seconds.
-        watched: The outputs that the FMU is to tell in intermediate updates.
     """
 
     solver: str = "dormand_prince"
     tolerance: float = 1e-6
     max_step: float = math.inf
-    ramps: tuple[int, ...] = ()
-    ramp_duration: float = 1.0
-    watched: tuple[Variable, ...] = ()
 
 
 _MEMORY: Final = struct.Struct("=dddqq")

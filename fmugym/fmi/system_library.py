@@ -9,7 +9,6 @@ import functools
 import logging
 import weakref
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 from fmugym.archive.loadable import LoadableFMU
@@ -99,9 +98,8 @@ def _load(
             f"{layout.label}: it runs in a process of its own, which only the C extension can give "
             "it"
         )
-    ramps = tuple(variable.value_reference for variable in layout.ramped)
     try:
-        return Library(part, target, None if solving is None else replace(solving, ramps=ramps))
+        return Library(part, target, solving)
     except FMULoadError as error:
         raise FMULoadError(f"{layout.label}: {error}") from None
 
@@ -145,7 +143,5 @@ def open_library(
     description = fmu.description
     if not isinstance(description, SystemDescription):
         return Library(fmu, target, solving)
-    ramps = () if solving is None else solving.ramps
-    ramped = [variable for variable in inputs if variable.value_reference in ramps]
-    layout = Layout(description, inputs, outputs, ramped)
+    layout = Layout(description, inputs, outputs)
     return SystemLibrary(fmu, layout, target, solving, resets)

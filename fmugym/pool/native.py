@@ -154,7 +154,6 @@ class NativePool(SavingPool):
         if private_libraries:
             paths = copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
-        watched = tuple(spec.outputs[i] for i in spec.watched)
         try:
             return _native.Pool(
                 library=cast(
@@ -177,7 +176,6 @@ class NativePool(SavingPool):
                     | {
                         "inputs": self._access(spec.inputs),
                         "outputs": self._access(spec.outputs),
-                        "watched": self._access(watched) if watched else None,
                     },
                 ),
                 arrays={

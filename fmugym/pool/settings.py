@@ -156,7 +156,6 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
     return {
         "num_observed": spec.num_observed,
         "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
-        "watched_places": np.array(spec.watched, np.uint32).tobytes(),
     }
 
 
@@ -167,11 +166,9 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
-        if not (description.uses_event_mode or spec.ramped or spec.watched):
+        if not description.uses_event_mode:
             return None
-        ramps = np.array([v.value_reference for v in spec.ramped], np.uint32).tobytes()
-        by_fmu = b"by_fmu", 1.0, math.inf, 0, 0, False, None, None
-        return (*by_fmu, *clocks, ramps, spec.time_step)
+        return (b"by_fmu", 1.0, math.inf, 0, 0, False, None, None, *clocks)
     solving, states, rates = spec.solving, None, None
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
@@ -186,8 +183,6 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         states,
         rates,
         *clocks,
-        b"",
-        spec.time_step,
     )
 
 
@@ -195,13 +190,7 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
     """The number of the way in which the FMU is run, one of ``enum Manner`` of ``native/fmi.h``."""
     if description.model_exchange is not None:
         return 1
-    if description.uses_event_mode:
-        return 2
-    if isinstance(description, SystemDescription):
-        return 0
-    if spec.watched or (spec.ramped and description.fmi_major_version == 3):
-        return 4
-    return 3 if spec.ramped else 0
+    return 2 if description.uses_event_mode else 0
 
 
 def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:

@@ -96,7 +96,6 @@ class Slot:
         self._step_size = spec.communication_step_size
         self._restores = library.can_save_state and spec.reset_method == ResetMethod.RESTORE
         self._first_outputs = b""
-        self._watched = spec.watched
         self._integrals = [i for i, name in enumerate(spec.samplings) if name == "integral"]
         self._build()
 
@@ -288,17 +287,12 @@ class Slot:
     def _advance_sampled(self) -> int:
         """Read the outputs after each substep, and let the row hold what is asked for of them."""
         samples, status = Samples(self._spec.samplings, self._step_size), 0
-        updates = self._instance.updates
-        if updates is not None:
-            updates.clear()
         for _ in range(self._spec.substeps):
             status = self._step_once()
             got = 0 if _has_failed(status) else self._outputs.get()
             if _has_failed(status) or _has_failed(got):
                 self._output_row[:] = self._good_outputs
                 return self._take_outputs(status, got) if _has_failed(got) else status
-            if updates is not None:
-                updates.summarize(self._watched, self._spec.samplings, self._output_row)
             samples.add(self._output_row.tolist())
             if status == Status.TERMINATED:
                 break

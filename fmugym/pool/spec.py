@@ -143,7 +143,6 @@ class PoolSpec:
         solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
-        ramped: The inputs that change linearly within each step, from the value of the last one.
         call_timeout: How long a call of a component with a process of its own may take, in seconds
             of real time; an initialization may take ten times as long.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
@@ -172,7 +171,6 @@ class PoolSpec:
     records: bool = False
     solver: str = SOLVERS[0]
     max_step: float | None = None
-    ramped: tuple[Variable, ...] = ()
     call_timeout: float = DEFAULT_CALL_TIMEOUT
 
     def communication_point(self, count: int, start_time: float | None = None) -> float:
@@ -221,25 +219,10 @@ class PoolSpec:
         return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
 
     @property
-    def watched(self) -> tuple[int, ...]:
-        """The places of outputs whose values within a step count, and which the FMU tells there."""
-        # there are no samplings if all are "last"
-        pairs = enumerate(zip(self.outputs, self.samplings, strict=False))
-        return tuple(i for i, (output, name) in pairs if output.updated and name != "last")
-
-    @property
     def solving(self) -> Solving:
         """How the equations of FMUs of model exchange are solved."""
         tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
-        ramps = tuple(v.value_reference for v in self.ramped)
-        return Solving(
-            self.solver,
-            tolerance,
-            self.max_step or math.inf,
-            ramps,
-            self.time_step,
-            tuple(self.outputs[place] for place in self.watched),
-        )
+        return Solving(self.solver, tolerance, self.max_step or math.inf)
 
     @property
     def communication_step_size(self) -> float:

@@ -7,8 +7,6 @@
 typedef struct {
     PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance;
     PyAccess *inputs, *outputs;
-    PyObject *watched; /* an Access or None */
-    const char *watched_places;
     Py_ssize_t size_of_places;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
@@ -56,11 +54,9 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", "watched_places",
-                            "watched", NULL};
-    return parse_group(group, "$O!O!ny#y#O:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings,
-                       &a->watched_places, &a->size_of_places, &a->watched);
+    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", NULL};
+    return parse_group(group, "$O!O!ny#:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
@@ -121,28 +117,6 @@ static bool check_accesses(const Arguments *a) {
     return true;
 }
 
-/* The outputs of which the FMU may tell more than their values at the ends of steps. */
-static bool take_watched(const Arguments *a, Solving *solving) {
-    if (a->watched == Py_None) {
-        return true;
-    }
-    const PyAccess *watched = (const PyAccess *)a->watched;
-    const uint32_t *places = (const uint32_t *)(const void *)a->watched_places;
-    bool sound = PyObject_TypeCheck(a->watched, access_type) &&
-                 watched->access.fmi == a->outputs->access.fmi && a->samplings > 0 &&
-                 (size_t)a->size_of_places == watched->access.count * sizeof *places;
-    for (size_t i = 0; sound && i < watched->access.count; i++) {
-        sound = places[i] < a->outputs->access.count;
-    }
-    if (!sound) {
-        PyErr_SetString(PyExc_ValueError, "the watched outputs do not fit the outputs");
-        return false;
-    }
-    solving->watched = &watched->access;
-    solving->watched_places = places;
-    return true;
-}
-
 static bool take_optional(PyObject *object, bool *given, double *value) {
     *given = object != Py_None;
     *value = *given ? PyFloat_AsDouble(object) : 0.0;
@@ -198,17 +172,17 @@ static bool take_method(const char *name, Solving *solving) {
 
 /* The references stay in the pool's arguments. */
 bool take_solving(PyObject *tuple, Solving *solving) {
-    const char *method, *states, *rates, *clocks, *clocked, *ramps;
-    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size, ramps_size;
+    const char *method, *states, *rates, *clocks, *clocked;
+    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
     int completes;
 
     if (tuple == Py_None) {
         return true;
     }
-    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#y#d", &method, &solving->tolerance,
+    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#", &method, &solving->tolerance,
                           &solving->max_step, &count, &indicators, &completes, &states,
                           &states_size, &rates, &rates_size, &clocks, &clocks_size, &clocked,
-                          &clocked_size, &ramps, &ramps_size, &solving->ramp_duration)) {
+                          &clocked_size)) {
         return false;
     }
     const Py_ssize_t wanted = count * (Py_ssize_t)sizeof(uint32_t);
@@ -226,8 +200,6 @@ bool take_solving(PyObject *tuple, Solving *solving) {
     solving->number_of_clocks = (size_t)clocks_size / sizeof(Clock);
     solving->clocked = (const Clocked *)(const void *)clocked;
     solving->number_of_clocked = (size_t)clocked_size / sizeof(Clocked);
-    solving->ramped_references = (const uint32_t *)(const void *)ramps;
-    solving->number_of_ramps = (size_t)ramps_size / sizeof(uint32_t);
     return take_method(method, solving);
 }
 
@@ -283,7 +255,6 @@ static bool settle(PyPool *self, const Arguments *a) {
         self->system->largest_state = STATES_LIMIT / s->count;
     }
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
-           take_watched(a, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }

@@ -68,9 +68,7 @@ class PlayAround:
         return _native.Pool(
             library=_NO_LIBRARY,
             experiment=cast("_native.Experiment", experiment_settings(spec)),
-            variables=cast(
-                "_native.Variables", variable_settings(spec) | accesses | {"watched": None}
-            ),
+            variables=cast("_native.Variables", variable_settings(spec) | accesses),
             arrays={
                 "inputs": arrays.inputs,
                 "outputs": arrays.outputs,

@@ -233,8 +233,6 @@ class ProgramCoding:
         writer.access(spec.inputs, description.fmi_major_version)
         writer.access(spec.outputs, description.fmi_major_version)
         _write_variables(writer, variable_settings(spec))
-        watched = [spec.outputs[place] for place in spec.watched]
-        writer.access(watched, description.fmi_major_version)
         writer.block(experiment["start_outputs"] or b"")
         writer.integers(setup.block.stop - setup.block.start, setup.threads)
         writer.flags(spec.records or offered_method(description, spec) is not SaveMethod.STATE)
@@ -411,4 +409,3 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
 def _write_variables(writer: _Writer, variables: Mapping[str, Any]) -> None:
     writer.integers(variables["num_observed"])
     writer.block(variables["sampling"])
-    writer.block(variables["watched_places"])
