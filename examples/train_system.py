@@ -212,7 +212,6 @@ def main(argv=None):
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(argv)
     system = make_system(options.folder)
-    system.write(options.folder / "home.ssp")
     system.plot(options.folder / "home.svg")
     envs = fmugym.FMUVectorEnv(lambda: HomeEnv(system), options.envs, autoreset_mode="Disabled")
     reference = float(np.mean(thermostat(envs, TEST_SEED)))

@@ -82,17 +82,6 @@ def serve_component() -> None:
         OSError: If the standard input is no socket, or on Windows.
     """
 
-def claim_initialization(last: Array, interval: float, /) -> float:
-    """Take the next moment at which an instance may be made or initialized.
-
-    Args:
-        last: The latest such moment that is taken, in ns, int64, of shape (1,); 0 for none.
-        interval: Seconds between two of them.
-
-    Returns:
-        The seconds until then.
-    """
-
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 
@@ -202,7 +191,6 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
-    pace: float
     start_outputs: bytes | None
 
 class Variables(TypedDict):
@@ -212,22 +200,15 @@ class Variables(TypedDict):
     outputs: Access
     num_observed: int
     sampling: bytes
-    watched: Access | None
-    watched_places: bytes
 
 class Arrays(TypedDict):
-    """The pool's own arrays.
-
-    ``health`` is int64, see ``fmugym.pool.health``, and so is ``last_initialization``, of shape
-    (1,), see ``fmugym.pool.pacing``.
-    """
+    """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
 
     inputs: Array
     outputs: Array
     statuses: Array
     observations: Array
     health: Array
-    last_initialization: Array
 
 Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
 """An episode: types and elements (see ``Access``) of the start variables, start values, first
@@ -413,17 +394,6 @@ class Pool:
 
     def knows_start(self, index: int, start: Access, values: bytes, /) -> bool:
         """Whether a reset with these start values (float64) restores a state."""
-
-    def pack(self, index: int, /) -> bytes | None:
-        """Serialize the state of an instance that has just been reset."""
-
-    def adopt(
-        self, index: int, start: Access, values: bytes, outputs: bytes, state: bytes, /
-    ) -> bool:
-        """Let an instance restore a serialized state at its next reset with these start values.
-
-        ``outputs`` are those just after the initialization: with others, it is initialized.
-        """
 
     def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
         """Tell what failed last.

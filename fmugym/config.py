@@ -34,11 +34,11 @@ from fmugym.pool.spec import (
     SOLVERS,
     ResetMethod,
 )
+from fmugym.retired import without_retired
 from fmugym.signals import ordinary
 
 __all__ = ["EnvConfig"]
 
-INTERPOLATIONS: Final = ("hold", "linear")
 ON_FAULT: Final = ("truncate", "terminate", "raise")
 MOST_RETRIES: Final = 10
 """The last retry makes 1024 steps of one."""
@@ -51,7 +51,6 @@ _POSITIVE: Final = (
     "call_timeout",
     "tolerance",
     "max_step",
-    "max_initializations_per_second",
 )
 _NAMES: Final = ("model_input_names", "model_output_names", "monitor_names", "preload")
 
@@ -113,22 +112,13 @@ class EnvConfig:
             ``fmugym.trial.opening.make_pool``.
         call_timeout: Seconds of real time that a call of an FMU may take in a worker process. A
             reset or an instantiation may take ten times as long. None for no limit.
-        max_instances: How many instances of the FMU may exist at once on this machine, for FMUs
-            with licences: each instance may take a seat. None for no limit.
-        max_initializations_per_second: How many instantiations and initializations may begin in a
-            second of real time on this machine, counted together; None for no limit.
-        keep_initial_states: Whether to keep the state after initialization and warm-up, for other
-            instances and on disk, where this gives the same results to the last bit. For models
-            that take long to initialize.
+        max_instances: How many instances of the FMU this process and its workers may have at once,
+            for FMUs with licences: each instance may take a seat. None for no limit.
         licence_wait: Seconds of real time to wait for a licence that the FMU does not get; 0 to
             give up at once.
         samplings: What a step gives of outputs and monitored variables by name: ``"last"`` (the
             default), or the ``"mean"``, ``"integral"`` over time, ``"min"`` or ``"max"`` of the
-            values after each substep, and of those within that the FMU tells in intermediate
-            updates (FMI 3.0). After a reset an integral is 0.
-        input_interpolation: How inputs change within a step: ``"hold"`` (the default) at once, or
-            ``"linear"`` from the value of the last step; one for all inputs, or by name. The FMU
-            must be able to interpolate inputs, in co-simulation.
+            values after each substep. After a reset an integral is 0.
         interface: How the FMU is run: ``"co_simulation"`` or ``"model_exchange"``; by default
             co-simulation where the FMU offers it, or as the class says.
         solver: The method of integration for model exchange: ``"dormand_prince"``, ``"euler"``,
@@ -167,11 +157,8 @@ class EnvConfig:
     isolation: str | None = None
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT
     max_instances: int | None = None
-    max_initializations_per_second: float | None = None
-    keep_initial_states: bool = False
     licence_wait: float = 0.0
     samplings: Mapping[str, str] = field(default_factory=dict)
-    input_interpolation: str | Mapping[str, str] = "hold"
     interface: str | None = None
     solver: str = SOLVERS[0]
     max_step: float | None = None
@@ -193,7 +180,7 @@ class EnvConfig:
             return config
         if not isinstance(config, Mapping):
             raise ConfigError(f"config must be a dict, got {type(config).__name__}")
-        items = check_mapping("config", config)
+        items = without_retired(check_mapping("config", config))
         known = [f.name for f in fields(cls)]
         for key in items:
             if key in _ELSEWHERE:
@@ -222,10 +209,6 @@ class EnvConfig:
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))
-        if not isinstance(self.keep_initial_states, bool | np.bool_):
-            raise ConfigError(
-                f"keep_initial_states must be True or False, got {shown(self.keep_initial_states)}"
-            )
         if self.archive_limits is not None:
             self._set("archive_limits", _archive_limits(self.archive_limits))
         self._check_names()
@@ -259,27 +242,6 @@ class EnvConfig:
         samplings = check_mapping("samplings", self.samplings).items()
         checked = {name: check_option("sampling", value, SAMPLINGS) for name, value in samplings}
         self._set("samplings", checked)
-        self._set("input_interpolation", self._interpolations())
-
-    def _interpolations(self) -> dict[str, str]:
-        """One for each input that is named, or for all."""
-        given = self.input_interpolation
-        if isinstance(given, str):
-            given = dict.fromkeys(self.model_input_names, given)
-        for name in check_mapping("input_interpolation", given):
-            if name not in self.model_input_names:
-                raise unknown_name("input in 'input_interpolation'", name, self.model_input_names)
-        return {
-            name: check_option("input interpolation", value, INTERPOLATIONS)
-            for name, value in given.items()
-        }
-
-    @property
-    def ramped_inputs(self) -> tuple[str, ...]:
-        """The inputs that change linearly within each step."""
-        given = self.input_interpolation
-        assert not isinstance(given, str)  # it was taken apart
-        return tuple(name for name in self.model_input_names if given.get(name) == "linear")
 
     def _take_floats(self) -> None:
         for key in _REWARDS:

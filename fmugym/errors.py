@@ -111,7 +111,7 @@ class SimulationError(FMUGymError):
 class LicenceError(SimulationError, FMULoadError):
     """An FMU got no licence when it was instantiated or initialized, by its own words.
 
-    Or other environments have all instances that the config key ``max_instances`` allows.
+    Or other environments of this process have all instances that ``max_instances`` allows.
     """
 
 

@@ -120,15 +120,6 @@ bool pool_knows_start(Pool *pool, size_t index, const Access *start, const doubl
            instance_knows_start(pool, &pool->instances[index], start, values);
 }
 
-bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size) {
-    return instance_pack(pool, &pool->instances[index], bytes, size);
-}
-
-bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed) {
-    return make_room_for_starts(pool, start) &&
-           instance_adopt(pool, &pool->instances[index], start, packed);
-}
-
 /* Reads variables of one instance into a column of values. */
 static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
                             double *column) {

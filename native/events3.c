@@ -50,7 +50,6 @@ static const Model model = {
     .clocks = offsetof(Functions, clocks),
     .update = update3,
     .step = step,
-    .updates = true,
 };
 
 static void *instantiate(const Library *library, const Identity *identity) {

@@ -5,8 +5,6 @@ const Fmi *fmi_table(int64_t version, int64_t manner) {
         [CO_SIMULATION_ALONE] = {&fmi1, &fmi2, &fmi3},
         [MODEL_EXCHANGE_SOLVED] = {&exchange1, &exchange2, &exchange3},
         [CO_SIMULATION_WITH_EVENTS] = {NULL, NULL, &events3},
-        [CO_SIMULATION_WITH_RAMPS] = {&ramped1, &ramped2, NULL},
-        [CO_SIMULATION_WITH_UPDATES] = {NULL, NULL, &updated3},
     };
     const bool sound = version >= 1 && version <= 3 && manner >= 0 &&
                        manner < NUMBER_OF_MANNERS;

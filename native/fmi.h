@@ -181,13 +181,10 @@ typedef enum {
     CO_SIMULATION_ALONE,
     MODEL_EXCHANGE_SOLVED,
     CO_SIMULATION_WITH_EVENTS,
-    CO_SIMULATION_WITH_RAMPS,
-    CO_SIMULATION_WITH_UPDATES,
     NUMBER_OF_MANNERS
 } Manner;
 
-extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3, ramped1, ramped2,
-    updated3;
+extern const Fmi fmi1, fmi2, fmi3, exchange1, exchange2, exchange3, events3;
 /* Of systems. */
 extern const Fmi composite;
 

@@ -39,7 +39,6 @@ static const Binding bindings[] = {
     ELEMENT("SetBoolean", Functions, older.set, TYPE_BOOLEAN),
     {"SetString", offsetof(Functions, older.set_string), false},
     {"GetString", offsetof(Functions, older.get_string), false},
-    {"SetRealInputDerivatives", offsetof(Functions, older.set_derivatives), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {

@@ -11,7 +11,6 @@ static const Binding bindings[] = {
     {"DoStep", offsetof(Functions, do_step), true},
     {"GetBooleanStatus", offsetof(Functions, get_boolean_status), false},
     {"GetRealStatus", offsetof(Functions, get_real_status), false},
-    {"SetRealInputDerivatives", offsetof(Functions, older.set_derivatives), false},
 };
 
 static bool bind(Library *library, char *error, size_t size) {

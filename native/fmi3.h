@@ -10,7 +10,6 @@
 #include "log.h"
 #include "shared.h"
 #include "solver.h"
-#include "update.h"
 
 typedef int Get3(void *instance, const uint32_t *references, size_t number_of_references,
                  void *values, size_t number_of_values);
@@ -199,19 +198,13 @@ static inline void ignore_intermediate_update(void *environment, double time, bo
     }
 }
 
-/* The FMU is told which variables are wanted in its intermediate updates. */
+/* Nothing is wanted in intermediate updates, but FMUs may make them all the same. */
 static inline void *instantiate_steps(const Library *library, const Identity *identity,
                                       bool with_events) {
-    size_t count = 0;
-    uint32_t *wanted =
-        identity->solving == NULL ? NULL : updates_references(identity->solving, &count);
-    void *instance = functions_of(library)->instantiate_steps(
+    return functions_of(library)->instantiate_steps(
         identity->name, identity->token, identity->resources, false, identity->logging, with_events,
-        with_events, wanted, count, environment_of(identity), log_message_fmi3,
-        count > 0 ? updates_answer : ignore_intermediate_update);
-
-    free(wanted);
-    return instance;
+        with_events, NULL, 0, environment_of(identity), log_message_fmi3,
+        ignore_intermediate_update);
 }
 
 static inline Status get3(const Library *library, void *instance, Type type,

@@ -74,7 +74,6 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     if (status > STATUS_WARNING) {
         return status;
     }
-    pace_wait(&pool->settings.pace);
     instance_begin_turn(pool);
     atomic_add(&initializations, 1);
     begin_call(CALL_INITIALIZE);
@@ -275,63 +274,7 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     return status;
 }
 
-/* States for other instances and processes */
-
 bool instance_knows_start(Pool *pool, Instance *me, const Access *start, const double *values) {
     return me->saved != NULL && me->phase != PHASE_DEAD && states_are_of_use(pool, me) &&
            starts_as_before(pool, me, start, values);
-}
-
-static Status serialize(Pool *pool, Instance *me, void *state, char **bytes, size_t *size) {
-    const Fmi *fmi = pool->settings.fmi;
-
-    *size = fmi->state_size(me->library, me->component, state);
-    *bytes = *size == 0 || *size > STATES_LIMIT ? NULL : malloc(*size);
-    const Status status = *bytes == NULL ? STATUS_DISCARD
-                                         : fmi->serialize(me->library, me->component, state,
-                                                          *bytes, *size);
-    floats_restore_if_seen(&pool->floats);
-    return status;
-}
-
-bool instance_pack(Pool *pool, Instance *me, char **bytes, size_t *size) {
-    void *state = NULL;
-
-    *bytes = NULL;
-    if (pool->settings.fmi->serialize == NULL || !pool->settings.restores ||
-        me->phase != PHASE_STEPPING || instance_save(pool, me, &state) > STATUS_WARNING) {
-        return false;
-    }
-    Status status = instance_judge(me, serialize(pool, me, state, bytes, size));
-    if (status <= STATUS_WARNING) {
-        status = instance_free_state(pool, me, &state);
-    }
-    if (status > STATUS_WARNING) {
-        free(*bytes);
-        *bytes = NULL;
-    }
-    return *bytes != NULL;
-}
-
-bool instance_adopt(Pool *pool, Instance *me, const Access *start, const Packed *packed) {
-    const Fmi *fmi = pool->settings.fmi;
-
-    if (fmi->deserialize == NULL || me->phase == PHASE_DEAD || !states_are_of_use(pool, me) ||
-        packed->size > STATES_LIMIT / pool->settings.count) {
-        return false;
-    }
-    instance_free_state(pool, me, &me->saved);
-    const Status status = instance_judge(me, fmi->deserialize(me->library, me->component,
-                                                              packed->bytes, packed->size,
-                                                              &me->saved));
-    floats_restore_if_seen(&pool->floats);
-    if (status > STATUS_WARNING) {
-        me->saved = NULL;
-        return false;
-    }
-    *start_id_of(pool, me) = start->id;
-    memcpy(start_values_of(pool, me), packed->start_values, start->count * sizeof(double));
-    memcpy(first_outputs_of(pool, me), packed->outputs,
-           pool->settings.outputs->count * sizeof(double));
-    return true;
 }

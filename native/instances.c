@@ -31,7 +31,6 @@ static bool build(Pool *pool, Instance *me, bool logging) {
     if (s->elsewhere) {
         return false;
     }
-    pace_wait(&pool->settings.pace);
     mutex_lock(pool->making);
     begin_call(CALL_INSTANTIATE);
     me->component = s->fmi->instantiate(me->library, &identity);
@@ -234,7 +233,6 @@ static Status reset(Pool *pool, Instance *me) {
     const bool renews = pool->settings.renews;
 
     if (renews) {
-        pace_wait(&pool->settings.pace);
         free_states(pool, me);
         me->generation++;
         mutex_lock(pool->making);

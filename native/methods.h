@@ -42,12 +42,6 @@ typedef struct Solving {
     const Clock *clocks;
     const Clocked *clocked;
     size_t number_of_clocks, number_of_clocked;
-    const uint32_t *ramped_references; /* inputs that change linearly */
-    size_t number_of_ramps;
-    double ramp_duration;
-    /* The outputs that the FMU tells in intermediate updates, or NULL, and their places among all. */
-    const struct Access *watched;
-    const uint32_t *watched_places;
 } Solving;
 
 #endif

@@ -14,7 +14,6 @@
 #include "log.h"
 #include "mark.h"
 #include "methods.h"
-#include "pace.h"
 #include "platform.h"
 #include "play.h"
 #include "tape.h"
@@ -47,7 +46,6 @@ typedef struct {
     bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
-    Pace pace;
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -298,18 +296,8 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside);
 /* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
 size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside);
 
-/* A serialized FMU state after initialization. */
-typedef struct {
-    const double *start_values; /* one for each variable of the Access */
-    const double *outputs;      /* just after initialization */
-    const char *bytes;
-    size_t size;
-} Packed;
-
-/* These three are for one instance; initial_states.h describes them. */
+/* For one instance; see initial_states.h. */
 bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values);
-bool pool_pack(Pool *pool, size_t index, char **bytes, size_t *size);
-bool pool_adopt(Pool *pool, size_t index, const Access *start, const Packed *packed);
 
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);

@@ -46,8 +46,6 @@ static void put_solving(Packet *packet, const Solving *s) {
     packet_put_block(packet, s->rate_references, s->states * sizeof(uint32_t));
     packet_put_block(packet, s->clocks, s->number_of_clocks * sizeof(Clock));
     packet_put_block(packet, s->clocked, s->number_of_clocked * sizeof(Clocked));
-    packet_put_block(packet, s->ramped_references, s->number_of_ramps * sizeof(uint32_t));
-    PUT(packet, s->ramp_duration);
 }
 
 static void put_groups(Packet *packet, const Access *access) {

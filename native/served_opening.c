@@ -37,9 +37,6 @@ static void take_solving(Solving *s) {
     s->number_of_clocks = size / sizeof(Clock);
     s->clocked = serving_take_copy(&size);
     s->number_of_clocked = size / sizeof(Clocked);
-    s->ramped_references = serving_take_copy(&size);
-    s->number_of_ramps = size / sizeof(uint32_t);
-    TAKE(&served.in, s->ramp_duration);
 }
 
 static void take_batches(Batches *batches) {

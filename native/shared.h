@@ -31,8 +31,6 @@ typedef struct {
                       const char *const *values);
     int (*get_string)(void *component, const uint32_t *references, size_t count,
                       const char **values);
-    int (*set_derivatives)(void *component, const uint32_t *references, size_t count,
-                           const int *orders, const double *values);
 } Older;
 
 #define COUNT_OF(array) (sizeof(array) / sizeof *(array))

@@ -4,8 +4,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "update.h"
-
 /* A component: the solver, and the values that were last set, by type. Inputs that stay the same
  * need no event. */
 typedef struct {
@@ -23,7 +21,7 @@ typedef struct {
 typedef struct {
     void *state; /* of the FMU */
     Memory memory;
-    char kept[]; /* ticks and ramps */
+    Ticks ticks[];
 } SolvedState;
 
 static const Fmi *fmi_of(const Solver *me) {
@@ -38,12 +36,9 @@ static void forget_last(Solved *me) {
 
 static void forget(Solved *me) {
     memset(&me->solver.memory, 0, sizeof me->solver.memory);
-    memset(me->solver.kept, 0, solver_kept_size(&me->solver));
+    memset(me->solver.ticks, 0, solver_size_of_ticks(&me->solver));
     me->solver.memory.next_event = INFINITY;
     me->solver.stale = true;
-    if (me->solver.updates != NULL) {
-        updates_clear(me->solver.updates);
-    }
     forget_last(me);
 }
 
@@ -53,17 +48,6 @@ static const void *functions_at(const Library *library, size_t offset) {
 }
 
 static Status set_clocked(Solver *me, size_t clock);
-
-/* Returns whether there was enough memory. */
-static bool open_updates(Solver *me) {
-    const Solving *s = me->solving;
-
-    if (me->model->updates && (s->number_of_ramps > 0 || s->watched != NULL)) {
-        me->updates = updates_open(me);
-        return me->updates != NULL;
-    }
-    return true;
-}
 
 void *solved_take(const Model *model, const Library *library, const Identity *identity,
                   void *component) {
@@ -80,11 +64,8 @@ void *solved_take(const Model *model, const Library *library, const Identity *id
                               .floats = identity->floats,
                               .environment = identity->environment};
         if (solver_open(&me->solver)) {
-            if (open_updates(&me->solver)) {
-                forget(me);
-                return me;
-            }
-            solver_close(&me->solver);
+            forget(me);
+            return me;
         }
     }
     if (component != NULL) {
@@ -101,7 +82,6 @@ void solved_free(const Library *library, void *component) {
     for (int type = 0; type < NUMBER_OF_TYPES; type++) {
         free(me->last[type].bytes);
     }
-    updates_close(me->solver.updates);
     solver_close(&me->solver);
     free(me);
 }
@@ -133,11 +113,6 @@ Status solved_initialize(const Library *library, void *component, const Experime
     if (!good(status)) {
         return status;
     }
-    if (me->model->update == NULL) {
-        *doing = "reading the inputs";
-        me->memory.mode = IN_CONTINUOUS_TIME;
-        return ramps_begin(me);
-    }
     *doing = "the initial event";
     me->memory.mode = IN_EVENTS;
     return solver_settle(me);
@@ -149,9 +124,6 @@ Status solved_do_step(const Library *library, void *component, double time, doub
 
     (void)library;
     (void)no_return;
-    if (me->model->step != NULL && me->model->update == NULL) {
-        return ramps_step(me, time, step);
-    }
     if (me->model->step != NULL) {
         me->memory.time = time; /* which may differ from the end of the last step by its rounding */
     }
@@ -257,25 +229,6 @@ static Status set_clocks(Solver *me, const uint32_t *references, size_t count,
     return any && me->memory.mode == IN_CONTINUOUS_TIME ? solver_enter_events(me) : STATUS_OK;
 }
 
-/* Sets what has no ramp, and lets the others aim at their values. */
-static Status set_beside_ramps(Solver *me, Type type, const uint32_t *references, size_t count,
-                               const void *values) {
-    const Fmi *fmi = fmi_of(me);
-    const size_t size = value_size(fmi, type);
-    Status status = STATUS_OK;
-
-    if (type == TYPE_FLOAT64) {
-        ramps_aim(me, references, count, values);
-    }
-    for (size_t i = 0; i < count && good(status); i++) {
-        if (type != TYPE_FLOAT64 || !ramps_own(me, references[i])) {
-            status = fmi->set(me->library, me->component, type, &references[i], 1,
-                              (const char *)values + i * size, 1);
-        }
-    }
-    return status;
-}
-
 /* New values of inputs and parameters are an event: they may jump. */
 Status solved_set(const Library *library, void *component, Type type, const uint32_t *references,
                   size_t count, const void *values, size_t size) {
@@ -285,9 +238,6 @@ Status solved_set(const Library *library, void *component, Type type, const uint
 
     if (type == TYPE_CLOCK) {
         return set_clocks(&me->solver, references, count, values);
-    }
-    if (me->solver.model->update == NULL && me->solver.memory.mode != BEFORE_EVENTS) {
-        return set_beside_ramps(&me->solver, type, references, count, values);
     }
     if (me->solver.memory.mode != BEFORE_EVENTS) {
         if (is_repeated(&me->last[type], references, count, values, size * value_size(fmi, type))) {
@@ -353,7 +303,7 @@ Status solved_get_state(const Library *library, void *component, void **state) {
     const Status status = fmi_of(me)->get_state(library, me->component, &inner);
 
     if (old == NULL || old->state != inner) {
-        saved = malloc(sizeof *saved + solver_kept_size(me));
+        saved = malloc(sizeof *saved + solver_size_of_ticks(me));
         free(saved == NULL ? NULL : old);
     }
     if (saved == NULL) {
@@ -361,7 +311,7 @@ Status solved_get_state(const Library *library, void *component, void **state) {
     }
     saved->state = inner;
     saved->memory = me->memory;
-    memcpy(saved->kept, me->kept, solver_kept_size(me));
+    memcpy(saved->ticks, me->ticks, solver_size_of_ticks(me));
     *state = saved;
     if (!good(status) && inner == NULL) {
         free(saved);
@@ -376,7 +326,7 @@ Status solved_set_state(const Library *library, void *component, void *state) {
 
     forget(component);
     me->memory = saved->memory;
-    memcpy(me->kept, saved->kept, solver_kept_size(me));
+    memcpy(me->ticks, saved->ticks, solver_size_of_ticks(me));
     return fmi_of(me)->set_state(library, me->component, saved->state);
 }
 
@@ -392,7 +342,7 @@ Status solved_free_state(const Library *library, void *component, void **state) 
 
 /* Of what is serialized beside the FMU's state. */
 static size_t size_of_memory(const Solver *me) {
-    return sizeof(Memory) + solver_kept_size(me);
+    return sizeof(Memory) + solver_size_of_ticks(me);
 }
 
 size_t solved_state_size(const Library *library, void *component, void *state) {
@@ -409,7 +359,7 @@ Status solved_serialize(const Library *library, void *component, void *state, ch
 
     const size_t own = size_of_memory(me);
     memcpy(bytes, &saved->memory, sizeof(Memory));
-    memcpy(bytes + sizeof(Memory), saved->kept, solver_kept_size(me));
+    memcpy(bytes + sizeof(Memory), saved->ticks, solver_size_of_ticks(me));
     return fmi_of(me)->serialize(library, me->component, saved->state, bytes + own, size - own);
 }
 
@@ -417,13 +367,13 @@ Status solved_deserialize(const Library *library, void *component, const char *b
                           void **state) {
     const Solver *me = component;
     const size_t own = size_of_memory(me);
-    SolvedState *saved = size < own ? NULL : calloc(1, sizeof *saved + solver_kept_size(me));
+    SolvedState *saved = size < own ? NULL : calloc(1, sizeof *saved + solver_size_of_ticks(me));
 
     if (saved == NULL) {
         return STATUS_ERROR;
     }
     memcpy(&saved->memory, bytes, sizeof(Memory));
-    memcpy(saved->kept, bytes + sizeof(Memory), solver_kept_size(me));
+    memcpy(saved->ticks, bytes + sizeof(Memory), solver_size_of_ticks(me));
     const Status status = fmi_of(me)->deserialize(library, me->component, bytes + own, size - own,
                                                   &saved->state);
     *state = saved;

@@ -6,7 +6,6 @@
 #include <string.h>
 
 #include "log.h"
-#include "update.h"
 
 enum {
     MOST_UPDATES = 1000,  /* of the discrete states in one event */
@@ -46,9 +45,8 @@ static void share_out(Solver *me, double *memory) {
     me->found_z = take(&memory, s->indicators);
 }
 
-size_t solver_kept_size(const Solver *me) {
-    const Solving *s = me->solving;
-    return s->number_of_clocks * sizeof(Ticks) + s->number_of_ramps * sizeof(Ramp);
+size_t solver_size_of_ticks(const Solver *me) {
+    return me->solving->number_of_clocks * sizeof(Ticks);
 }
 
 bool solver_open(Solver *me) {
@@ -58,15 +56,13 @@ bool solver_open(Solver *me) {
     me->n = s->states;
     double *memory = calloc(me->n * rows + 4 * s->indicators + 1, sizeof *memory);
     me->order = calloc(me->n + 1, sizeof *me->order);
-    me->kept = calloc(solver_kept_size(me) + 1, 1);
+    me->ticks = calloc(s->number_of_clocks + 1, sizeof *me->ticks);
     me->active = calloc(s->number_of_clocks + 1, sizeof *me->active);
     me->arrays = memory;
-    if (memory == NULL || me->order == NULL || me->kept == NULL || me->active == NULL) {
+    if (memory == NULL || me->order == NULL || me->ticks == NULL || me->active == NULL) {
         solver_close(me);
         return false;
     }
-    me->ticks = (Ticks *)(void *)me->kept;
-    me->ramps = (Ramp *)(void *)(me->ticks + s->number_of_clocks);
     share_out(me, memory);
     return true;
 }
@@ -74,7 +70,7 @@ bool solver_open(Solver *me) {
 void solver_close(Solver *me) {
     free(me->arrays);
     free(me->order);
-    free(me->kept);
+    free(me->ticks);
     free(me->active);
 }
 
@@ -336,7 +332,8 @@ static Status step_by_fmu(Solver *me, double until) {
     const double time = me->memory.time;
     double reached = until;
     bool event = false, terminate = false;
-    const Status status = updates_step(me, time, until - time, &reached, &event, &terminate);
+    const Status status = me->model->step(me->library, me->component, time, until - time, &reached,
+                                          &event, &terminate);
 
     solver_restore_floats(me);
     if (!good(status)) {

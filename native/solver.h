@@ -1,6 +1,5 @@
 /* Model exchange: the pool integrates the FMU's equations and handles its events. In co-simulation
- * with event mode the FMU does its steps, and the pool handles the events between them; with ramps
- * and intermediate updates it only sets inputs and reads outputs.
+ * with event mode the FMU does its steps, and the pool handles the events between them.
  *
  * Everything above sees an instance that can do steps, as in co-simulation: solved.h. */
 
@@ -9,7 +8,6 @@
 
 #include "fmi.h"
 #include "methods.h"
-#include "ramp.h"
 
 /* What the FMU tells after one update of its discrete states. */
 typedef struct {
@@ -35,7 +33,6 @@ typedef struct {
 typedef struct Model {
     const Fmi *fmi;   /* of the FMU itself */
     size_t equations; /* where they are in the library's table of functions */
-    /* NULL if there is no event mode. */
     Status (*update)(const Library *library, void *component, Events *events);
     /* Tells the FMU that a step is complete. It may want an event, or to stop. */
     Status (*complete)(const Library *library, void *component, bool *event, bool *terminate);
@@ -47,7 +44,6 @@ typedef struct Model {
      * or to stop. */
     Status (*step)(const Library *library, void *component, double time, double size,
                    double *reached, bool *event, bool *terminate);
-    bool updates; /* whether it may make intermediate updates in it */
 } Model;
 
 typedef enum { BEFORE_EVENTS, IN_EVENTS, IN_CONTINUOUS_TIME } Mode;
@@ -93,15 +89,11 @@ typedef struct Solver {
     double *stages;     /* n for each stage of the method */
     double *jacobian, *matrix, *slope; /* for methods that need them */
     uint32_t *order; /* of the rows of the matrix */
-    char *kept;   /* the memory of ticks and ramps, which is saved with the state */
-    Ticks *ticks; /* one for each clock */
-    Ramp *ramps;
-    struct Updates *updates; /* of FMI 3.0, or NULL */
+    Ticks *ticks; /* one for each clock, which are saved with the state */
     bool *active; /* whether each clock ticks in this event, or is to tick in the next one */
 } Solver;
 
-/* Of the memory of ticks and ramps. */
-size_t solver_kept_size(const Solver *me);
+size_t solver_size_of_ticks(const Solver *me);
 
 /* Allocates the arrays. Returns whether there was enough memory. */
 bool solver_open(Solver *me);

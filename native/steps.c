@@ -7,7 +7,6 @@
 
 #include "inside.h"
 #include "instances.h"
-#include "update.h"
 
 static const char *const BAD_INPUTS = "the inputs are not finite";
 const char *const BAD_OUTPUTS = "the outputs are not finite";
@@ -135,13 +134,9 @@ static void conclude(const Pool *pool, int64_t substeps, const double *collected
  * scratch memory for values. */
 static Status advance_sampled(Pool *pool, Instance *me, Scratch scratch) {
     const Settings *s = &pool->settings;
-    const bool updates = s->solving.watched != NULL;
     Status status = STATUS_OK;
     int64_t done = 0;
 
-    if (updates) {
-        updates_begin(me->component);
-    }
     while (done < s->substeps && status <= STATUS_WARNING) {
         status = step_once(pool, me);
         if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
@@ -151,9 +146,6 @@ static Status advance_sampled(Pool *pool, Instance *me, Scratch scratch) {
                                       scratch.typed, &pool->floats);
         if (got > STATUS_WARNING) {
             return instance_fail_reading(pool, me, got);
-        }
-        if (updates) {
-            updates_summarize(me->component, s->sampling, scratch.outputs);
         }
         collect(s, done++ == 0, scratch.outputs, scratch.values);
     }

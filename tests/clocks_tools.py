@@ -26,8 +26,7 @@ FRACTIONS = CLOCKS | {
 REALS = {
     "x": (
         30,
-        'causality="output" variability="continuous" initial="exact" start="0" '
-        'intermediateUpdate="true"',
+        'causality="output" variability="continuous" initial="exact" start="0"',
     ),
     "der(x)": (31, 'causality="local" variability="continuous" derivative="30"'),
     "period": (32, 'causality="parameter" variability="fixed" start="0.2"'),

@@ -18,7 +18,6 @@ STATES = {
     "relay": ["x"],
     "sun": ["x"],
     "season": ["x"],
-    "updating": ["x"],
 }
 """By model; their value references begin with 0, and those of their derivatives follow."""
 
@@ -35,7 +34,6 @@ OTHERS = {
     "relay": ["turns", "last", "speed", "steps"],
     "sun": ["now", "sine", "seconds", "u"],
     "season": ["u"],
-    "updating": ["u", "k", "mischief", "y", "calls", "tentative"],
 }
 """The other variables in the order of their value references."""
 
@@ -55,7 +53,6 @@ START = {
     "relay": {"x": 0, "last": 1e9, "speed": 1},
     "sun": {"x": 0, "u": 0},
     "season": {"x": 1, "u": 0},
-    "updating": {"x": 1, "u": 0, "k": 1, "mischief": 0},
     "circuit": {"voltage": 0, "duty": 0.5, "limit": 0.8, "period": 0.1, "tau": 0.3},
 }
 FLAGS = {1: "", 2: 'canGetAndSetFMUstate="true" canSerializeFMUstate="true"'}

@@ -16,7 +16,6 @@ from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
 LOG = logging.getLogger("fmugym.test")
-in_each_engine = pytest.mark.parametrize("native", [True])
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 
 STATES = {

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import ssp_tools
 from source_tools import write_source_fmu
 
 import fmugym
@@ -60,7 +61,8 @@ def shortened(arguments):
 
 def write_system(path):
     house = fmugym.bundled_fmu("House")
-    fmugym.FMUSystem({"first": house, "second": house}, ["first.T_air -> second.T_out"]).write(path)
+    wires = ["first.T_air -> second.T_out"]
+    ssp_tools.write(fmugym.FMUSystem({"first": house, "second": house}, wires), path)
 
 
 def test_every_command_has_an_example_or_a_link():

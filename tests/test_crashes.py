@@ -14,12 +14,11 @@ from pathlib import Path
 import pytest
 import zoo_tools
 
-from fmugym.pool import has_native_pool, mark
+from fmugym.pool import mark
 from fmugym.pool.mark import remains_of
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="crashes are only noted on Linux"),
-    pytest.mark.skipif(not has_native_pool(), reason="crashes are noted by the C extension"),
 ]
 
 HOST = Path(__file__).with_name("crash_host.py")

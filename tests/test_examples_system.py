@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import fmugym
-
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
@@ -23,6 +21,6 @@ def test_it_learns_to_beat_a_thermostat(example, tmp_path, capsys):
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     picture = (tmp_path / "home.svg").read_text()
     assert all(f">{name}<" in picture for name in ("roof", "house", "battery", "P_grid"))
-    system = fmugym.FMUSystem.read(tmp_path / "home.ssp")
+    system = example.make_system(tmp_path)
     tools = [one.fmu.description.generation_tool for one in system.components.values()]
     assert ["PythonFMU" in tool for tool in tools] == [True, False, True]

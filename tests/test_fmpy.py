@@ -157,7 +157,6 @@ class TestRefusals:
             ({"samplings": {"theta": "mean"}}, "samplings"),
             ({"reset_method": "reset"}, "reset_method"),
             ({"isolation": "process"}, "isolation"),
-            ({"keep_initial_states": True}, "keep_initial_states"),
         ],
     )
     def test_of_configs(self, temp_root, changes, name):

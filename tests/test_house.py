@@ -12,7 +12,7 @@ PACKAGE = Path(fmugym.__file__).parent
 STOREYS = [
     {"signals", "_native"},
     {"errors", "caching", "lazy"},
-    {"checks", "extras", "figures", "scaling", "wine"},
+    {"checks", "retired", "extras", "figures", "scaling", "wine"},
     {"archive", "distributions", "rendering"},
     {"systems"},
     {"fmi"},

@@ -12,6 +12,7 @@ import exchange_tools
 import fmu_tools
 import numpy as np
 import pytest
+import ssp_tools
 import values_tools
 from apart_tools import (  # noqa: F401  # some are fixtures
     LOG,
@@ -290,7 +291,9 @@ class TestWhereAnFMUStands:
             Component(bundled_fmu("Pendulum"), isolate=value)
 
     def test_an_archive_keeps_it(self, tmp_path):
-        archive = chain(bundled_fmu("Pendulum"), isolate=True).write(tmp_path / "chain.ssp")
+        archive = ssp_tools.write(
+            chain(bundled_fmu("Pendulum"), isolate=True), tmp_path / "chain.ssp"
+        )
         plan = FMUSystem.read(archive).plan
         assert [component.isolate for component in plan.components] == [True, False]
 
@@ -299,7 +302,9 @@ class TestWhereAnFMUStands:
         assert [component.isolate for component in plan.components] == [True, False]
 
     def test_info_says_where_each_runs(self, tmp_path, capsys):
-        archive = chain(bundled_fmu("Pendulum"), isolate=True).write(tmp_path / "chain.ssp")
+        archive = ssp_tools.write(
+            chain(bundled_fmu("Pendulum"), isolate=True), tmp_path / "chain.ssp"
+        )
         assert cli.main(["info", str(archive)]) == 0
         lines = [line for line in capsys.readouterr().out.splitlines() if "Pendulum.fmu" in line]
         assert [("process of its own" in line) for line in lines] == [True, False]

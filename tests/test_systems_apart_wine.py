@@ -6,6 +6,7 @@ import building
 import fmu_tools
 import numpy as np
 import pytest
+import ssp_tools
 import wine_tools
 from apart_tools import (  # noqa: F401  # some are fixtures
     MASSES,
@@ -90,7 +91,7 @@ class TestInWine:
 
     def test_info_says_so(self, tmp_path, capsys):
         windows = wine_tools.for_windows(bundled_fmu("Pendulum"), tmp_path)
-        archive = chain(windows).write(tmp_path / "chain.ssp")
+        archive = ssp_tools.write(chain(windows), tmp_path / "chain.ssp")
         assert cli.main(["info", str(archive)]) == 0
         assert "in Wine" in capsys.readouterr().out
 

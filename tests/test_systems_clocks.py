@@ -3,6 +3,7 @@
 import clocks_tools
 import numpy as np
 import pytest
+import ssp_tools
 from system_tools import (
     LOG,
     closing_pools,  # noqa: F401  # the fixture "make"
@@ -166,7 +167,7 @@ class TestRefusals:
 
 
 def test_new_lists_them(fmus, tmp_path):
-    file = FMUSystem({"c": fmus["CoSimulation"]}).write(tmp_path / "s.ssp")
+    file = ssp_tools.write(FMUSystem({"c": fmus["CoSimulation"]}), tmp_path / "s.ssp")
     assert cli.main(["new", str(file), "--output", str(tmp_path / "task.toml")]) == 0
     text = (tmp_path / "task.toml").read_text()
     assert '"c.strike"' in text

@@ -7,6 +7,7 @@ from contextlib import closing
 import gymnasium
 import numpy as np
 import pytest
+import ssp_tools
 
 import fmugym
 from fmugym import Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
@@ -102,7 +103,7 @@ def played(env, steps=12, seed=3):
 
 @pytest.fixture(scope="module")
 def archive(tmp_path_factory):
-    return two_houses().write(tmp_path_factory.mktemp("ssp") / "houses.ssp")
+    return ssp_tools.write(two_houses(), tmp_path_factory.mktemp("ssp") / "houses.ssp")
 
 
 @pytest.fixture
@@ -353,7 +354,7 @@ class TestCommandLine:
 
     def test_info_describes_what_cannot_run(self, tmp_path, capsys):
         given = FMUSystem({"cart": bundled_fmu("CartPole", "1.0")}, error_tolerance=1e-3)
-        path = given.write(tmp_path / "cart.ssp")
+        path = ssp_tools.write(given, tmp_path / "cart.ssp")
         assert main(["info", str(path)]) == 0
         text = capsys.readouterr().out
         assert "does NOT run here: error_tolerance" in text

@@ -10,6 +10,7 @@ import os
 import numpy as np
 import pytest
 import quirk_table
+import ssp_tools
 from exchange_tools import exchange_fmu
 
 from fmugym import Component, FMUSystem
@@ -276,7 +277,7 @@ class TestTrial:
 
     def test_info_tells_it(self, fmu_of, tmp_path, capsys):
         system = chain(fmu_of, "well behaved", "reset does nothing")
-        archive = system.write(tmp_path / "chain.ssp")
+        archive = ssp_tools.write(system, tmp_path / "chain.ssp")
         system = FMUSystem.read(archive)
         verdict_of(system)
         assert cli.main(["info", str(archive)]) == 0

@@ -1,4 +1,4 @@
-"""SSP archives: what is read of them, compared with FMPy's reader, and what is written."""
+"""SSP archives: what is read of them, compared with FMPy's reader."""
 
 import copy
 import logging
@@ -16,12 +16,23 @@ import system_tools
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
 from fmu_tools import PlainEnv
 from lxml import etree
+from ssp_tools import (
+    HEAD,
+    TAIL,
+    bindings,
+    component,
+    connection,
+    linear,
+    mapping,
+    parameter_set,
+    real,
+    system,
+    values,
+)
 
 import fmugym
 from fmugym import (
-    Component,
     ConfigError,
-    Connection,
     FMUGymError,
     FMULoadError,
     FMUSystem,
@@ -34,95 +45,6 @@ from fmugym.systems.order import order_of
 from fmugym.systems.plan import Link, Loop
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
-
-HEAD = (
-    '<?xml version="1.0" encoding="UTF-8"?>\n<ssd:SystemStructureDescription version="1.0" '
-    'name="test" xmlns:ssd="http://ssp-standard.org/SSP1/SystemStructureDescription" '
-    'xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" '
-    'xmlns:ssv="http://ssp-standard.org/SSP1/SystemStructureParameterValues" '
-    'xmlns:ssm="http://ssp-standard.org/SSP1/SystemStructureParameterMapping">\n'
-)
-TAIL = "</ssd:SystemStructureDescription>"
-
-
-def connectors(**kinds):
-    """Connectors by name: the kind, and after a blank the unit."""
-    parts = []
-    for name, text in kinds.items():
-        kind, _, unit = text.partition(" ")
-        unit = f' unit="{unit}"' if unit else ""
-        own = f'<ssd:Connector name="{name}" kind="{kind}"><ssc:Real{unit}/></ssd:Connector>'
-        parts.append(own)
-    return f"<ssd:Connectors>{''.join(parts)}</ssd:Connectors>"
-
-
-def values(parameters, more="", **attributes):
-    """A binding with values in place, by name: a number, and after a blank its unit."""
-    own = "".join(f' {name}="{value}"' for name, value in attributes.items())
-    return (
-        f"<ssd:ParameterBinding{own}><ssd:ParameterValues>{parameter_set(parameters)}"
-        f"</ssd:ParameterValues>{more}</ssd:ParameterBinding>"
-    )
-
-
-def parameter_set(parameters):
-    own = "".join(
-        f'<ssv:Parameter name="{name}">{value}</ssv:Parameter>'
-        for name, value in parameters.items()
-    )
-    return (
-        '<ssv:ParameterSet version="1.0" name="set" '
-        'xmlns:ssv="http://ssp-standard.org/SSP1/SystemStructureParameterValues">'
-        f"<ssv:Parameters>{own}</ssv:Parameters></ssv:ParameterSet>"
-    )
-
-
-def mapping(entries):
-    return (
-        '<ssm:ParameterMapping version="1.0" '
-        'xmlns:ssc="http://ssp-standard.org/SSP1/SystemStructureCommon" '
-        'xmlns:ssm="http://ssp-standard.org/SSP1/SystemStructureParameterMapping">'
-        f"{entries}</ssm:ParameterMapping>"
-    )
-
-
-def bindings(*texts):
-    return f"<ssd:ParameterBindings>{''.join(texts)}</ssd:ParameterBindings>"
-
-
-def real(value, unit=""):
-    unit = f' unit="{unit}"' if unit else ""
-    return f'<ssv:Real value="{value}"{unit}/>'
-
-
-def component(name, ports, source="resources/House.fmu", more="", **attributes):
-    own = "".join(f' {key}="{value}"' for key, value in attributes.items())
-    return (
-        f'<ssd:Component name="{name}" source="{source}"{own}>{connectors(**ports)}{more}'
-        "</ssd:Component>"
-    )
-
-
-def connection(start, end, inner="", **attributes):
-    ends = []
-    for kind, text in (("start", start), ("end", end)):
-        element, _, connector = text.rpartition(".")
-        ends.append(f' {kind}Element="{element}"' if element else "")
-        ends.append(f' {kind}Connector="{connector}"')
-    own = "".join(f' {key}="{value}"' for key, value in attributes.items())
-    return f"<ssd:Connection{''.join(ends)}{own}>{inner}</ssd:Connection>"
-
-
-def system(name, ports, elements, connections=(), more=""):
-    wires = f"<ssd:Connections>{''.join(connections)}</ssd:Connections>" if connections else ""
-    return (
-        f'<ssd:System name="{name}">{connectors(**ports) if ports else ""}{more}'
-        f"<ssd:Elements>{''.join(elements)}</ssd:Elements>{wires}</ssd:System>"
-    )
-
-
-def linear(factor, offset=0.0):
-    return f'<ssc:LinearTransformation factor="{factor}" offset="{offset}"/>'
 
 
 @pytest.fixture
@@ -568,7 +490,7 @@ class TestDamaged:
     )
 
     @pytest.mark.parametrize("seed", range(6))
-    def test_by_chance(self, pack, seed, tmp_path):
+    def test_by_chance(self, pack, seed):
         draw = random.Random(seed)
         texts = [NESTED, LINKED, self.with_parameters()]
         read = 0
@@ -579,12 +501,10 @@ class TestDamaged:
             )
             path = pack(text.decode().partition(">")[2].rpartition("<")[0] or root)
             try:
-                system = FMUSystem.read(path)
-                again = FMUSystem.read(system.write(tmp_path / "again.ssp"))
+                FMUSystem.read(path)
             except FMUGymError:
                 continue
             read += 1
-            assert (again.links, again.connectors) == (system.links, system.connectors)
         assert read
 
     def with_parameters(self):
@@ -611,77 +531,6 @@ class TestDamaged:
             elif other not in list(one.iter()):
                 other.append(copy.deepcopy(one))
         return root
-
-
-class TestWriting:
-    def make(self):
-        return FMUSystem(
-            {
-                "house": Component(HOUSE, {"T_m_0": 290.0, "solver": "rk4"}, steps=2),
-                "other": Component(HOUSE, interface="co_simulation", feedthrough=False),
-                "rod": PENDULUM,
-            },
-            [
-                "u -> house.u",
-                "T -> house.T_out",
-                "T -> other.T_out",
-                "house.T_air -> T_room",
-                Connection("house.T_air", "rod.tau", 0.1, -1.0, convert_units=False),
-                Connection("house.Q_em", "other.Q_int", 2.0),
-                "A -> house.A_f",
-            ],
-            units={"T": "degC", "T_room": "degC"},
-            name="demo",
-            description="Two houses & a rod",
-            master="jacobi",
-            loops="fixed_point",
-            loop_tolerance=1e-7,
-            step_size=0.1,
-            stop_time=5.5,
-            tolerance=1e-5,
-        )
-
-    def test_what_is_read_again_is_the_same(self, tmp_path):
-        system = self.make()
-        found = FMUSystem.read(system.write(tmp_path / "demo.ssp"))
-        for name in ("links", "connectors", "times", "units", "loop", "loops", "master", "order"):
-            assert getattr(found, name) == getattr(system, name), name
-        assert (found.name, found.description) == (system.name, system.description)
-        assert found.findings == system.findings
-        for theirs, ours in zip(found.plan.components, system.plan.components, strict=True):
-            assert (theirs.name, theirs.steps, theirs.starts) == (
-                ours.name,
-                ours.steps,
-                ours.starts,
-            )
-            assert theirs.path.read_bytes() == ours.path.read_bytes()
-        again = found.write(tmp_path / "again.ssp")
-        assert again.read_bytes() == (tmp_path / "demo.ssp").read_bytes()
-
-    def test_the_schemas_of_the_standard_accept_it(self, tmp_path):
-        """FMPy validates against the schemas of SSP 1.0 when it reads."""
-        theirs = read_ssd(str(self.make().write(tmp_path / "demo.ssp")))
-        assert [one.name for one in theirs.system.elements] == ["house", "other", "rod"]
-        ends = {
-            (one.startElement, one.startConnector, one.endElement, one.endConnector)
-            for one in theirs.system.connections
-        }
-        assert ("house", "Q_em", "other", "Q_int") in ends
-        assert (None, "T", "other", "T_out") in ends
-        units = {one.name: (one.K, one.factor, one.offset) for one in theirs.units}
-        assert units["degC"] == (1, 1.0, 273.15)
-        (binding,) = theirs.system.elements[0].parameterBindings
-        assert [one.value for one in binding.parameterValues[0].parameters] == ["290.0", "2"]
-
-    def test_a_nested_system_is_written_flat(self, pack, tmp_path):
-        system = FMUSystem.read(pack(NESTED))
-        found = FMUSystem.read(system.write(tmp_path / "flat.ssp"))
-        assert links_of(found) == links_of(system)
-        assert list(found.components) == list(system.components)
-
-    def test_a_folder_that_does_not_exist(self, tmp_path):
-        with pytest.raises(FMULoadError, match="none"):
-            self.make().write(tmp_path / "none" / "demo.ssp")
 
 
 class TestNestedConnectors:
@@ -738,15 +587,6 @@ class TestNestedConnectors:
             ("third", "pair.east"),
             ("third", "pair.west"),
             ("pair.west", "third"),
-        }
-
-    def test_they_are_written_and_read_back(self, pack, tmp_path):
-        given = FMUSystem.read(self.archive(pack))
-        again = FMUSystem.read(given.write(tmp_path / "again.ssp"))
-        assert again.connectors == given.connectors
-        assert {one.name: len(one.ends) for one in given.connectors} == {
-            "pair.warmth": 2,
-            "pair.out": 1,
         }
 
     def test_a_parameter_fans_out_too(self, pack):

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import ssp_tools
 import values_tools
 from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
@@ -118,7 +119,7 @@ def test_a_text_and_a_number_have_no_common_source(fmus):
 def test_archives_have_them(make, fmus, tmp_path):
     """In parameter sets of components, and as a connector of the system."""
     system = labelled(fmus, a="four", b="b", c="<&>")
-    file = system.write(tmp_path / "s.ssp")
+    file = ssp_tools.write(system, tmp_path / "s.ssp")
     again = FMUSystem.read(file)
     assert again.connectors == system.connectors
     assert play(make(again, (), LENGTHS), 0).tolist() == [[4, 1, 3]]

@@ -54,10 +54,8 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     _read_unsigned_limits(source, root)
     elements = {element.get("name"): element for element in root.find("ModelVariables")}
     capabilities = _capabilities(source, root, interface, offer)
-    updates = capabilities.provides_intermediate_update
     variables = {
-        v.name: _convert_variable(v, elements.get(v.name, {}), updates)
-        for v in source.modelVariables
+        v.name: _convert_variable(v, elements.get(v.name, {})) for v in source.modelVariables
     }
     return ModelDescription(
         fmi_version=source.fmiVersion,
@@ -233,10 +231,6 @@ def _capabilities(source: Any, root: Any, interface: str, offer: Any) -> Capabil
         offer.canBeInstantiatedOnlyOncePerProcess,
         offer.needsExecutionTool,
         _provides(root, _ELEMENTS[interface], "Adjoint"),
-        interface == "co_simulation"
-        and source.fmiVersion.startswith("2")
-        and offer.canInterpolateInputs,
-        _offers(root, interface, "providesIntermediateUpdate"),
     )
 
 
@@ -260,7 +254,6 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
         or flag("canHandleVariableCommunicationStepSize"),
         can_be_instantiated_only_once_per_process=flag("canBeInstantiatedOnlyOncePerProcess"),
         needs_execution_tool=root.find("Implementation/CoSimulation_Tool") is not None,
-        can_interpolate_inputs=interface == "co_simulation" and flag("canInterpolateInputs"),
     )
 
 
@@ -273,7 +266,7 @@ def _read_unsigned_limits(source: Any, root: Any) -> None:
             variable.min, variable.max = element.get("min"), element.get("max")
 
 
-def _convert_variable(source: Any, element: Any, updates: bool) -> Variable:
+def _convert_variable(source: Any, element: Any) -> Variable:
     _check_reference(source)
     ticking = _ticking(source, element)
     return Variable(
@@ -299,7 +292,6 @@ def _convert_variable(source: Any, element: Any, updates: bool) -> Variable:
         interval=_clock_time(source, element, "interval") if ticking else UNKNOWN,
         shift=_shift(source, element, ticking),
         by_fractions=element.get("supportsFraction") in {"true", "1"},
-        updated=updates and not ticking and element.get("intermediateUpdate") in {"true", "1"},
     )
 
 

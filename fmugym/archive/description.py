@@ -68,8 +68,6 @@ class Capabilities:
     can_be_instantiated_only_once_per_process: bool = False
     needs_execution_tool: bool = False
     provides_adjoint_derivatives: bool = False
-    can_interpolate_inputs: bool = False
-    provides_intermediate_update: bool = False
 
     @property
     def provides_derivatives(self) -> bool:
@@ -223,25 +221,6 @@ class ModelDescription:
         known = {clock.value_reference for clock in self.clocks}
         inputs = (v for v in self.variables.values() if v.causality == "input" and v.clocks)
         return tuple(v for v in inputs if known.issuperset(v.clocks))
-
-    def unable_to_interpolate(self, variable: Variable) -> str | None:
-        """Say why an input cannot change linearly within a step; None if it can."""
-        name = f"{self.model_name} (FMI {self.fmi_version})"
-        if self.model_exchange is not None:
-            return f"{name} cannot interpolate inputs in model exchange"
-        if self.fmi_major_version < 3:
-            able = self.capabilities.can_interpolate_inputs
-            return None if able else f"{name} cannot interpolate inputs (canInterpolateInputs)"
-        if self.uses_event_mode:
-            return f"{name} cannot interpolate inputs in event mode, which it needs"
-        if not variable.updated:
-            able = self.capabilities.provides_intermediate_update
-            missing = "intermediateUpdate of the variable" if able else "providesIntermediateUpdate"
-            return (
-                f"{name} cannot interpolate inputs: it takes no values of {variable.name!r} within "
-                f"a step ({missing})"
-            )
-        return None
 
     def what_drives(self, variable: Variable) -> str | None:
         """In a system: the output or the name of the system that sets a variable; or None."""

@@ -105,7 +105,6 @@ class Variable:
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
         interval, shift: Of a clock: the time between its ticks and that before the first one.
         by_fractions: Of a clock: whether the FMU takes and tells these times as fractions.
-        updated: Whether the FMU takes or tells it in intermediate updates (FMI 3.0).
     """
 
     name: str
@@ -131,7 +130,6 @@ class Variable:
     interval: Interval = UNKNOWN
     shift: Interval = UNKNOWN
     by_fractions: bool = False
-    updated: bool = False
 
     @property
     def kind(self) -> str:

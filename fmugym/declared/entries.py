@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from fmugym.checks import check_flag, check_mapping, check_text
 from fmugym.errors import ConfigError, TaskError, shown, unknown_name
+from fmugym.retired import without_retired
 
 __all__ = ["Entry", "Source"]
 
@@ -157,7 +158,7 @@ class Entry:
         Raises:
             ConfigError: If this is no table, or for an unknown key, with the nearest known one.
         """
-        known, items = list(known), self.items()
+        known, items = list(known), without_retired(self.items())
         for key, entry in items.items():
             if key not in known:
                 raise entry.error(unknown_name("key", key, known))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
 from fmugym.pool.progress import INITIALIZATION, STEP, announce, hears_calls, progress
-from fmugym.pool.seats import Claim
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["Attendant", "AttendedPool"]
@@ -27,23 +25,25 @@ Reset = Callable[[tuple[Variable, ...], FloatArray, MaskArray | None], Any]
 """A pool's own function for resets, without an attendant."""
 
 
-@dataclass(frozen=True)
-class InitialState:
-    """A serialized FMU state just after initialization and warm-up.
+class Attendant:
+    """Waits for licences, and tells what takes long.
 
-    Attributes:
-        outputs: The outputs then, float64, shape (k,), as bytes.
-        data: The FMU's own bytes.
+    Args:
+        name: The FMU, for messages.
+        spec: Says how long to wait for a licence.
+        log: Is told what this waits for.
     """
 
-    outputs: bytes
-    data: bytes
+    def __init__(self, name: str, spec: PoolSpec, log: logging.Logger) -> None:
+        self._name, self._log = name, log
+        self._patience = Patience(spec.licence_wait, log)
 
+    @classmethod
+    def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> Attendant | None:
+        """Make the attendant that a pool needs; None if it needs none."""
+        needed = spec.licence_wait or log.isEnabledFor(logging.INFO) or hears_calls()
+        return cls(name, spec, log) if needed else None
 
-class Attending(ABC):
-    """Goes with the resets of a pool."""
-
-    @abstractmethod
     def reset(
         self,
         pool: AttendedPool,
@@ -52,7 +52,7 @@ class Attending(ABC):
         values: FloatArray,
         mask: MaskArray | None,
     ) -> None:
-        """Reset instances, and do whatever else belongs to it.
+        """Reset instances; those that get no licence are reset again.
 
         Args:
             pool: The pool.
@@ -61,51 +61,13 @@ class Attending(ABC):
             values: As for ``Pool.reset``.
             mask: As for ``Pool.reset``.
         """
-
-
-class Attendant(Attending):
-    """Waits for licences, and tells what takes long.
-
-    Args:
-        name: The FMU, for messages.
-        spec: Says how long to wait for a licence.
-        log: Is told what this waits for.
-        inner: Goes with the resets, too.
-    """
-
-    def __init__(
-        self, name: str, spec: PoolSpec, log: logging.Logger, inner: Attending | None = None
-    ) -> None:
-        self._name, self._log, self._inner = name, log, inner
-        self._patience = Patience(spec.licence_wait, log)
-
-    @classmethod
-    def of(
-        cls, name: str, spec: PoolSpec, log: logging.Logger, inner: Attending | None = None
-    ) -> Attending | None:
-        """Make the attendant that a pool needs besides another one; None if it needs none."""
-        needed = spec.licence_wait or log.isEnabledFor(logging.INFO) or hears_calls()
-        return cls(name, spec, log, inner) if needed else inner
-
-    def reset(
-        self,
-        pool: AttendedPool,
-        reset: Reset,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None,
-    ) -> None:
-        """See ``Attending.reset``; instances that get no licence are reset again."""
         chosen = np.ones(pool.num_instances, np.bool_) if mask is None else np.asarray(mask)
         what = f"{self._name}: the initialization of {np.count_nonzero(chosen)} instance(s)"
 
         def attempt() -> None:
             nonlocal chosen
             with progress(self._log, what):
-                if self._inner is None:
-                    reset(variables, values, chosen)
-                else:
-                    self._inner.reset(pool, reset, variables, values, chosen)
+                reset(variables, values, chosen)
             refused = _refusals(pool, chosen)
             if refused:
                 chosen = np.isin(np.arange(pool.num_instances), list(refused))
@@ -127,24 +89,24 @@ def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
 class AttendedPool(CountedPool):
     """A pool whose resets somebody may go with."""
 
-    _attendant: Attending | None = None
+    _attendant: Attendant | None = None
 
     @property
     def is_attended(self) -> bool:
         """See ``Pool.is_attended``."""
         return self._attendant is not None
 
-    _claim: Claim | None = None
+    _release: Callable[[], None] | None = None
 
-    def hold(self, claim: Claim | None) -> None:
-        """Keep the seats of the instances until ``close``."""
-        self._claim = claim
+    def hold(self, release: Callable[[], None]) -> None:
+        """Keep the seats of the instances until ``close``, which releases them."""
+        self._release = release
 
     def _return_seats(self) -> None:
-        if self._claim is not None:
-            self._claim.release()
+        if self._release is not None:
+            self._release()
 
-    def attend(self, attendant: Attending | None) -> None:
+    def attend(self, attendant: Attendant | None) -> None:
         """Let somebody go with all calls of ``reset`` from now on."""
         self._attendant = attendant
 
@@ -164,28 +126,6 @@ class AttendedPool(CountedPool):
     ) -> Any:
         """Do what ``reset`` does, without an attendant."""
 
-    # Initial states that instances share; the defaults are for pools that cannot share them.
-
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """Whether a reset of an instance with these start values, shape (P,), restores a state."""
-        return False
-
-    def pack(self, index: int) -> InitialState | None:
-        """Serialize the state of an instance that has just been reset; None if it refuses."""
-        return None
-
-    def adopt(
-        self,
-        index: int,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        state: InitialState,
-    ) -> bool:
-        """Let an instance restore a state at its next reset with these start values.
-
-        If its outputs then differ from those of the state, it is initialized.
-
-        Returns:
-            Whether the FMU took the state.
-        """
         return False

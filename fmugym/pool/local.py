@@ -12,7 +12,6 @@ from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import PoolSpec
-from fmugym.pool.states import InitialStates
 
 __all__ = ["local_pool"]
 
@@ -63,7 +62,6 @@ def local_pool(
         counts=counts,
         mark=mark,
     )
-    states = InitialStates(spec) if spec.state_files else None
-    pool.attend(Attendant.of(fmu.path.name, spec, log, states) if attended else states)
+    pool.attend(Attendant.of(fmu.path.name, spec, log) if attended else None)
     announce(STEP)
     return pool

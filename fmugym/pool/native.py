@@ -27,7 +27,6 @@ from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.chain import chained_jacobian
-from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -44,7 +43,6 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import Column, HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
-from fmugym.pool.pacing import last_initialization
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
@@ -160,7 +158,6 @@ class NativePool(SavingPool):
         if private_libraries:
             paths = copy_libraries(fmu, folder, self.num_instances)
         place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
-        watched = tuple(spec.outputs[i] for i in spec.watched)
         try:
             return _native.Pool(
                 library=cast(
@@ -183,7 +180,6 @@ class NativePool(SavingPool):
                     | {
                         "inputs": self._access(spec.inputs),
                         "outputs": self._access(spec.outputs),
-                        "watched": self._access(watched) if watched else None,
                     },
                 ),
                 arrays={
@@ -192,7 +188,6 @@ class NativePool(SavingPool):
                     "statuses": self.statuses,
                     "observations": self.observations,
                     "health": self._counts,
-                    "last_initialization": last_initialization(spec),
                 },
                 count=self.num_instances,
                 threads=self.threads,
@@ -298,7 +293,7 @@ class NativePool(SavingPool):
         description, spec = self._fmu.description, self._spec
         if not isinstance(description, SystemDescription):
             return self._differentiate(0, description, unknowns, knowns)
-        layout = Layout(description, spec.inputs, spec.outputs, spec.ramped)
+        layout = Layout(description, spec.inputs, spec.outputs)
 
         def differentiate(part: int, of: Variables, by: Variables) -> FloatArray:
             found = self._differentiate(part, layout.parts[part].description, of, by)
@@ -329,23 +324,6 @@ class NativePool(SavingPool):
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""
         return self._open_pool().knows_start(index, self._access(variables), values.tobytes())
-
-    def pack(self, index: int) -> InitialState | None:
-        """See ``AttendedPool.pack``."""
-        data = self._open_pool().pack(index)
-        return None if data is None else InitialState(self.outputs[:, index].tobytes(), data)
-
-    def adopt(
-        self,
-        index: int,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        state: InitialState,
-    ) -> bool:
-        """See ``AttendedPool.adopt``."""
-        return self._open_pool().adopt(
-            index, self._access(variables), values.tobytes(), state.outputs, state.data
-        )
 
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""

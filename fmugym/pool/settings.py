@@ -154,7 +154,6 @@ def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
         "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
         "reloads": method == ResetMethod.LIBRARY,
         "one_initialization": spec.one_initialization,
-        "pace": spec.initialization_interval,
         "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
     }
 
@@ -164,7 +163,6 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
     return {
         "num_observed": spec.num_observed,
         "sampling": bytes(SAMPLINGS.index(name) for name in spec.samplings),
-        "watched_places": np.array(spec.watched, np.uint32).tobytes(),
     }
 
 
@@ -175,11 +173,9 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
     model = description.model_exchange
     clocks = clocks_of(description)
     if model is None:
-        if not (description.uses_event_mode or spec.ramped or spec.watched):
+        if not description.uses_event_mode:
             return None
-        ramps = np.array([v.value_reference for v in spec.ramped], np.uint32).tobytes()
-        by_fmu = b"by_fmu", 1.0, math.inf, 0, 0, False, None, None
-        return (*by_fmu, *clocks, ramps, spec.time_step)
+        return (b"by_fmu", 1.0, math.inf, 0, 0, False, None, None, *clocks)
     states, rates = None, None
     tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
     if description.capabilities.provides_directional_derivatives and model.state_references:
@@ -195,8 +191,6 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         states,
         rates,
         *clocks,
-        b"",
-        spec.time_step,
     )
 
 
@@ -204,13 +198,7 @@ def manner_of(description: ModelDescription, spec: PoolSpec) -> int:
     """The number of the way in which the FMU is run, one of ``enum Manner`` of ``native/fmi.h``."""
     if description.model_exchange is not None:
         return 1
-    if description.uses_event_mode:
-        return 2
-    if isinstance(description, SystemDescription):
-        return 0
-    if spec.watched or (spec.ramped and description.fmi_major_version == 3):
-        return 4
-    return 3 if spec.ramped else 0
+    return 2 if description.uses_event_mode else 0
 
 
 def clocks_of(description: ModelDescription) -> tuple[bytes, bytes]:

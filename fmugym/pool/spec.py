@@ -133,21 +133,14 @@ class PoolSpec:
         input_limits: Lowest and highest value of each input; empty for those of the FMU.
         one_initialization: Whether only one instance in a process may be made, initialized, reset
             or freed at a time. Steps run in parallel all the same.
-        initialization_interval: The least real time in seconds from one instantiation or
-            initialization to the next; see ``fmugym.pool.pacing``.
-        max_instances: How many instances may exist at once on this machine; None for no limit.
-        locks: The beginning of the paths of the files by which all environments of the FMU keep
-            to these two limits; "" for none.
-        keep_states: Whether initial states are kept for other instances and processes, if the trial
-            shows that they work there.
-        state_files: Where they are kept, see ``fmugym.pool.states``; "" for nowhere.
+        max_instances: How many instances of the FMU this process may have at once; None for no
+            limit.
         licence_wait: How long to wait for a refused licence, in seconds of real time.
         blind_start: Whether outputs have the start values of the model description until the first
             step, because the FMU cannot be read before.
         solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
-        ramped: The inputs that change linearly within each step, from the value of the last one.
         call_timeout: How long a call of a component with a process of its own may take, in seconds
             of real time; an initialization may take ten times as long.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
@@ -169,18 +162,13 @@ class PoolSpec:
     component_resets: tuple[ResetMethod, ...] = ()
     input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
-    initialization_interval: float = 0.0
     max_instances: int | None = None
-    locks: str = ""
     licence_wait: float = 0.0
-    keep_states: bool = False
-    state_files: str = ""
     blind_start: bool = False
     samplings: tuple[str, ...] = ()
     records: bool = False
     solver: str = SOLVERS[0]
     max_step: float | None = None
-    ramped: tuple[Variable, ...] = ()
     call_timeout: float = DEFAULT_CALL_TIMEOUT
 
     def communication_point(self, count: int, start_time: float | None = None) -> float:
@@ -227,13 +215,6 @@ class PoolSpec:
     def reloads(self) -> bool:
         """Whether anything is loaded anew, which must be a private copy then."""
         return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
-
-    @property
-    def watched(self) -> tuple[int, ...]:
-        """The places of outputs whose values within a step count, and which the FMU tells there."""
-        # there are no samplings if all are "last"
-        pairs = enumerate(zip(self.outputs, self.samplings, strict=False))
-        return tuple(i for i, (output, name) in pairs if output.updated and name != "last")
 
     @property
     def communication_step_size(self) -> float:

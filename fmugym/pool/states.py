@@ -1,9 +1,7 @@
-"""Initial states that instances and processes share, in memory and on disk.
+"""States of FMUs on disk, which episodes of later programs begin with.
 
-A model may need minutes to initialize. Where its FMU serializes its state, and a second process
-gives the same outputs with it, one initialization serves all instances with the same start values.
-The states are files in the cache folder: a digest, the outputs just after the initialization, and
-the FMU's own bytes. A file that is damaged, too large, or no regular file is no state.
+They are files in the cache folder: a digest, numbers that go with the state, and the FMU's own
+bytes. A file that is damaged, too large, or no regular file is no state.
 """
 
 from __future__ import annotations
@@ -13,21 +11,14 @@ import logging
 import os
 import stat
 import tempfile
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
-from fmugym.archive.variable import Variable
-from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.attendant import AttendedPool, Attending, InitialState, Reset
-from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.spec import PoolSpec
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["MOST_BYTES", "InitialStates", "StateFiles", "essence"]
+__all__ = ["MOST_BYTES", "KeptState", "StateFiles", "essence"]
 
 logger = logging.getLogger(__name__)
 
@@ -44,12 +35,25 @@ _READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBL
 """Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
 
 
+@dataclass(frozen=True)
+class KeptState:
+    """A serialized FMU state.
+
+    Attributes:
+        numbers: What goes with it, float64, as bytes.
+        data: The FMU's own bytes.
+    """
+
+    numbers: bytes
+    data: bytes
+
+
 class StateFiles:
     """States on disk.
 
     Args:
         prefix: The folder, and the beginning of the files' names, which stands for the FMU.
-        width: How many outputs a state has.
+        width: How many numbers go with a state.
     """
 
     def __init__(self, prefix: str, width: int) -> None:
@@ -59,7 +63,7 @@ class StateFiles:
         """The file of a state."""
         return self._prefix.with_name(f"{self._prefix.name}-{key}")
 
-    def find(self, key: str) -> InitialState | None:
+    def find(self, key: str) -> KeptState | None:
         """Read a state; None if there is none, or only a damaged one."""
         path = self.path(key)
         try:
@@ -74,7 +78,7 @@ class StateFiles:
             return None
         return state
 
-    def _parse(self, content: bytes) -> InitialState | None:
+    def _parse(self, content: bytes) -> KeptState | None:
         start = len(_MAGIC) + _DIGEST
         digest, body = content[len(_MAGIC) : start], content[start:]
         size = 8 * self._width
@@ -82,11 +86,11 @@ class StateFiles:
             return None
         if hashlib.sha256(body).digest() != digest:
             return None
-        return InitialState(body[:size], body[size:])
+        return KeptState(body[:size], body[size:])
 
-    def keep(self, key: str, state: InitialState) -> None:
+    def keep(self, key: str, state: KeptState) -> None:
         """Write a state; if that is not possible, nothing is kept, and no error is raised."""
-        body = state.outputs + state.data
+        body = state.numbers + state.data
         if len(body) > _LARGEST // 2:
             return
         try:
@@ -94,7 +98,7 @@ class StateFiles:
             _write(self.path(key), _MAGIC + hashlib.sha256(body).digest() + body)
             _remove_old(self._prefix.parent)
         except ordinary(OSError) as error:
-            logger.debug("no initial state is kept: %s", error)
+            logger.debug("no state is kept: %s", error)
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -125,74 +129,8 @@ def _remove_old(folder: Path) -> None:
                 path.unlink()
 
 
-class InitialStates(Attending):
-    """Goes with the resets of a pool: instances restore states that others have made.
-
-    Args:
-        spec: What the pool does; ``spec.state_files`` says where the states are.
-    """
-
-    def __init__(self, spec: PoolSpec) -> None:
-        self._files = StateFiles(spec.state_files, len(spec.outputs))
-        self._scope = repr(essence(spec)).encode()
-        self._work = True
-
-    def reset(
-        self,
-        pool: AttendedPool,
-        reset: Reset,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None,
-    ) -> None:
-        """See ``Attending.reset``; instances with the same start values are initialized once."""
-        chosen = np.ones(pool.num_instances, np.bool_) if mask is None else np.array(mask, bool)
-        columns: dict[bytes, list[int]] = {}
-        for index in np.flatnonzero(chosen).tolist():
-            columns.setdefault(values[:, index].tobytes(), []).append(index)
-        for column, indices in columns.items():
-            unknown = [i for i in indices if not pool.knows_start(i, variables, values[:, i])]
-            if unknown and self._work:
-                done = self._share(pool, reset, variables, values, column, unknown)
-                chosen[done] = False
-        if chosen.any():
-            reset(variables, values, chosen)
-
-    def _share(
-        self,
-        pool: AttendedPool,
-        reset: Reset,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        column: bytes,
-        indices: Sequence[int],
-    ) -> list[int]:
-        """Give a state to instances with the same start values; return which are reset already."""
-        key = self._key(variables, column)
-        state, done = self._files.find(key), list[int]()
-        if state is None:
-            first = indices[0]
-            reset(variables, values, np.arange(pool.num_instances) == first)
-            if pool.statuses[first] > WARNING_CODE:
-                return [first]
-            state = pool.pack(first)
-            if state is None:
-                self._work = False  # whatever the trial showed
-                return []  # the refusal may have harmed the instance: it is reset again
-            self._files.keep(key, state)
-            done = [first]
-        for index in indices:
-            pool.adopt(index, variables, values[:, index], state)
-        return done
-
-    def _key(self, variables: tuple[Variable, ...], column: bytes) -> str:
-        names = repr([(v.name, v.value_reference) for v in variables]).encode()
-        parts = (self._scope, names, column)
-        return hashlib.sha256(b"".join(hashlib.sha256(p).digest() for p in parts)).hexdigest()[:32]
-
-
 def essence(spec: PoolSpec) -> PoolSpec:
-    """The part of a spec on which initial states depend."""
+    """The part of a spec on which states depend."""
     return replace(
         spec,
         num_observed=0,
@@ -200,11 +138,7 @@ def essence(spec: PoolSpec) -> PoolSpec:
         leak_limit=None,
         input_limits=(),
         one_initialization=False,
-        initialization_interval=0.0,
         max_instances=None,
-        locks="",
         licence_wait=0.0,
-        keep_states=False,
-        state_files="",
         records=False,
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -45,11 +44,11 @@ def system_settings(
     description = fmu.description
     if not isinstance(description, SystemDescription):
         return None
-    layout = Layout(description, spec.inputs, spec.outputs, spec.ramped)
+    layout = Layout(description, spec.inputs, spec.outputs)
     rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
         tuple(
-            _part(part, one, replace(spec, ramped=tuple(part.ramped)), rung, folder / str(i), hosts)
+            _part(part, one, spec, rung, folder / str(i), hosts)
             for i, (part, one, rung) in enumerate(zip(layout.parts, fmu.parts, rungs, strict=True))
         ),
         _routes(layout),

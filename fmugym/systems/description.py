@@ -80,14 +80,6 @@ class SystemDescription(ModelDescription):
         """See ``ModelDescription.components``."""
         return self.parts
 
-    def unable_to_interpolate(self, variable: Variable) -> str | None:
-        """See ``ModelDescription.unable_to_interpolate``; the first component that cannot."""
-        for end in self.ends[variable.value_reference]:
-            unable = self.parts[end.part].unable_to_interpolate(end.variable)
-            if unable is not None:
-                return f"component {self.plan.components[end.part].name!r}, {unable}"
-        return None
-
     def what_drives(self, variable: Variable) -> str | None:
         """See ``ModelDescription.what_drives``."""
         sources = {
@@ -249,8 +241,6 @@ def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabi
         Capabilities(**able),
         provides_directional_derivatives=False,
         provides_adjoint_derivatives=False,
-        can_interpolate_inputs=False,
-        provides_intermediate_update=False,
     )
 
 
@@ -367,7 +357,7 @@ def _joined(array: Variable, texts: Iterable[str | None]) -> str:
 
 def _renamed(own: Variable, name: str, reference: int, driven: Container[str]) -> Variable:
     """What something else drives cannot be set from outside."""
-    variable = replace(own, name=name, value_reference=reference, updated=False)
+    variable = replace(own, name=name, value_reference=reference)
     places = [place for place, one in enumerate(own.elements) if one.name in driven]
     if own.shape:
         variable = replace(variable, driven=frozenset(places))
@@ -403,7 +393,6 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         own,
         name=connector.name,
         value_reference=reference,
-        updated=False,
         array=None,
         place=0,
         driven=frozenset() if own.shape else None,

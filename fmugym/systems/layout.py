@@ -28,8 +28,6 @@ class PartLayout:
         description: Of its FMU.
         inputs, outputs: Its scalars and elements of arrays, one for each slot. Arrays are there as
             a whole, because FMI sets them as a whole.
-        ramped: The inputs that change linearly within a step. They have no slots: each value is set
-            once, when the step of the environment begins.
         first_input, first_output: The numbers of its first slots.
     """
 
@@ -37,7 +35,6 @@ class PartLayout:
     description: ModelDescription
     inputs: list[Variable] = field(default_factory=list)
     outputs: list[Variable] = field(default_factory=list)
-    ramped: list[Variable] = field(default_factory=list)
     first_input: int = 0
     first_output: int = 0
 
@@ -114,7 +111,6 @@ class Layout:
         description: Of the system.
         inputs: The system's variables that each step sets.
         outputs: The system's variables that are read after each step.
-        ramped: Those of the inputs that change linearly within a step.
 
     Attributes:
         description, plan: Of the system.
@@ -134,7 +130,6 @@ class Layout:
         description: SystemDescription,
         inputs: Iterable[Variable] = (),
         outputs: Iterable[Variable] = (),
-        ramped: Iterable[Variable] = (),
     ) -> None:
         self.description, self.plan = description, description.plan
         pairs = zip(self.plan.components, description.parts, strict=True)
@@ -142,10 +137,7 @@ class Layout:
         self._numbers = {part.component.name: i for i, part in enumerate(self.parts)}
         self._input_slots: dict[tuple[int, *_Key], int] = {}
         self._output_slots: dict[tuple[int, *_Key], int] = {}
-        linear = set(ramped)
-        for end in (end for variable in linear for end in self.ends_of(variable)):
-            self.parts[end.part].ramped.append(end.variable)
-        self._fill([variable for variable in inputs if variable not in linear], outputs)
+        self._fill(inputs, outputs)
         self.routes = self._find_routes()
 
     def _fill(self, inputs: Iterable[Variable], outputs: Iterable[Variable]) -> None:

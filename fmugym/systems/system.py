@@ -1,4 +1,4 @@
-"""Systems as users make, read and write them."""
+"""Systems as users make and read them."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Any, Self
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.checks import check_path
 from fmugym.errors import FMUGymError
 from fmugym.systems.components import Component
 from fmugym.systems.drawing import draw
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.ssp.reading import arguments_of
-from fmugym.systems.ssp.writing import write_ssp
 from fmugym.systems.wired import WiredSystem
 
 __all__ = ["FMUSystem"]
@@ -99,26 +97,6 @@ class FMUSystem(WiredSystem):
             return cls(**arguments)
         except FMUGymError as error:
             raise type(error)(f"{arguments['file'].name}: {error}") from None
-
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write the system with its FMUs as an SSP archive.
-
-        What SSP has no words for (the master, steps of components) stands in annotations that
-        fmugym reads again.
-
-        Args:
-            path: The ``.ssp`` file, which is replaced if it exists.
-
-        Returns:
-            The path.
-
-        Raises:
-            ConfigError: If the path is none.
-            FMULoadError: If the file cannot be written.
-        """
-        file = check_path("the path of a system", path)
-        write_ssp(self, file)
-        return file
 
     def as_fmu(self, probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT) -> SystemFMU:
         """Open the system as an ``FMU``, for functions that take one.

@@ -11,6 +11,7 @@ from typing import Any, Final, Never
 from fmugym.archive.description import Unit
 from fmugym.checks import check_count, check_mapping, check_number, check_option, check_text
 from fmugym.errors import ConfigError, shown, unknown_argument
+from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import Connection
 from fmugym.systems.order import Order, order_of
@@ -53,7 +54,7 @@ class WiredSystem:
         file: Path | None = None,
         **unknown: Never,
     ) -> None:
-        for argument in unknown:
+        for argument in without_retired(unknown):
             raise unknown_argument(type(self).__name__, argument, _ARGUMENTS)
         given = check_mapping("components", components)
         if not given:

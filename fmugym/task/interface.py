@@ -167,46 +167,12 @@ class Interface:
             fault_retries=config.fault_retries,
             leak_limit=config.leak_limit,
             input_limits=tuple(map(self._limits, self.inputs)),
-            initialization_interval=_interval(config.max_initializations_per_second),
             max_instances=config.max_instances,
             licence_wait=config.licence_wait,
-            keep_states=bool(config.keep_initial_states),
             samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),
-            ramped=self._ramped(),
         )
-
-    def _ramped(self) -> tuple[Variable, ...]:
-        """The inputs that change linearly within a step.
-
-        Raises:
-            ConfigError: If the FMU cannot interpolate inputs, or one of them is no continuous Real
-                or Float64.
-        """
-        names = dict.fromkeys(self.config.ramped_inputs, True)
-        kind = "input in 'input_interpolation'"
-        linear = _by_scalar(self.description, names, self.inputs, kind)
-        ramped = tuple(variable for variable in self.inputs if variable.name in linear)
-        for variable in ramped:
-            self._require_linear(variable)
-        return ramped
-
-    def _require_linear(self, variable: Variable) -> None:
-        """Refuse an input that cannot change linearly; see ``_ramped``."""
-        unable = self.description.unable_to_interpolate(variable)
-        if unable is not None:
-            raise ConfigError(
-                f"config key 'input_interpolation': {unable}; {variable.name!r} can only hold"
-            )
-        found = variable.variability, variable.causality, variable.is_scalar
-        if found != ("continuous", "input", True) or variable.type not in {"Real", "Float64"}:
-            element = "" if variable.is_scalar else ", an element of an array"
-            raise ConfigError(
-                f"config key 'input_interpolation': {variable.name!r} cannot be linear: it is "
-                f"a {variable.variability} {variable.causality} of type {variable.type}"
-                f"{element}; expected a continuous scalar input of type Real or Float64"
-            )
 
     def _max_step(self) -> float | None:
         """The config's, or else, for a solver of fixed steps, the FMU's default step size."""
@@ -364,7 +330,3 @@ def _check_inputs_are_whole(inputs: Sequence[Variable], started: Sequence[Variab
                 f"{variable.name!r} cannot be given a start value while other elements of "
                 f"{array.name!r} are inputs; let all of {array.name!r} be inputs"
             )
-
-
-def _interval(frequency: float | None) -> float:
-    return 0.0 if frequency is None else 1.0 / frequency

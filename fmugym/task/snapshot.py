@@ -38,7 +38,7 @@ _VERSION: Final = 3
 _OPERATION: Final = {
     *("on_fault", "fault_retries", "fault_reward", "leak_limit", "reset_method", "rehearsals"),
     *("archive_limits", "preload", "probe_timeout", "isolation", "call_timeout", "max_instances"),
-    *("max_initializations_per_second", "keep_initial_states", "licence_wait"),
+    "licence_wait",
 }
 """Config keys on which no state depends."""
 

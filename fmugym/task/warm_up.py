@@ -18,11 +18,10 @@ import numpy.typing as npt
 from fmugym.archive.variable import Variable
 from fmugym.fmi.status import Status
 from fmugym.pool import Pool
-from fmugym.pool.attendant import InitialState
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.patience import failed_reset
-from fmugym.pool.states import StateFiles, essence
+from fmugym.pool.states import KeptState, StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
@@ -335,7 +334,7 @@ class WarmUps:
         found = None if files is None else files.find(key.hex()[:32])
         if found is None:
             return None
-        numbers = np.frombuffer(found.outputs)
+        numbers = np.frombuffer(found.numbers)
         outputs, start, rest = np.split(numbers, [len(spec.outputs), len(spec.outputs) + 1])
         inputs, rest = np.split(rest, [count])
         parts = np.split(rest, np.cumsum(self._sizes)[:-1]) if self._sizes else []
@@ -353,7 +352,7 @@ class WarmUps:
             state = warmed.state
             values = [state.outputs, state.start_times, warmed.inputs, *warmed.variables.values()]
             numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
-            files.keep(key.hex()[:32], InitialState(numbers.tobytes(), warmed.state.data))
+            files.keep(key.hex()[:32], KeptState(numbers.tobytes(), warmed.state.data))
 
 
 def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:

@@ -95,7 +95,6 @@ def _trial(fmu: FMU) -> dict[str, Any] | None:
         "several_instances": None if verdict.neighbours is None else str(verdict.neighbours),
         "isolate": verdict.isolate,
         "cannot_be_read_before_a_step": verdict.blind_start,
-        "initial_state": None if verdict.states is None else str(verdict.states),
         "instances_at_once": verdict.instances,
         "initializations": verdict.initializations,
         "deaths": list(verdict.reasons),
@@ -248,8 +247,6 @@ def _first_meeting(trial: Mapping[str, Any] | None) -> str:
         parts.append("it cannot be read before its first step")
     if trial["isolate"]:
         parts.append("it harms its process and is isolated")
-    if trial["initial_state"]:
-        parts.append(f"an initial state in another process is {_GRADES[trial['initial_state']]}")
     count = trial["instances_at_once"]
     parts = parts or ["it survived"]
     parts.append(f"tried with {count} {'instance' if count == 1 else 'instances'} at once")

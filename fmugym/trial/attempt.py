@@ -53,8 +53,6 @@ class Stage(StrEnum):
     RESET = "the rehearsal of resets"
     INSTANCE = "the rehearsal of new instances"
     LIBRARY = "the rehearsal of libraries loaded anew"
-    STATE = "the serialization of an initial state"
-    RESUMED = "the rehearsal of an initial state from another process"
     HALFWAY = "the rehearsal of a state in the middle of an episode"
     SECOND = "the comparison with a second instance"
     COPIES = "the comparison with a second copy of the library"
@@ -81,8 +79,6 @@ class Request:
         alone: Whether it is known that instances must not share a copy of the library.
         known: The ``Verdict`` of an earlier trial if it lacks only what several instances need.
         skip: The stages in which an earlier worker died.
-        sample: The ``Sample`` of an initial state that another worker has made, if this one has to
-            try only that.
         resume: Whether to try a state in the middle of an episode; or a ``Halfway`` that another
             worker has made.
         check_memory: Whether the C library checks for memory errors (glibc only).
@@ -95,7 +91,6 @@ class Request:
     alone: bool = False
     skip: frozenset[str] = frozenset()
     known: Any = None
-    sample: Any = None
     resume: Any = None
     check_memory: bool = True
 

@@ -81,11 +81,8 @@ def verdict_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     """The scope of a verdict on resets and neighbours."""
     tried = replace(
         spec,
-        initialization_interval=0.0,
         max_instances=None,
-        locks="",
         licence_wait=0.0,
-        keep_states=False,
     )
     asked = _digest(repr((tried, starts, candidate.preload)).encode())
     return f"{content_key(candidate)}-{asked}"

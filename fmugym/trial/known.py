@@ -7,19 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.archive.fmu import FMU
-from fmugym.caching import cache_folder, lasting_folder
-from fmugym.errors import ConfigError
+from fmugym.caching import cache_folder
 from fmugym.pool.bundle import SaveMethod
 from fmugym.signals import ordinary
 from fmugym.trial.cache import recall, remember
-from fmugym.trial.candidate import Candidate, content_key, content_of, verdict_key
+from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.verdict import Verdict
 
 __all__ = [
     "is_known_to_harm",
     "known_resuming",
     "known_verdict",
-    "locks_of",
     "marks_of",
     "note_harm",
     "note_resuming",
@@ -35,7 +33,7 @@ def known_verdict(fmu: FMU) -> Verdict | None:
 
 
 def state_files(fmu: FMU) -> str:
-    """Where the initial states of an FMU are kept; see ``fmugym.pool.states``."""
+    """Where states of an FMU are kept; see ``fmugym.pool.states``."""
     try:
         return str(cache_folder("states") / content_key(Candidate.of(fmu)))
     except ordinary(OSError):  # there is no folder for caches
@@ -49,23 +47,6 @@ def marks_of(candidate: Candidate) -> tuple[Path, str]:
         OSError: If there is no folder for caches.
     """
     return cache_folder("marks"), content_key(candidate)
-
-
-def locks_of(candidate: Candidate) -> str:
-    """The place of the files by which environments of an FMU keep to the limits of a licence.
-
-    They are in the cache folder, or in the user's own one for temporary files.
-
-    Returns:
-        The beginning of their paths.
-
-    Raises:
-        ConfigError: If there is no folder for them.
-    """
-    try:
-        return str(lasting_folder("licences") / content_of(candidate))
-    except ordinary(OSError) as error:
-        raise ConfigError(f"the limits of a licence need a folder: {error}") from None
 
 
 def is_known_to_harm(candidate: Candidate) -> bool:

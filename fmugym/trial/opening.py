@@ -32,14 +32,12 @@ from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
-from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
 from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     is_known_to_harm,
     known_resuming,
-    locks_of,
     marks_of,
     note_harm,
     revise,
@@ -49,6 +47,7 @@ from fmugym.trial.plan import Plan, is_alone
 from fmugym.trial.rehearsal import Starts
 from fmugym.trial.repetition import Repetition
 from fmugym.trial.resuming import method_that_works
+from fmugym.trial.seats import take, taking
 from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
@@ -123,15 +122,13 @@ def make_pool(
         )
     plan = Plan(reset_method, threads, private_libraries, isolation, workers)
     plan = plan.checked(fmu)
-    spec, timeout = _with_locks(fmu, spec), math.inf
+    timeout = math.inf
     if call_timeout is not None:
         timeout = check_number("call_timeout", call_timeout, positive=True)
 
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
-        if spec.keep_states:
-            completed = completed.with_states(fmu, verdict, log)
 
         def note_crash(how: str) -> None:
             _note_crash(fmu, spec, starts, verdict, how, log)
@@ -149,12 +146,6 @@ def make_pool(
     return Patience(spec.licence_wait, log).call(attempt)
 
 
-def _with_locks(fmu: FMU, spec: PoolSpec) -> PoolSpec:
-    """Let all environments of the FMU keep to the limits of its licence together."""
-    is_limited = spec.max_instances is not None or spec.initialization_interval > 0.0
-    return replace(spec, locks=locks_of(Candidate.of(fmu))) if is_limited else spec
-
-
 @licence_errors()
 def _open(
     fmu: FMU,
@@ -170,17 +161,16 @@ def _open(
         reset_method=plan.method,
         component_resets=plan.component_resets,
         one_initialization=plan.one_initialization,
-        state_files=plan.state_files,
     )
-    seats = Seats.of(fmu.path.name, spec)
-    claim = None if seats is None else seats.take(num_instances, "an environment")
+    claim = take(Candidate.of(fmu), spec, num_instances, "an environment")
     try:
         pool = _open_now(fmu, spec, num_instances, log, plan, call_timeout, note_crash)
     except BaseException:
         if claim is not None:
             claim.release()
         raise
-    pool.hold(claim)
+    if claim is not None:
+        pool.hold(claim.release)
     return pool
 
 
@@ -370,7 +360,7 @@ def _mark(candidate: Candidate) -> Mark | None:
 def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:
     """Compare two instances in this process, in which the FMU will run without a trial anyway."""
     try:
-        with taking(Seats.of(candidate.path.name, spec), 2, "a trial"):
+        with taking(candidate, spec, 2, "a trial"):
             return disturb_in_turn(candidate, spec)
     except LicenceError:
         raise

@@ -13,7 +13,6 @@ from fmugym.pool.base import first_of
 from fmugym.pool.spec import ISOLATIONS, ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.trial.candidate import Candidate
-from fmugym.trial.known import state_files
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 from fmugym.wine.prefix import Wine
 
@@ -31,7 +30,6 @@ class Plan:
     workers: int | None = None
     component_resets: tuple[ResetMethod, ...] = ()
     one_initialization: bool = False
-    state_files: str = ""
     own_files: bool = False
 
     def checked(self, fmu: FMU) -> Plan:
@@ -76,15 +74,6 @@ class Plan:
             log.warning("%s harms its process%s. It runs in worker processes", fmu.path.name, why)
             plan = replace(plan, isolation="process")
         return plan._with_means_of_reset(num_instances)
-
-    def with_states(self, fmu: FMU, verdict: Verdict, log: logging.Logger) -> Plan:
-        """Keep initial states where they give the same results to the last bit; log if not."""
-        obstacle = _obstacle_to_states(fmu, verdict, self.method)
-        if obstacle:
-            log.warning("%s: no initial state is kept: %s", fmu.path.name, obstacle)
-            return self
-        log.info("%s: initial states are kept for other instances and on disk", fmu.path.name)
-        return replace(self, state_files=state_files(fmu))
 
     def _in_processes(self, fmu: FMU, num_instances: int, log: logging.Logger) -> Plan:
         """Give each instance a process, as the FMU demands, unless the caller insists."""
@@ -183,27 +172,6 @@ def _prepare_components(fmu: FMU) -> None:
 def is_alone(fmu: FMU) -> bool:
     """Whether the FMU says that a process may have only one instance."""
     return fmu.description.capabilities.can_be_instantiated_only_once_per_process
-
-
-def _obstacle_to_states(fmu: FMU, verdict: Verdict, method: ResetMethod) -> str:
-    """Why the initial states of an FMU must not be kept; "" if they may be."""
-    if not fmu.description.capabilities.can_serialize_fmu_state:
-        return "the FMU does not offer to serialize its state"
-    if verdict.states is None:
-        return "no trial has shown that they work in another process"
-    if method is not ResetMethod.RESTORE:
-        return f"episodes begin by the method {str(method)!r}, not by 'restore'"
-    if verdict.states is not Grade.BITWISE:
-        return f"in another process, the trial of a state {_GRADES[verdict.states]}"
-    return ""
-
-
-_GRADES: Final = {
-    Grade.TOLERANCE: "gives other results in the last digits",
-    Grade.WRONG: "gives other results",
-    Grade.FAILS: "fails",
-    Grade.ABSENT: "was not possible",
-}
 
 
 _warned: Final[set[tuple[Path, str]]] = set()

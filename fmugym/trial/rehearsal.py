@@ -19,7 +19,7 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.attendant import AttendedPool, InitialState
+from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -28,7 +28,7 @@ from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.verdict import Grade
 
-__all__ = ["Rehearsal", "Sample", "Starts", "difference", "tolerance_of"]
+__all__ = ["Rehearsal", "Starts", "difference", "tolerance_of"]
 
 _SHORT: Final = 3
 """The steps of a short episode."""
@@ -111,23 +111,6 @@ class _Run:
         return _Run(self.rows[: steps + 1], Status.OK)
 
 
-@dataclass(frozen=True)
-class Sample:
-    """An initial state, and what followed it in the process that made it.
-
-    Attributes:
-        starts: The start values of both episodes.
-        state: The state after an initialization with the first start values.
-        inputs: The inputs of the steps, shape (steps, inputs).
-        runs: The episodes of fresh instances with the first and with the second start values.
-    """
-
-    starts: Starts
-    state: InitialState
-    inputs: FloatArray
-    runs: tuple[_Run, ...]
-
-
 class Rehearsal:
     """Plays episodes of one FMU with different reset methods.
 
@@ -135,7 +118,6 @@ class Rehearsal:
         candidate: The FMU.
         spec: What to do at each reset and step.
         starts: The start values of two episodes.
-        sample: The reference, if another process has made it.
 
     Attributes:
         noisy: The names of the outputs that two fresh instances give differently, as far as known.
@@ -144,28 +126,16 @@ class Rehearsal:
         reason: The FMU's message if even a fresh instance cannot play an episode, otherwise "".
     """
 
-    def __init__(
-        self,
-        candidate: Candidate,
-        spec: PoolSpec,
-        starts: Starts,
-        sample: Sample | None = None,
-    ) -> None:
+    def __init__(self, candidate: Candidate, spec: PoolSpec, starts: Starts) -> None:
         self._candidate, self._starts = candidate, starts
         self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
         self.noisy: tuple[str, ...] = ()
         self.reason = ""
-        self.is_frugal = spec.initialization_interval > 0.0 or spec.licence_wait > 0.0
+        self.is_frugal = spec.licence_wait > 0.0
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
         self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance_of(spec)), False
-        self._sample = sample
-        if sample is None:
-            self._find_reference()
-        else:
-            self._starts = sample.starts
-            self._inputs, self._steps = sample.inputs, len(sample.inputs)
-            self._references = list(sample.runs)
+        self._find_reference()
 
     @property
     def possible(self) -> bool:
@@ -256,39 +226,6 @@ class Rehearsal:
         try:
             is_system = self._candidate.plan is not None
             return self._worst_grade(pool, restores=is_system and method is ResetMethod.RESTORE)
-        finally:
-            pool.close()
-
-    def sample(self) -> Sample | None:
-        """Make an initial state for another process; None if the FMU refuses."""
-        pool = self._open(ResetMethod.RESTORE)
-        try:
-            pool.reset(self._starts.variables, self._starts.column(0))
-            state = pool.pack(0)
-        finally:
-            pool.close()
-        if state is None:
-            return None
-        return Sample(self._starts, state, self._inputs[: self._steps], tuple(self._references))
-
-    def grade_sample(self) -> Grade:
-        """Grade the episodes of an instance that begins with the state of the sample.
-
-        No other method than ``BITWISE`` makes the state fit to be used.
-        """
-        assert self._sample is not None
-        variables, column = self._starts.variables, self._starts.column(0)
-        pool = self._open(ResetMethod.RESTORE)
-        try:
-            if not pool.adopt(0, variables, column[:, 0], self._sample.state):
-                return Grade.FAILS
-            if not pool.knows_start(0, variables, column[:, 0]):
-                return Grade.FAILS
-            first = self._compare(self._play(pool, 0, self._steps), self._references[0])
-            kept = pool.knows_start(0, variables, column[:, 0])  # or else it was initialized
-            if first is not Grade.BITWISE or not kept:
-                return first if kept else Grade.WRONG
-            return self._worst_grade(pool)
         finally:
             pool.close()
 

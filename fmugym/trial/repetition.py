@@ -19,11 +19,11 @@ from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.tape import Tape
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.rehearsal import difference, tolerance_of
+from fmugym.trial.seats import taking
 from fmugym.trial.verdict import Grade, Verdict
 
 __all__ = ["Repetition"]
@@ -103,8 +103,7 @@ class Repetition:
 
     def _play(self, tape: Tape) -> _Run:
         """Play a recorded episode on a fresh instance."""
-        seats = Seats.of(self._candidate.path.name, self._spec)
-        with taking(seats, 1, "a rehearsal"):
+        with taking(self._candidate, self._spec, 1, "a rehearsal"):
             return self._play_now(tape)
 
     def _play_now(self, tape: Tape) -> _Run:

@@ -20,7 +20,6 @@ from fmugym.pool.base import FloatArray, PoolSpec
 from fmugym.pool.bundle import Bundle, SaveMethod
 from fmugym.pool.patience import require_licence
 from fmugym.pool.saving import SavingPool
-from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.attempt import Request, run
 from fmugym.trial.candidate import Candidate
@@ -28,6 +27,7 @@ from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.known import known_resuming, note_resuming
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.rehearsal import Starts
+from fmugym.trial.seats import taking
 from fmugym.trial.verdict import Grade
 
 __all__ = ["Halfway", "make_halfway", "method_that_works", "try_halfway"]
@@ -72,7 +72,7 @@ def method_that_works(candidate: Candidate, spec: PoolSpec, starts: Starts | Non
     if known is not None:
         return known
     try:
-        with taking(Seats.of(candidate.path.name, spec), 1, "a trial of saved states"):
+        with taking(candidate, spec, 1, "a trial of saved states"):
             method, grade = _tried(Request(candidate, spec, starts, resume=True))
     except LicenceError as error:
         logger.warning("snapshots keep the inputs of the episode for now: %s", error)
@@ -151,7 +151,6 @@ def _open(request: Request) -> SavingPool:
         leak_limit=None,
         fault_retries=0,
         reset_method=ResetMethod.RESTORE,
-        state_files="",
     )
     return trial_pool(request.candidate.open(), spec, 1, logger)
 

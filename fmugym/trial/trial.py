@@ -11,19 +11,18 @@ A process protects from accidents but not from malice: the worker has all the ri
 from __future__ import annotations
 
 import logging
-import pickle
 from dataclasses import replace
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError
 from fmugym.pool.patience import speaks_of_licence
-from fmugym.pool.seats import Seats, taking
 from fmugym.pool.spec import ResetMethod
 from fmugym.trial.attempt import Outcome, Request, Stage, run
 from fmugym.trial.cache import recall, remember
 from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.known import known_verdict, with_harm
+from fmugym.trial.seats import taking
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 __all__ = ["examine", "meet"]
@@ -84,22 +83,16 @@ def examine(
     """
     key = verdict_key(candidate, spec, starts)
     known = Verdict.from_text(recall(key))
-    if known is not None and _answers(known, spec, several):
+    if known is not None and (known.neighbours is not None or not several):
         return with_harm(known, candidate)
     request = Request(candidate, spec, starts, several, alone)
-    if known is not None and known.complete and _answers(known, spec, several=False):
+    if known is not None and known.complete:
         request = replace(request, known=known, check_memory=not known.isolate)
-    with taking(Seats.of(candidate.path.name, spec), 2 if several else 1, "a trial"):
+    with taking(candidate, spec, 2 if several else 1, "a trial"):
         found = _examine(request, must_survive)
     if found.complete:
         remember(key, found.to_text())
     return found
-
-
-def _answers(verdict: Verdict, spec: Any, several: bool) -> bool:
-    """Whether a verdict tells all that is asked."""
-    knows_states = verdict.states is not None or not spec.keep_states
-    return knows_states and (verdict.neighbours is not None or not several)
 
 
 def _examine(request: Request, must_survive: bool) -> Verdict:
@@ -125,8 +118,6 @@ def _examine(request: Request, must_survive: bool) -> Verdict:
     verdict = notes.verdict
     if request.known is not None:
         verdict = _completed(request.known, verdict)
-    elif request.spec is not None and request.spec.keep_states and verdict.complete:
-        verdict = replace(verdict, states=_grade_of_states(request, notes.sample, verdict))
     verdict = with_harm(verdict, request.candidate)
     logger.info(
         "%s was tried with %d instance(s) at once at most, and %d initialization(s) in all",
@@ -146,18 +137,6 @@ def _completed(known: Verdict, found: Verdict) -> Verdict:
         initializations=known.initializations + found.initializations,
         reasons=tuple(dict.fromkeys((*known.reasons, *found.reasons))),
     )
-
-
-def _grade_of_states(request: Request, sample: bytes | None, verdict: Verdict) -> Grade:
-    """Let a second process begin with an initial state of the first one."""
-    if verdict.resets.get(ResetMethod.RESTORE) is not Grade.BITWISE:
-        return Grade.ABSENT
-    if sample is None:
-        return Grade.FAILS
-    spec = replace(request.spec, blind_start=verdict.blind_start)
-    outcome = run(replace(request, spec=spec, sample=pickle.loads(sample)))
-    _require_licence(request.candidate.path.name, outcome)
-    return Grade(outcome.answer.get("states", Grade.FAILS))
 
 
 def _require_licence(name: str, outcome: Outcome) -> None:
@@ -184,13 +163,11 @@ class _Notes:
         self._answer: dict[str, Any] = {}
         self._deaths: list[Outcome] = []
         self._initializations = 0
-        self.sample: bytes | None = None
 
     def add(self, outcome: Outcome) -> None:
         """Record the answer of a worker, and how it ended if it did not finish."""
         self._answer |= outcome.answer
         self._initializations += int(outcome.answer.get("initializations", 0))
-        self.sample = outcome.sample or self.sample
         if "finished" not in outcome.answer:
             self._deaths.append(outcome)
 

@@ -61,7 +61,6 @@ class Verdict:
         components: How each component of a system begins an episode; empty if all do alike.
         neighbours: What several instances need; None if only one was tried.
         isolate: Whether a lone instance has harmed its process.
-        states: The grade of an initial state in a second process; None if it was not tried.
         blind_start: Whether the FMU cannot be read before its first step.
         unreadable: The names of outputs that could not be read at all.
         instances: How many instances the trial used at once, each of which may take a licence.
@@ -75,7 +74,6 @@ class Verdict:
     components: tuple[ResetMethod, ...] = ()
     neighbours: Neighbours | None = None
     isolate: bool = False
-    states: Grade | None = None
     blind_start: bool = False
     unreadable: tuple[str, ...] = ()
     instances: int = 1
@@ -114,7 +112,6 @@ class Verdict:
                 "components": [str(method) for method in self.components],
                 "neighbours": None if self.neighbours is None else str(self.neighbours),
                 "isolate": self.isolate,
-                "states": None if self.states is None else str(self.states),
                 "blind_start": self.blind_start,
                 "unreadable": list(self.unreadable),
                 "instances": self.instances,
@@ -150,7 +147,6 @@ class Verdict:
             components=tuple(map(ResetMethod, data["components"])),
             neighbours=None if given is None else Neighbours(given),
             isolate=flags[1],
-            states=None if data["states"] is None else Grade(data["states"]),
             blind_start=flags[2],
             unreadable=tuple(unreadable),
             instances=data["instances"],

@@ -41,7 +41,7 @@ from fmugym.trial.attempt import ECHO, Request, Stage, patience
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.pools import trial_pool
-from fmugym.trial.rehearsal import Rehearsal, Sample, Starts
+from fmugym.trial.rehearsal import Rehearsal, Starts
 from fmugym.trial.resuming import Halfway, make_halfway, try_halfway
 from fmugym.trial.rungs import find_rungs, offers_of
 from fmugym.trial.shared_data import Steps, watch_steps
@@ -87,10 +87,9 @@ class Notes:
         """Whether the answer so far has a value that is true."""
         return bool(self._answer.get(name))
 
-    def keep(self, sample: Sample | Halfway | None) -> None:
-        """Leave a sample for another process, if there is one."""
-        if sample is not None:
-            (self._folder / "sample").write_bytes(pickle.dumps(sample))
+    def keep(self, sample: Halfway) -> None:
+        """Leave a sample for another process."""
+        (self._folder / "sample").write_bytes(pickle.dumps(sample))
 
     def answer(self, **values: Any) -> None:
         """Add to the answer; the file is replaced atomically."""
@@ -127,9 +126,6 @@ def _echo_to(path: Path) -> None:
 
 
 def _try(request: Request, notes: Notes) -> None:
-    if request.sample is not None:
-        _try_sample(request, notes)
-        return
     if request.resume is not None:
         _try_resuming(request, notes)
         return
@@ -185,9 +181,6 @@ def _try_alone(request: Request, notes: Notes) -> bool:
 def _step_once(request: Request, notes: Notes) -> None:
     fmu = request.candidate.open()
     spec = default_spec(fmu)
-    if request.spec is not None:
-        interval, locks = request.spec.initialization_interval, request.spec.locks
-        spec = replace(spec, initialization_interval=interval, locks=locks)
     notes.stage("loading and instantiation")
     pool = trial_pool(fmu, spec, 1, _SILENT)
     try:
@@ -229,8 +222,6 @@ def _try_resets(request: Request, notes: Notes) -> Verdict:
         if grades[method] == Grade.BITWISE:
             break
     components = _try_components(request, rehearsal, grades, notes)
-    if request.spec.keep_states and grades.get(ResetMethod.RESTORE) == Grade.BITWISE:
-        _make_sample(rehearsal, request, notes)
     blind = notes.found("blind_start")
     return Verdict(resets=grades, components=components, noisy=rehearsal.noisy, blind_start=blind)
 
@@ -292,21 +283,6 @@ def _can_read(request: Request, outputs: tuple[Variable, ...]) -> bool:
         return bool(statuses[0] <= WARNING_CODE)
     finally:
         pool.close()
-
-
-def _make_sample(rehearsal: Rehearsal, request: Request, notes: Notes) -> None:
-    """Write down an initial state for a second process."""
-    notes.stage(Stage.STATE)
-    if Stage.STATE not in request.skip:
-        notes.keep(rehearsal.sample())
-
-
-def _try_sample(request: Request, notes: Notes) -> None:
-    """Grade an initial state of another process."""
-    notes.stage(Stage.RESUMED)
-    starts = request.starts or Starts()
-    rehearsal = Rehearsal(request.candidate, request.spec, starts, request.sample)
-    notes.answer(states=rehearsal.grade_sample())
 
 
 def _try_resuming(request: Request, notes: Notes) -> None:

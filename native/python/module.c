@@ -65,22 +65,6 @@ static PyObject *initializations(PyObject *module, PyObject *unused) {
     return PyLong_FromUnsignedLongLong(number_of_initializations());
 }
 
-static PyObject *claim_initialization(PyObject *module, PyObject *args) {
-    PyObject *array;
-    Py_buffer buffer = {0};
-    double interval;
-
-    (void)module;
-    if (!PyArg_ParseTuple(args, "Od", &array, &interval) ||
-        !take_vector(array, &buffer, WRITTEN, "last_initialization", ITEM_INT64, 1)) {
-        return NULL;
-    }
-    const Pace pace = {(uint64_t)(interval * 1e9), buffer.buf};
-    const uint64_t next = pace_claim(&pace), now = clock_now();
-    release_buffer(&buffer);
-    return PyFloat_FromDouble(next > now ? 1e-9 * (double)(next - now) : 0.0);
-}
-
 static PyObject *py_text_with(PyObject *module, PyObject *number) {
     const double wanted = PyFloat_AsDouble(number);
 
@@ -119,7 +103,6 @@ static PyMethodDef functions[] = {
     {"echo_to", echo_to, METH_O, NULL},
     {"text_with", py_text_with, METH_O, NULL},
     {"serve_component", py_serve_component, METH_NOARGS, NULL},
-    {"claim_initialization", claim_initialization, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

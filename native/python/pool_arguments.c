@@ -7,8 +7,6 @@
 typedef struct {
     PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance;
     PyAccess *inputs, *outputs;
-    PyObject *watched; /* an Access or None */
-    const char *watched_places;
     Py_ssize_t size_of_places;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
@@ -17,7 +15,6 @@ typedef struct {
     long long substeps, warm_up_steps, retries;
     const char *sampling;
     Py_ssize_t samplings;
-    double pace;
 } Arguments;
 
 bool parse_group(PyObject *group, const char *format, char **names, ...) {
@@ -48,30 +45,26 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
                             "rebuilds",   "reloads",       "one_initialization",
-                            "pace",       "start_outputs", NULL};
+                            "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLppppdz#:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLppppz#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &a->pace, &s->start_outputs,
-                       &a->start_outputs_size);
+                       &a->one_initialization, &s->start_outputs, &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
-    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", "watched_places",
-                            "watched", NULL};
-    return parse_group(group, "$O!O!ny#y#O:variables", names, access_type, &a->inputs, access_type,
-                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings,
-                       &a->watched_places, &a->size_of_places, &a->watched);
+    static char *names[] = {"inputs", "outputs", "num_observed", "sampling", NULL};
+    return parse_group(group, "$O!O!ny#:variables", names, access_type, &a->inputs, access_type,
+                       &a->outputs, &a->num_observed, &a->sampling, &a->samplings);
 }
 
 static bool parse_arrays(PyPool *self, PyObject *group) {
     static char *names[] = {"inputs",       "outputs", "statuses",
-                            "observations", "health",  "last_initialization", NULL};
+                            "observations", "health",  NULL};
     PyObject **arrays = self->arrays;
-    return parse_group(group, "$OOOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
-                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH],
-                       &arrays[LAST_INITIALIZATION]);
+    return parse_group(group, "$OOOOO:arrays", names, &arrays[INPUTS], &arrays[OUTPUTS],
+                       &arrays[STATUS], &arrays[OBSERVATIONS], &arrays[HEALTH]);
 }
 
 static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
@@ -124,28 +117,6 @@ static bool check_accesses(const Arguments *a) {
     return true;
 }
 
-/* The outputs of which the FMU may tell more than their values at the ends of steps. */
-static bool take_watched(const Arguments *a, Solving *solving) {
-    if (a->watched == Py_None) {
-        return true;
-    }
-    const PyAccess *watched = (const PyAccess *)a->watched;
-    const uint32_t *places = (const uint32_t *)(const void *)a->watched_places;
-    bool sound = PyObject_TypeCheck(a->watched, access_type) &&
-                 watched->access.fmi == a->outputs->access.fmi && a->samplings > 0 &&
-                 (size_t)a->size_of_places == watched->access.count * sizeof *places;
-    for (size_t i = 0; sound && i < watched->access.count; i++) {
-        sound = places[i] < a->outputs->access.count;
-    }
-    if (!sound) {
-        PyErr_SetString(PyExc_ValueError, "the watched outputs do not fit the outputs");
-        return false;
-    }
-    solving->watched = &watched->access;
-    solving->watched_places = places;
-    return true;
-}
-
 static bool take_optional(PyObject *object, bool *given, double *value) {
     *given = object != Py_None;
     *value = *given ? PyFloat_AsDouble(object) : 0.0;
@@ -188,9 +159,7 @@ static bool take_arrays(PyPool *self, const Arguments *a) {
            take_matrix(arrays[OBSERVATIONS], &buffers[OBSERVATIONS], WRITTEN, "observations",
                        ITEM_FLOAT32, n, a->num_observed) &&
            take_matrix(arrays[HEALTH], &buffers[HEALTH], WRITTEN, "health", ITEM_INT64, n,
-                       HEALTH_COUNTS) &&
-           take_vector(arrays[LAST_INITIALIZATION], &buffers[LAST_INITIALIZATION], WRITTEN,
-                       "last_initialization", ITEM_INT64, 1);
+                       HEALTH_COUNTS);
 }
 
 static bool settle(PyPool *self, const Arguments *a) {
@@ -227,10 +196,7 @@ static bool settle(PyPool *self, const Arguments *a) {
         self->system->private_libraries = s->private_libraries;
         self->system->largest_state = STATES_LIMIT / s->count;
     }
-    s->pace.interval = (uint64_t)(a->pace * 1e9);
-    s->pace.last = self->buffers[LAST_INITIALIZATION].buf;
     return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
-           take_watched(a, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }

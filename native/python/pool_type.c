@@ -128,8 +128,6 @@ static PyMethodDef methods[] = {
     FAST("differentiate", py_differentiate),
     {"failure", py_failure, METH_O, NULL},
     FAST("knows_start", py_knows_start),
-    {"pack", py_pack, METH_O, NULL},
-    FAST("adopt", py_adopt),
     FAST("bundle", py_bundle),
     FAST("unbundle", py_unbundle),
     {"keep_records", py_keep_records, METH_NOARGS, NULL},

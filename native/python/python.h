@@ -14,7 +14,7 @@
 #include "pool.h"
 #include "system.h"
 
-enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, LAST_INITIALIZATION, BUFFERS };
+enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 
 typedef struct {
     PyObject_HEAD Access access;
@@ -112,8 +112,6 @@ PyObject *py_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_pack(PyObject *object, PyObject *index);
-PyObject *py_adopt(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_keep_records(PyObject *object, PyObject *unused);

@@ -31,17 +31,17 @@ static bool take_method(const char *name, Solving *solving) {
 
 /* The references stay in the pool's arguments. */
 bool take_solving(PyObject *tuple, Solving *solving) {
-    const char *method, *states, *rates, *clocks, *clocked, *ramps;
-    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size, ramps_size;
+    const char *method, *states, *rates, *clocks, *clocked;
+    Py_ssize_t count, indicators, states_size, rates_size, clocks_size, clocked_size;
     int completes;
 
     if (tuple == Py_None) {
         return true;
     }
-    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#y#d", &method, &solving->tolerance,
+    if (!PyArg_ParseTuple(tuple, "yddnnpz#z#y#y#", &method, &solving->tolerance,
                           &solving->max_step, &count, &indicators, &completes, &states,
                           &states_size, &rates, &rates_size, &clocks, &clocks_size, &clocked,
-                          &clocked_size, &ramps, &ramps_size, &solving->ramp_duration)) {
+                          &clocked_size)) {
         return false;
     }
     const Py_ssize_t wanted = count * (Py_ssize_t)sizeof(uint32_t);
@@ -59,7 +59,5 @@ bool take_solving(PyObject *tuple, Solving *solving) {
     solving->number_of_clocks = (size_t)clocks_size / sizeof(Clock);
     solving->clocked = (const Clocked *)(const void *)clocked;
     solving->number_of_clocked = (size_t)clocked_size / sizeof(Clocked);
-    solving->ramped_references = (const uint32_t *)(const void *)ramps;
-    solving->number_of_ramps = (size_t)ramps_size / sizeof(uint32_t);
     return take_method(method, solving);
 }

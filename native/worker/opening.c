@@ -53,15 +53,6 @@ static void *place(const Shared *shared, Reader *reader, size_t element, size_t 
     return shared->base + offset + element * first;
 }
 
-/* When the last instance was made or initialized; all processes that limit it map one file. */
-static bool share_pace(Worker *w, const char *path) {
-    static Atomic own;
-    Pace *pace = &w->settings.pace;
-
-    pace->last = *path == '\0' ? &own : (Atomic *)map_file(path, sizeof own);
-    return pace->last != NULL;
-}
-
 static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
     Shared *shared = &w->shared;
     const char *path = read_text(reader);
@@ -85,7 +76,7 @@ static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
         log_echo_to(echo, echo_size);
         frames_watch((const Atomic *)(echo + echo_size));
     }
-    return reader->sound && share_pace(w, read_text(reader));
+    return reader->sound;
 }
 
 /* Settings, in the order of fmugym/pool/process/windows.py */
@@ -143,9 +134,6 @@ static void read_solving(Reader *reader, Solving *solving) {
     solving->rate_references = read_references(reader, solving->states);
     solving->clocks = read_copy(reader, sizeof(Clock), &solving->number_of_clocks);
     solving->clocked = read_copy(reader, sizeof(Clocked), &solving->number_of_clocked);
-    solving->ramped_references =
-        read_copy(reader, sizeof(uint32_t), &solving->number_of_ramps);
-    solving->ramp_duration = read_number(reader);
     reader->sound = reader->sound && solving->method != NULL;
 }
 
@@ -190,21 +178,6 @@ static void read_experiment(Reader *reader, Settings *s) {
     s->rebuilds = read_flag(reader);
     s->reloads = read_flag(reader);
     s->one_initialization = read_flag(reader);
-    s->pace.interval = (uint64_t)(read_number(reader) * 1e9);
-}
-
-/* The outputs of which the FMU may tell more than their values at the ends of steps. */
-static void read_watched(Worker *w, Reader *reader) {
-    Solving *solving = &w->settings.solving;
-    size_t count;
-
-    solving->watched_places = read_copy(reader, sizeof(uint32_t), &count);
-    reader->sound = reader->sound && read_access(reader, w->settings.fmi, &w->watched) &&
-                    w->watched.count == count;
-    for (size_t i = 0; reader->sound && i < count; i++) {
-        reader->sound = solving->watched_places[i] < w->outputs.count;
-    }
-    solving->watched = reader->sound && count > 0 ? &w->watched : NULL;
 }
 
 static void read_variables(Worker *w, Reader *reader) {
@@ -220,7 +193,6 @@ static void read_variables(Worker *w, Reader *reader) {
     s->sampling = size == 0 ? NULL : s->sampling;
     reader->sound = reader->sound && (size == 0 || size == w->outputs.count) &&
                     s->num_observed <= w->outputs.count;
-    read_watched(w, reader);
     const char *starts = read_block(reader, &size);
     s->start_outputs = size == 0 ? NULL : starts;
     s->count = (size_t)read_integer(reader);

@@ -29,7 +29,7 @@ typedef struct {
 typedef struct {
     Pool pool;
     Settings settings;
-    Access inputs, outputs, watched;
+    Access inputs, outputs;
     Shared shared;
     double *output_values;
     float *observations;

@@ -25,8 +25,6 @@ typedef void Update(void *environment, double time, bool set, bool get, bool fin
                     bool *early_requested, double *early_time);
 
 typedef struct {
-    Update *update; /* called within steps if anything is wanted there, otherwise NULL */
-    void *environment;
     int mode;
     bool exchange, active[CLOCKS], counts_down;
     double time, x, next_alarm, countdown;
@@ -44,8 +42,6 @@ static void start(Model *me) {
 
     memset(me, 0, sizeof *me);
     me->exchange = kept.exchange;
-    me->update = kept.update;
-    me->environment = kept.environment;
     me->period = 0.2;
     me->pace = 0.5;
     me->next_alarm = 0.3;
@@ -78,10 +74,7 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
     if (!event_mode || !early_return || wants_early_return) {
         return NULL;
     }
-    Model *me = make(false);
-    me->update = intermediate_count > 0 ? update : NULL;
-    me->environment = environment;
-    return me;
+    return make(false);
 }
 
 void fmi3FreeInstance(Model *me) {
@@ -351,16 +344,6 @@ int fmi3SetFloat64(Model *me, const unsigned *references, size_t count, const do
 
 /* Co-simulation */
 
-/* In the middle of a step and at its end. */
-static void tell(Model *me, double begin, double end) {
-    for (int i = 1; i <= 2 && me->update != NULL; i++) {
-        bool early = false;
-        double early_time = 0.0;
-        me->x = begin + 0.5 * i * (end - begin);
-        me->update(me->environment, me->x, false, true, true, true, &early, &early_time);
-    }
-}
-
 int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *event,
                bool *terminate, bool *early, double *reached) {
     const double until = time + step;
@@ -370,7 +353,6 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     me->time = me->eager > 0.0 ? fmin(until, time + me->eager) : until;
     *event = me->time >= me->next_alarm;
     me->time = *event ? me->next_alarm : me->time;
-    tell(me, time, me->time);
     me->x = me->time;
     *early = me->time < until;
     *reached = me->time;

@@ -20,7 +20,6 @@
 
 static void start(Model *me) {
     memset(me->v, 0, sizeof me->v);
-    memset(me->slope, 0, sizeof me->slope);
     me->mode = INSTANTIATED;
     me->stops = me->again = me->wants_event = false;
     me->next_event = me->stop = INFINITY;
@@ -130,30 +129,18 @@ int core_nominals(Model *me, double *x, size_t count) {
     return OK;
 }
 
-/* In intermediate updates, only what was asked for at the instantiation may be got and set. */
-static bool is_wanted(const Model *me, unsigned reference) {
-    bool wanted = !me->updating;
-
-    for (size_t i = 0; i < me->number_wanted; i++) {
-        wanted |= me->wanted[i] == reference;
-    }
-    return wanted;
-}
-
 int core_get(Model *me, const unsigned *references, size_t count, double *values) {
-    REQUIRE(me->mode != INSTANTIATED && (!me->updating || me->may_get));
+    REQUIRE(me->mode != INSTANTIATED);
     model_rates(me);
     for (size_t i = 0; i < count; i++) {
-        REQUIRE(is_wanted(me, references[i]));
         values[i] = me->v[references[i]];
     }
     return OK;
 }
 
 int core_set(Model *me, const unsigned *references, size_t count, const double *values) {
-    REQUIRE(me->mode != CONTINUOUS && me->mode != TERMINATED && (!me->updating || me->may_set));
+    REQUIRE(me->mode != CONTINUOUS && me->mode != TERMINATED);
     for (size_t i = 0; i < count; i++) {
-        REQUIRE(is_wanted(me, references[i]));
         me->v[references[i]] = values[i];
     }
     return OK;
@@ -166,18 +153,13 @@ static bool step_once(Model *me, double until) {
     double before[MOST], after[MOST];
     bool event = false;
 
-    model_update(me, false);
     model_rates(me);
     model_indicators(me, before);
     for (size_t i = 0; i < STATES; i++) {
         me->v[i] += step * me->v[STATES + i];
     }
-    for (size_t i = 0; i < MOST; i++) {
-        me->v[i] += step * me->slope[i];
-    }
     me->time += step;
     model_rates(me);
-    model_update(me, true);
     model_indicators(me, after);
     for (size_t i = 0; i < INDICATORS; i++) {
         event |= (before[i] > 0) != (after[i] > 0);
@@ -188,23 +170,12 @@ static bool step_once(Model *me, double until) {
     return me->time >= me->stop - 1e-12;
 }
 
-int core_set_slopes(Model *me, const unsigned *references, size_t count, const int *orders,
-                    const double *values) {
-    REQUIRE(me->mode == STEPPING);
-    for (size_t i = 0; i < count; i++) {
-        REQUIRE(orders[i] == 1);
-        me->slope[references[i]] = values[i];
-    }
-    return OK;
-}
-
 /* Does no more of a step than EARLY seconds, and breaks off one that is longer than LONGEST. */
 int core_do_step(Model *me, double time, double step) {
     const double until = time + fmin(step, EARLY);
 
     REQUIRE(me->mode == STEPPING && fabs(time - me->time) < 1e-9);
-    me->time = me->step_begin = time;
-    me->step_end = time + step;
+    me->time = time;
     while (me->time < until - 1e-12) {
         if (step > LONGEST && me->time > time + 0.5 * step) {
             return DISCARD;
@@ -234,9 +205,6 @@ int core_set_state(Model *me, const void *state) {
     memcpy(me->name, kept.name, sizeof kept.name);
     me->logger = kept.logger;
     me->environment = kept.environment;
-    me->update = kept.update;
-    memcpy(me->wanted, kept.wanted, sizeof kept.wanted);
-    me->number_wanted = kept.number_wanted;
     return OK;
 }
 

@@ -24,7 +24,6 @@ enum { MOST = 32 };
 
 typedef struct {
     double v[MOST]; /* the variables */
-    double slope[MOST]; /* of inputs, in co-simulation */
     double time;
     double completed; /* the time of the last complete step or event */
     double next_event;
@@ -37,12 +36,6 @@ typedef struct {
     bool wants_event;  /* after a complete step */
     char name[64];
     void *logger, *environment;
-    /* intermediate updates of co-simulation */
-    void *update;
-    unsigned wanted[MOST]; /* the variables that are wanted in them */
-    size_t number_wanted;
-    bool updating, may_set, may_get;
-    double step_begin, step_end;
 } Model;
 
 /* Every model has these. */
@@ -53,8 +46,6 @@ void model_rates(Model *me);      /* computes derivatives and outputs */
 void model_indicators(const Model *me, double *z);
 void model_event(Model *me);      /* updates the discrete states */
 void model_complete(Model *me);   /* after a step */
-/* Tells of a point of an internal step: its beginning, where inputs are wanted, or its end. */
-void model_update(Model *me, bool at_end);
 double model_partial(const Model *me, size_t unknown, size_t known);
 
 Model *core_new(const char *name, bool exchange, void *logger, void *environment);
@@ -73,8 +64,6 @@ int core_indicators(Model *me, double *z, size_t count);
 int core_nominals(Model *me, double *x, size_t count);
 int core_get(Model *me, const unsigned *references, size_t count, double *values);
 int core_set(Model *me, const unsigned *references, size_t count, const double *values);
-int core_set_slopes(Model *me, const unsigned *references, size_t count, const int *orders,
-                    const double *values);
 int core_do_step(Model *me, double time, double step);
 int core_get_state(Model *me, void **state);
 int core_set_state(Model *me, const void *state);

@@ -137,11 +137,6 @@ int Model_fmiDoStep(Model *me, double time, double step, char new_step) {
     return core_do_step(me, time, step);
 }
 
-int Model_fmiSetRealInputDerivatives(Model *me, const unsigned *references, size_t count,
-                                     const int *orders, const double *values) {
-    return core_set_slopes(me, references, count, orders, values);
-}
-
 const char *Model_fmiGetVersion(void) {
     return "1.0";
 }

@@ -59,11 +59,6 @@ int fmi2DoStep(Model *me, double time, double step, int no_set_state) {
     return status == OK && me->time < time + step - 1e-9 ? DISCARD : status;
 }
 
-int fmi2SetRealInputDerivatives(Model *me, const unsigned *references, size_t count,
-                                const int *orders, const double *values) {
-    return core_set_slopes(me, references, count, orders, values);
-}
-
 int fmi2GetRealStatus(Model *me, int kind, double *value) {
     *value = me->time;
     return kind == 2 ? OK : DISCARD;

@@ -13,14 +13,7 @@ void *fmi3InstantiateCoSimulation(const char *name, const char *token, const cha
                                   bool visible, bool logging, bool event_mode, bool early_return,
                                   const unsigned *intermediate, size_t intermediate_count,
                                   void *environment, void *logger, void *intermediate_update) {
-    Model *me = core_new(name, false, logger, environment);
-
-    me->update = intermediate_update;
-    me->number_wanted = intermediate_count < MOST ? intermediate_count : MOST;
-    for (size_t i = 0; i < me->number_wanted; i++) {
-        me->wanted[i] = intermediate[i];
-    }
-    return me;
+    return core_new(name, false, logger, environment);
 }
 
 void fmi3FreeInstance(Model *me) {

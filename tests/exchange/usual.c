@@ -16,9 +16,6 @@ USUAL void model_event(Model *me) {
 USUAL void model_complete(Model *me) {
 }
 
-USUAL void model_update(Model *me, bool at_end) {
-}
-
 USUAL double model_partial(const Model *me, size_t unknown, size_t known) {
     return NAN;
 }

@@ -141,14 +141,6 @@ def way(name, version, folder, **options):
     return played(fmu, ["tau"], ["q", "q_dot"], starts, 0.05, options, **spec)
 
 
-def linear_inputs(version, folder, **options):
-    """Co-simulation of FMI 1.0 and 2.0 with inputs that change within a step."""
-    path = folder / f"linear inputs {version}.fmu"
-    able = 'canInterpolateInputs="true"'
-    fmu = FMU(exchange_tools.exchange_fmu(path, "dahlquist", version, ("CoSimulation",), able))
-    return played(fmu, ["u"], ["x"], [], 0.1, options, ramped=(fmu.variable("u"),))
-
-
 CLOCKED = {
     "in equations": ("ModelExchange", False),
     "in event mode": ("CoSimulation", True),
@@ -305,7 +297,6 @@ def cases():
         found[f"clocks {where} {kind}"] = partial(clocks, where, kind)
     for name, version in product(FAULTS, (1, 2, 3)):
         found[f"fault {name} {version}"] = partial(fault, name, version)
-    found |= {f"linear inputs {v}": partial(linear_inputs, v) for v in (1, 2)}
     found |= {f"types {v}": partial(types, v) for v in (1, 2, 3)}
     found |= {f"arrays {i}": partial(arrays, i) for i in ("CoSimulation", "ModelExchange")}
     for name, make in tasks().items():

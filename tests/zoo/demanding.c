@@ -4,8 +4,7 @@
    Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter).
 
    The environment variable SEATS names a file that has the process of each licence in use, and
-   SEATS_LIMIT says how many there may be. SEATS.most gets the most that were in use at once,
-   SEATS.calls the time of each instantiation and initialization. */
+   SEATS_LIMIT says how many there may be. SEATS.most gets the most that were in use at once. */
 
 #define _GNU_SOURCE
 #include "zoo.h"
@@ -37,21 +36,12 @@ static bool is_licensed(void) {
     return seats != NULL && *seats != '\0';
 }
 
-static void note(const char *suffix, double value, bool append) {
+static void note_most(int most) {
     char path[400];
-    snprintf(path, sizeof path, "%s.%s", getenv("SEATS"), suffix);
-    FILE *file = fopen(path, append ? "a" : "w");
-    fprintf(file, "%.6f\n", value);
+    snprintf(path, sizeof path, "%s.most", getenv("SEATS"));
+    FILE *file = fopen(path, "a");
+    fprintf(file, "%d\n", most);
     fclose(file);
-}
-
-static void note_call(void) {
-    struct timespec now;
-
-    if (is_licensed()) {
-        clock_gettime(CLOCK_MONOTONIC, &now);
-        note("calls", (double)now.tv_sec + 1e-9 * (double)now.tv_nsec, true);
-    }
 }
 
 /* Reads the processes that have seats, without those that have ended. */
@@ -87,7 +77,7 @@ static bool change_seats(bool taken) {
     }
     if (count > most) {
         most = count;
-        note("most", most, true);
+        note_most(most);
     }
     ftruncate(file, 0);
     pwrite(file, seats, count * sizeof *seats, 0);
@@ -127,7 +117,6 @@ static void set_start(Animal *me) {
 Animal *zoo_instantiate(const Birth *birth) {
     Animal *me = calloc(1, sizeof *me);
 
-    note_call();
     snprintf(me->token, sizeof me->token, "%s", birth->token);
     snprintf(me->name, sizeof me->name, "%s", birth->name);
     me->logger = birth->logger;
@@ -151,7 +140,6 @@ void zoo_free(Animal *me) {
 }
 
 int zoo_exit(Animal *me) {
-    note_call();
     if (!take_seat(me)) {
         return ERROR;
     }
@@ -217,7 +205,7 @@ typedef struct {
 
 int zoo_size_of_bytes(Animal *me, void *state, size_t *size) {
     *size = sizeof(Bytes);
-    return is(me, "slow, serializes nothing") ? ERROR : OK;
+    return OK;
 }
 
 int zoo_to_bytes(Animal *me, void *state, char *bytes, size_t size) {

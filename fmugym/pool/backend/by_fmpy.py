@@ -309,10 +309,8 @@ def _needs(fmu: FMU, spec: PoolSpec) -> dict[str, bool]:
         "clocks and event mode": about.uses_event_mode,
         "libraries for Windows": fmu.in_wine,
         "arrays": bool(about.structure) or any(not v.is_scalar for v in variables),
-        "input_interpolation": bool(spec.ramped),
         "samplings": bool(spec.samplings),
         "fault_retries": bool(spec.fault_retries),
-        "keep_initial_states": spec.keep_states,
     }
 
 

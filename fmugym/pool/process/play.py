@@ -18,7 +18,6 @@ from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray, MaskArray, Played, SingleCalls, available_processors
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.native import prepare
-from fmugym.pool.pacing import last_initialization
 from fmugym.pool.process.shared_memory import Arrays
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.settings import experiment_settings, listing, variable_settings
@@ -69,16 +68,13 @@ class PlayAround:
         return _native.Pool(
             library=_NO_LIBRARY,
             experiment=cast("_native.Experiment", experiment_settings(spec)),
-            variables=cast(
-                "_native.Variables", variable_settings(spec) | accesses | {"watched": None}
-            ),
+            variables=cast("_native.Variables", variable_settings(spec) | accesses),
             arrays={
                 "inputs": arrays.inputs,
                 "outputs": arrays.outputs,
                 "statuses": arrays.statuses,
                 "observations": arrays.observations,
                 "health": arrays.counts,
-                "last_initialization": last_initialization(spec),
             },
             count=setup.num_instances,
             threads=available_processors(),

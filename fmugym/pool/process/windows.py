@@ -20,7 +20,6 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray, Record, SaveMethod
-from fmugym.pool.pacing import last_initialization, pace_file
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
 from fmugym.pool.process.worker import Setup
@@ -234,8 +233,6 @@ class ProgramCoding:
         writer.access(spec.inputs, description.fmi_major_version)
         writer.access(spec.outputs, description.fmi_major_version)
         _write_variables(writer, variable_settings(spec))
-        watched = [spec.outputs[place] for place in spec.watched]
-        writer.access(watched, description.fmi_major_version)
         writer.block(experiment["start_outputs"] or b"")
         writer.integers(setup.block.stop - setup.block.start, setup.threads)
         writer.flags(spec.records or offered_method(description, spec) is not SaveMethod.STATE)
@@ -247,9 +244,6 @@ class ProgramCoding:
         writer.text(os.fsencode(windows_path(path)))
         writer.integers(self._memory.size, setup.num_instances, setup.block.start)
         writer.integers(*offsets_of(setup.spec, setup.num_instances, setup.number), ECHO_SIZE)
-        last_initialization(setup.spec)  # makes the file ready
-        pace = pace_file(setup.spec)
-        writer.text(b"" if pace is None else os.fsencode(windows_path(pace)))
 
     # Other requests, and their answers
 
@@ -410,10 +404,8 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
     writer.integers(*(experiment[name] for name in ("substeps", "warm_up_steps", "retries")))
     names = ("restores", "rebuilds", "reloads", "one_initialization")
     writer.flags(*(experiment[name] for name in names))
-    writer.numbers(experiment["pace"])
 
 
 def _write_variables(writer: _Writer, variables: Mapping[str, Any]) -> None:
     writer.integers(variables["num_observed"])
     writer.block(variables["sampling"])
-    writer.block(variables["watched_places"])

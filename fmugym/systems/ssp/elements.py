@@ -36,7 +36,7 @@ SSD: Final = "SystemStructure.ssd"
 FMU_TYPE: Final = "application/x-fmu-sharedlibrary"
 
 OWN_ANNOTATION: Final = "fmugym"
-"""The type of the annotations that fmugym writes for what SSP has no words for."""
+"""The type of the annotations that say for fmugym what SSP has no words for."""
 
 _GIVES: Final = {"output", "calculatedParameter", "local", "constant"}
 _INTERFACES: Final = {
@@ -110,7 +110,7 @@ class Element:
         bindings: The parameter bindings in their order.
         source: The URI of the FMU.
         interface: One of fmugym's; None for any.
-        own: What fmugym itself has written about it: attributes of an annotation.
+        own: The attributes of an annotation for fmugym.
     """
 
     name: str

@@ -202,7 +202,7 @@ class Flat:
         first, wire = chain[0]
         ends = _named(first), _named(target)
         told = self._is_told(first) or self._is_told(target)
-        if len(chain) == 1 and not told:  # kept as in the file, so that it can be written back
+        if len(chain) == 1 and not told:  # kept as in the file
             return Connection(*ends, wire.scaling.gain, wire.scaling.offset, wire.convert)
         value = _Value(unit=self._unit(first), units=self._units_at(first))
         stops = [node for node, _ in chain[1:]] + [target]

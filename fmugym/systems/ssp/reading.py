@@ -189,7 +189,7 @@ def _experiment(root: Any) -> dict[str, float]:
 
 
 def _master(own: Mapping[str, str]) -> dict[str, Any]:
-    """What fmugym has written about the way in which a system is run."""
+    """What an annotation of fmugym says about the way in which a system is run."""
     return {name: _own_value(own, name, kind) for name, kind in _OWN.items() if name in own}
 
 

@@ -1,0 +1,27 @@
+"""What earlier versions took: it warns for one release, and then nobody knows it any more."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Final, TypeVar
+
+__all__ = ["RETIRED", "without_retired"]
+
+_Value = TypeVar("_Value")
+
+RETIRED: Final = {
+    "input_interpolation": "inputs hold their values within a step; take a shorter 'time_step'",
+    "keep_initial_states": "leave it out; each instance keeps its own state after initialization",
+    "max_initializations_per_second": "leave it out; 'max_instances' and 'licence_wait' stay",
+}
+"""Keys of configs and task files and arguments of systems that are gone, and what to do now."""
+
+
+def without_retired(given: Mapping[str, _Value]) -> dict[str, _Value]:
+    """Leave out what is gone, with a ``FutureWarning`` for each that says what to do."""
+    for key in given:
+        if key in RETIRED:
+            text = f"{key!r} is gone and does nothing: {RETIRED[key]}"
+            warnings.warn(text, FutureWarning, stacklevel=2)
+    return {key: value for key, value in given.items() if key not in RETIRED}

@@ -1,0 +1,98 @@
+"""Seats: how many instances of an FMU this process may have at once, its workers' included.
+
+Each environment that limits its instances takes a seat for each of them, and so does a trial.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import threading
+import weakref
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from fmugym.errors import LicenceError
+from fmugym.pool.spec import PoolSpec
+from fmugym.trial.candidate import Candidate, content_of
+
+__all__ = ["Claim", "take", "taking"]
+
+
+@dataclass(eq=False)
+class Claim:
+    """Seats of an FMU that are taken until this object is released or gone."""
+
+    content: str
+    seats: int
+    purpose: str
+
+    def release(self) -> None:
+        """Let others have the seats; more than one call is fine."""
+        _claims.discard(self)
+
+    def __str__(self) -> str:
+        return f"{self.seats} for {self.purpose}"
+
+
+_claims: Final[weakref.WeakSet[Claim]] = weakref.WeakSet()
+_lock: Final = threading.Lock()
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_claims.clear)
+
+
+def take(candidate: Candidate, spec: PoolSpec, count: int, purpose: str) -> Claim | None:
+    """Take seats of an FMU.
+
+    Args:
+        candidate: The FMU.
+        spec: Says how many seats there are.
+        count: How many to take.
+        purpose: What for, for the messages that others get.
+
+    Returns:
+        The seats; None if their number is not limited.
+
+    Raises:
+        LicenceError: If there are not so many left; the text tells what they are taken for.
+    """
+    if spec.max_instances is None:
+        return None
+    content = content_of(candidate)
+    if sum(claim.seats for claim in _taken(content)) + count > spec.max_instances:
+        gc.collect()  # environments that nobody uses any more still have their seats
+    with _lock:
+        taken = _taken(content)
+        if sum(claim.seats for claim in taken) + count > spec.max_instances:
+            name, most = candidate.path.name, spec.max_instances
+            raise LicenceError(_refusal(name, most, count, purpose, taken))
+        claim = Claim(content, count, purpose)
+        _claims.add(claim)
+    return claim
+
+
+def _taken(content: str) -> list[Claim]:
+    return [claim for claim in list(_claims) if claim.content == content]
+
+
+def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim]) -> str:
+    told = ", ".join(sorted(map(str, taken))) or "none"
+    advice = "; close environments that you no longer use" if taken else ""
+    return (
+        f"{name} needs {count} more instance(s) for {purpose}, but config key 'max_instances' "
+        f"allows {most} at once in this process, and of these are in use: {told}{advice}"
+    )
+
+
+@contextlib.contextmanager
+def taking(candidate: Candidate, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
+    """Take seats for this context, if they are limited; see ``take``."""
+    claim = take(candidate, spec, count, purpose)
+    try:
+        yield
+    finally:
+        if claim is not None:
+            claim.release()
