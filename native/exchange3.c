@@ -62,7 +62,7 @@ static const Model model = {
 static void *instantiate(const Library *library, const Identity *identity) {
     void *instance = functions_of(library)->instantiate_equations(
         identity->name, identity->token, identity->resources, false, identity->logging,
-        environment_of(identity), log_message_fmi3);
+        as_environment(identity), log_message_fmi3);
     return solved_take(&model, library, identity, instance);
 }
 

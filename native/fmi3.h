@@ -113,7 +113,7 @@ static inline const Functions *functions_of(const Library *library) {
     return library->functions;
 }
 
-static inline void *environment_of(const Identity *identity) {
+static inline void *as_environment(const Identity *identity) {
     return (void *)(uintptr_t)identity->environment;
 }
 
@@ -203,7 +203,7 @@ static inline void *instantiate_steps(const Library *library, const Identity *id
                                       bool with_events) {
     return functions_of(library)->instantiate_steps(
         identity->name, identity->token, identity->resources, false, identity->logging, with_events,
-        with_events, NULL, 0, environment_of(identity), log_message_fmi3,
+        with_events, NULL, 0, as_environment(identity), log_message_fmi3,
         ignore_intermediate_update);
 }
 

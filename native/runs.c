@@ -127,7 +127,7 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
 
     for (size_t j = 0; j < count; j++, outputs += width) {
         Instance *me = &pool->instances[begin + j];
-        if (!all_finite(outputs, width)) {
+        if (!are_finite(outputs, width)) {
             const bool counted = pool->settings.status[begin + j] > STATUS_WARNING;
             note_status(task, begin + j, instance_note_not_finite(me, BAD_OUTPUTS, outputs, width));
             troubled += !counted;
@@ -412,7 +412,7 @@ static size_t hand_out(Task *task, size_t begin, size_t count, Scratch scratch,
 static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
     records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
-    scratch.sound = all_finite(scratch.inputs, count * task->pool->settings.inputs->count);
+    scratch.sound = are_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     const size_t troubled = do_each(task, begin, count, scratch);
     return troubled + hand_out(task, begin, count, scratch, fits_floats);
 }

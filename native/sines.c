@@ -43,7 +43,7 @@ INLINED Pair sum_of(double a, double b) {
 
 /* What the rounded product of two numbers lacks: the same number in both ways, unless it is too small
  * for one. The first way needs a processor that multiplies and adds at once. */
-INLINED double lost(double a, double b, double product, bool fused) {
+INLINED double part_lost(double a, double b, double product, bool fused) {
     if (fused) {
         return FUSED(a, b, -product);
     }
@@ -53,7 +53,7 @@ INLINED double lost(double a, double b, double product, bool fused) {
 
 INLINED Pair square_of(Pair r, bool fused) {
     const double high = r.high * r.high;
-    return (Pair){high, lost(r.high, r.high, high, fused) + 2.0 * r.high * r.low};
+    return (Pair){high, part_lost(r.high, r.high, high, fused) + 2.0 * r.high * r.low};
 }
 
 /* x minus the nearest multiple of half of pi. */
@@ -88,9 +88,9 @@ INLINED double rest_of_cosine(double s) {
 INLINED Pair sine_of(Pair r, Pair s, bool fused) {
     const double sixth = 1.0 / 6, missing = 1.0 / 108086391056891904; /* of the rounded 1 / 6 */
     const double part = s.high * sixth;
-    const double part_low = lost(s.high, sixth, part, fused) + s.high * missing + s.low * sixth;
+    const double part_low = part_lost(s.high, sixth, part, fused) + s.high * missing + s.low * sixth;
     const double cube = part * r.high;
-    const double cube_low = lost(part, r.high, cube, fused) + part_low * r.high + part * r.low;
+    const double cube_low = part_lost(part, r.high, cube, fused) + part_low * r.high + part * r.low;
     const Pair first = sum_of(r.high, -cube);
     const double rest = r.high * (s.high * s.high) * rest_of_sine(s.high);
     return sum_of(first.high, first.low + (r.low - cube_low) + rest);
@@ -101,7 +101,7 @@ INLINED Pair cosine_of(Pair s, bool fused) {
     const Pair square = square_of(s, fused);
     const double fourth = square.high * part;
     const double fourth_low =
-        lost(square.high, part, fourth, fused) + square.high * missing + square.low * part;
+        part_lost(square.high, part, fourth, fused) + square.high * missing + square.low * part;
     const Pair first = sum_of(1.0, -0.5 * s.high), second = sum_of(first.high, fourth);
     const double rest = s.high * square.high * rest_of_cosine(s.high);
     return sum_of(second.high,

@@ -22,7 +22,7 @@ static bool make_inputs(const Pool *pool, const Single *s) {
     Notes notes = {.outside = false};
 
     program_run(&s->inputs, &source, 0, 1, s->input_registers, &notes);
-    if (notes.outside || !all_finite(s->wanted, count)) {
+    if (notes.outside || !are_finite(s->wanted, count)) {
         return false;
     }
     memcpy(s->inputs_row, s->wanted, count * sizeof *s->wanted);

@@ -163,7 +163,7 @@ WIDE bool all_within(const double *values, size_t count, double limit) {
     return bad == 0;
 }
 
-bool all_finite(const double *values, size_t count) {
+bool are_finite(const double *values, size_t count) {
     return all_within(values, count, DBL_MAX);
 }
 
@@ -198,7 +198,7 @@ Status instance_read_outputs(Pool *pool, Instance *me, Scratch scratch) {
     if (got > STATUS_WARNING) {
         return instance_fail(pool, me, "reading the outputs", got);
     }
-    if (!all_finite(scratch.values, count)) {
+    if (!are_finite(scratch.values, count)) {
         return instance_note_not_finite(me, BAD_OUTPUTS, scratch.values, count);
     }
     double *place = s->output_values + index_of(pool, me);
@@ -232,7 +232,7 @@ Status instance_step(Pool *pool, Instance *me, Scratch scratch) {
     if (me->phase != PHASE_STEPPING) {
         return instance_refuse(me, "the instance needs a reset before it can be stepped");
     }
-    if (!scratch.sound && !all_finite(scratch.inputs, s->inputs->count)) {
+    if (!scratch.sound && !are_finite(scratch.inputs, s->inputs->count)) {
         return instance_note_not_finite(me, BAD_INPUTS, scratch.inputs, s->inputs->count);
     }
     if (s->retries > 0) {

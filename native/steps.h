@@ -52,7 +52,7 @@ Status instance_fail_reading(Pool *pool, Instance *me, Status status);
 /* Magnitudes up to this one become finite when rounded to a float32. */
 #define FLOAT32_LIMIT 0x1.fffffefffffffp+127
 
-bool all_finite(const double *values, size_t count);
+bool are_finite(const double *values, size_t count);
 /* Whether no magnitude is greater than the limit; none is NaN. */
 bool all_within(const double *values, size_t count, double limit);
 /* Copies a column of a matrix. */
