@@ -19,18 +19,18 @@ from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 
 ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
-    ".*", "__pycache__", "*.egg-info", "*.py[cod]", "build", "dist", "results"
+    *(".*", "__pycache__", "*.egg-info", "*.py[cod]", "*.so", "build", "dist", "results")
 )
 STEP_EVERY_ENV = ROOT / "tests" / "step_every_env.py"
 HAS_BUILD_BACKEND = int(version("setuptools").split(".")[0]) >= 77
 
 
-def run(*command, **options):
+def run(*command, variables=None, **options):
     """Run a command without the variables that could lead it to the checkout."""
     env = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run(
         [str(word) for word in command],
-        env=env | {"PYTHONUTF8": "1"},
+        env=env | {"PYTHONUTF8": "1"} | (variables or {}),
         capture_output=True,
         encoding="utf-8",
         timeout=300,
@@ -61,8 +61,9 @@ def lend_dependencies(python):
     Path(purelib.strip(), "lent.pth").write_text("\n".join(lent) + "\n", encoding="utf-8")
 
 
-def pip_install(python, *what):
-    run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", *what)
+def pip_install(python, *what, **options):
+    pip = (sys.executable, "-m", "pip", "--python", python)
+    run(*pip, "install", "--no-deps", *what, **options)
 
 
 @pytest.fixture(scope="module")
@@ -123,6 +124,16 @@ def test_an_editable_install_steps_every_id_from_another_directory(editable_pyth
     file, steps = step_every_env(editable_python, tmp_path)
     assert file == (tree / "fmugym/__init__.py").resolve()
     assert_every_env_stepped(steps)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the compiler of Windows is not found by the PATH")
+def test_without_a_compiler_the_extension_is_built_all_the_same(tree, tmp_path):
+    copy = shutil.copytree(tree, tmp_path / "tree", ignore=NOT_SOURCES)
+    python = make_venv(tmp_path / "venv")
+    variables = {"PATH": str(tmp_path / "empty"), "CC": "no-compiler"}
+    pip_install(python, "--editable", copy, variables=variables)
+    lend_dependencies(python)
+    run(python, "-I", STEP_EVERY_ENV, "--native", cwd=tmp_path)
 
 
 def test_an_installed_wheel_brings_the_command(wheel_python, tmp_path):

@@ -22,9 +22,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 HOW_TO_BUILD = (
-    "the C extension of fmugym was not built. Install a C compiler (on Debian: apt install gcc; "
-    "on macOS: xcode-select --install; on Windows: the Build Tools for Visual Studio) and install "
-    "fmugym again with: pip install --force-reinstall --no-deps --no-binary :all: fmugym-toolbox"
+    "the C extension of fmugym was not built, for want of Python's headers. Install them (on "
+    "Debian: apt install python3-dev), and fmugym again"
 )
 
 
