@@ -380,14 +380,13 @@ def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) 
 def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
     writer.flags(solving is not None)
     if solving is not None:
-        name, tolerance, max_step, states, indicators, completes, *blocks, duration = solving
+        name, tolerance, max_step, states, indicators, completes, *blocks = solving
         writer.text(name)
         writer.numbers(tolerance, max_step)
         writer.integers(states, indicators)
         writer.flags(completes)
         for block in blocks:
             writer.block(block or b"")
-        writer.numbers(duration)
 
 
 def _write_texts(writer: _Writer, texts: Sequence[bytes]) -> None:
