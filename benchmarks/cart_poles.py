@@ -47,7 +47,7 @@ def actions(num_envs: int) -> npt.NDArray[np.int64]:
 
 
 def require_native_pool() -> None:
-    """Refuse to measure on the Python pool by mistake.
+    """Refuse to measure FMPy by mistake.
 
     Raises:
         MissingError: If the C extension was not built.
@@ -121,13 +121,12 @@ def _fmpy_start(fmu: FMU2Slave, references: dict[str, int]) -> None:
 
 
 def fmugym_vector(num_envs: int, **options: Any) -> gym.vector.VectorEnv[Any, Any, Any]:
-    """Make a vector environment of this package, on the native pool unless told otherwise.
+    """Make a vector environment of this package.
 
     Raises:
         MissingError: If there is no native pool.
     """
-    if options.get("backend") != "python":
-        require_native_pool()
+    require_native_pool()
     return gym.make_vec(FMUGYM, num_envs, **options)
 
 

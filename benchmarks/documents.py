@@ -17,7 +17,6 @@ __all__ = ["DOCUMENTS"]
 
 LEFT_OUT = {
     "fmugym, DISABLED, 2 threads",
-    "fmugym, Python pool",
     "Gymnasium AsyncVectorEnv",
     "EnvPool, 2 threads",
 }

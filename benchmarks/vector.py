@@ -30,7 +30,7 @@ import fmugym
 __all__ = ["tables"]
 
 SIZES = (1, 8, 64, 1024, 4096)
-MOST = {"fmugym, Python pool": 64, "Gymnasium SyncVectorEnv": 64, "Gymnasium AsyncVectorEnv": 8}
+MOST = {"Gymnasium SyncVectorEnv": 64, "Gymnasium AsyncVectorEnv": 8}
 """The largest sizes; larger ones would take longer and show nothing new."""
 
 BASE, LIMIT = "Gymnasium make_vec (numpy)", "C limit, 1 thread"
@@ -81,7 +81,6 @@ def _makers(stack: ExitStack, size: int) -> Iterator[tuple[str, Callable[[], Run
         yield f"fmugym, {mode}, {text}", lambda o=options: _fmugym(stack, size, **o)
     arrays = {"hooks": "array", "threads": most}
     yield f'fmugym, hooks="array", {text}', lambda: _fmugym(stack, size, **arrays)
-    yield "fmugym, Python pool", lambda: _fmugym(stack, size, backend="python")
     yield BASE, lambda: _gymnasium(stack, size, "vector_entry_point")
     yield "Gymnasium SyncVectorEnv", lambda: _gymnasium(stack, size, "sync")
     yield "Gymnasium AsyncVectorEnv", lambda: _gymnasium(stack, size, "async", context="spawn")

@@ -376,6 +376,22 @@ class Pool:
     def read(self, variables: Access, values: Array, /) -> int:
         """Read variables of all; returns the instance that refuses, or -1."""
 
+    def differentiate(
+        self, adjoint: bool, part: int, seeded: Access, others: Access, derivatives: Array, /
+    ) -> int:
+        """Differentiate variables of all by others, with the inputs set.
+
+        Args:
+            adjoint: Whether the others are what is differentiated by.
+            part: The FMU of a system that the variables are of; otherwise 0.
+            seeded: One after the other.
+            others: All at once.
+            derivatives: To be filled, shape (seeded * others, N).
+
+        Returns:
+            The instance that refuses, or -1.
+        """
+
     def knows_start(self, index: int, start: Access, values: bytes, /) -> bool:
         """Whether a reset with these start values (float64) restores a state."""
 

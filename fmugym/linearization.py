@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,8 @@ from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
-from fmugym.fmi.access import Access
-from fmugym.fmi.instance import Instance
-from fmugym.fmi.log import fmu_calls
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.fmi.system_library import open_library
+from fmugym.pool.base import Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
 from fmugym.systems.fmu import SystemFMU
@@ -111,13 +108,12 @@ def linearize(
     u = _chosen(description, "continuous input", inputs, _inputs(description))
     start = _start_values(description, at or {})
     meet(fmu)
-    if fmu.in_wine:
-        with closing(_InstanceInWine(fmu, start)) as worker:
-            return _linear_model(worker, description, x, u)
-    with fmu_calls, closing(open_library(fmu, logger, None, (), ())) as library:
-        instance = library.instantiate()
-        _initialize(instance, description, start)
-        return _linear_model(_InstanceHere(instance), description, x, u)
+    spec = PoolSpec((), (), 1.0, start_time=description.start_time)
+    with closing(trial_pool(fmu, spec, 1, logger)) as pool:
+        pool.reset(tuple(start), np.array([list(start.values())], float).T)
+        if pool.statuses[0] > WARNING_CODE:
+            raise SimulationError(pool.failure(0))
+        return _linear_model(pool, description, x, u)
 
 
 def _require_derivatives(description: ModelDescription) -> None:
@@ -214,71 +210,16 @@ def _start_values(
     return checked
 
 
-def _initialize(
-    instance: Instance, description: ModelDescription, start: Mapping[Variable, float]
-) -> None:
-    access = Access(instance, tuple(start), np.array(list(start.values()), float))
-
-    def set_start_values() -> None:
-        instance.check("setting the start values", access.set())
-        access.set_texts()
-
-    instance.initialize(description.start_time, None, None, set_start_values)
-
-
-class _Differentiable(Protocol):
-    """An instance after its initialization."""
-
-    def jacobian(self, unknowns: Variables, knowns: Variables) -> FloatArray: ...
-
-    def read(self, variables: Variables) -> FloatArray: ...
-
-
-class _InstanceHere:
-    """One in this process."""
-
-    def __init__(self, instance: Instance) -> None:
-        self._instance = instance
-        self.jacobian = instance.jacobian
-
-    def read(self, variables: Variables) -> FloatArray:
-        access = Access(self._instance, variables)
-        self._instance.check("reading variables", access.get())
-        return access.values
-
-
-class _InstanceInWine:
-    """One in a worker, if this process cannot load the library."""
-
-    def __init__(self, fmu: FMU, start: Mapping[Variable, float]) -> None:
-        spec = PoolSpec((), (), 1.0, start_time=fmu.description.start_time)
-        self._pool = trial_pool(fmu, spec, 1, logger)
-        self.close = self._pool.close
-        try:
-            self._pool.reset(tuple(start), np.array([list(start.values())], float).T)
-            if self._pool.statuses[0] > WARNING_CODE:
-                raise SimulationError(self._pool.failure(0))
-        except BaseException:
-            self.close()
-            raise
-
-    def jacobian(self, unknowns: Variables, knowns: Variables) -> FloatArray:
-        return self._pool.differentiate(unknowns, knowns)[:, :, 0]
-
-    def read(self, variables: Variables) -> FloatArray:
-        return self._pool.read(variables)[:, 0]
-
-
 def _linear_model(
-    instance: _Differentiable, description: ModelDescription, x: Variables, u: Variables
+    pool: Pool, description: ModelDescription, x: Variables, u: Variables
 ) -> LinearModel:
     x_dot = tuple(description.variable(description.state_derivatives[v.name]) for v in x)
     return LinearModel(
-        A=instance.jacobian(x_dot, x),
-        B=instance.jacobian(x_dot, u),
-        f=instance.read(x_dot),
-        x0=instance.read(x),
-        u0=instance.read(u),
+        A=pool.differentiate(x_dot, x)[:, :, 0],
+        B=pool.differentiate(x_dot, u)[:, :, 0],
+        f=pool.read(x_dot)[:, 0],
+        x0=pool.read(x)[:, 0],
+        u0=pool.read(u)[:, 0],
         states=_names(x),
         inputs=_names(u),
         derivatives=_names(x_dot),

@@ -95,7 +95,7 @@ static bool allocate(Access *access, const Listing *listing) {
     return true;
 }
 
-static void take_texts(Access *access, const Listing *listing) {
+static void keep_texts(Access *access, const Listing *listing) {
     memcpy(access->letters, listing->texts, listing->size_of_texts);
     const char *end = access->letters + listing->size_of_texts;
 
@@ -180,7 +180,7 @@ bool access_open(Access *access, const Fmi *fmi, const Listing *listing) {
     if (!allocate(access, listing)) {
         return false;
     }
-    take_texts(access, listing);
+    keep_texts(access, listing);
     share_memory(access, all);
     for (size_t i = 0; i < listing->count; i++) {
         if (access->types[i] == START_TIME) {

@@ -37,7 +37,7 @@ Failure *failure_note(Instance *me, const char *doing, int status) {
         me->failure->doing = doing;
         me->failure->status = status;
         me->failure->time = NAN;
-        me->failure->string_reference = UINT32_MAX;
+        me->failure->reference = UINT32_MAX;
     }
     return me->failure;
 }

@@ -73,6 +73,14 @@ void far_drop(const Library *library, void *component);
 const char *far_blamed(const void *component);
 Status far_choose_messages(const Library *library, void *component, const char *const *categories,
                            size_t count);
+Status far_get(const Library *library, void *component, Type type, const uint32_t *references,
+               size_t count, void *values, size_t size);
+Status far_set(const Library *library, void *component, Type type, const uint32_t *references,
+               size_t count, const void *values, size_t size);
+Status far_get_string(const Library *library, void *component, uint32_t reference,
+                      const char **text);
+Status far_set_string(const Library *library, void *component, uint32_t reference,
+                      const char *text);
 Status far_get_state(const Library *library, void *component, void **state);
 Status far_set_state(const Library *library, void *component, void *state);
 Status far_free_state(const Library *library, void *component, void **state);

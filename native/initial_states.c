@@ -35,7 +35,7 @@ static Status fail_initialization(Pool *pool, Instance *me, const StartContext *
                                   const char *doing, Status status) {
     instance_fail(pool, me, doing, status);
     if (me->failure != NULL) {
-        me->failure->string_reference = context->refused;
+        me->failure->reference = context->refused;
     }
     if (me->phase == PHASE_INSTANTIATED) {
         me->phase = PHASE_FAILED; /* initialization stopped halfway, so a reset is necessary */

@@ -195,7 +195,7 @@ void play_start_episode(const Turn *turn, size_t index) {
     start_listed(turn, &starting, 1);
 }
 
-WIDE static bool is_any_set(const uint8_t *flags, size_t count) {
+WIDE static bool is_any(const uint8_t *flags, size_t count) {
     uint8_t any = 0;
 
     for (size_t j = 0; j < count; j++) {
@@ -208,7 +208,7 @@ static void start_episodes(const Turn *turn, size_t begin, size_t count) {
     uint32_t starting[PROGRAM_WIDTH];
     size_t number = 0;
 
-    if (!is_any_set(turn->play->ended + begin, count)) {
+    if (!is_any(turn->play->ended + begin, count)) {
         return;
     }
     for (size_t index = begin; index < begin + count; index++) {
@@ -264,7 +264,7 @@ WIDE static size_t judge(const Turn *turn, size_t begin, size_t count, const uin
 
 static void add_notes(const Notes *notes, size_t count, Verdict *verdict) {
     verdict->outside |= notes->outside;
-    if (is_any_set(notes->not_finite, count)) {
+    if (is_any(notes->not_finite, count)) {
         for (size_t j = 0; j < count; j++) {
             verdict->troubled += notes->not_finite[j];
         }

@@ -99,7 +99,7 @@ typedef struct {
     int status;
     bool in_warm_up;
     double time;               /* time of the step, NaN for other calls */
-    uint32_t string_reference; /* the String that could not be set, or UINT32_MAX */
+    uint32_t reference;        /* of the String or the known that it was about, or UINT32_MAX */
     char *said;                /* what the FMU logged, or NULL */
     double *values;            /* the inputs or outputs if they caused the failure, or NULL */
     size_t number_of_values;

@@ -1,13 +1,29 @@
 #include "far.h"
+#include "remote.h"
 
-#if !defined _WIN32
+#if defined _WIN32
+
+#include <stdio.h>
+
+bool remote_open(Library *library, const Component *part, size_t parts, char *error, size_t size) {
+    (void)library;
+    (void)part;
+    (void)parts;
+    snprintf(error, size, "components have processes of their own on Linux and macOS only");
+    return false;
+}
+
+void remote_close(Library *library) {
+    (void)library;
+}
+
+#else
 
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "log.h"
-#include "remote.h"
 #include "served.h"
 
 /* Workers */

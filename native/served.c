@@ -13,40 +13,7 @@
 #include "log.h"
 #include "serving.h"
 
-Served served; /* the FMU that this process has been started for */
-
 static const uint64_t FOR_EVER = UINT64_MAX;
-
-/* Nobody can be told, and the other side takes it as a death. */
-static void end_process(int status) {
-#if defined _WIN32
-    ExitProcess((UINT)status);
-#else
-    _exit(status);
-#endif
-}
-
-void *serving_memory(void *old, size_t size) {
-    void *memory = realloc(old, size + 1);
-
-    if (memory == NULL) {
-        end_process(1);
-    }
-    return memory;
-}
-
-size_t serving_take_size(void) {
-    return packet_take_size(&served.in);
-}
-
-void *serving_take_copy(size_t *size) {
-    uint64_t count;
-
-    TAKE(&served.in, count);
-    const char *bytes = packet_see(&served.in, (size_t)count);
-    *size = bytes == NULL ? 0 : (size_t)count;
-    return *size == 0 ? NULL : memcpy(serving_memory(NULL, *size), bytes, *size);
-}
 
 static void *scratch_of(size_t size) {
     if (size > served.room) {
@@ -56,17 +23,12 @@ static void *scratch_of(size_t size) {
     return served.scratch == NULL ? (served.scratch = serving_memory(NULL, 0)) : served.scratch;
 }
 
-char *serving_copy(const char *text) {
-    const size_t size = strlen(text) + 1;
-    return memcpy(serving_memory(NULL, size), text, size);
-}
-
 static void send(char code, Packet *packet) {
     mutex_lock(&served.sending);
     const Arrival arrival = channel_send(served.channel, code, packet, FOR_EVER);
     mutex_unlock(&served.sending);
     if (arrival != CAME) {
-        end_process(0);
+        serving_end(0);
     }
 }
 
@@ -80,14 +42,6 @@ static void pass_on(uint64_t environment, int status, const char *category, cons
     packet_put_text(packet, category);
     packet_put_text(packet, text);
     send(MESSAGE, packet);
-}
-
-void serving_answer(Status status) {
-    const int32_t number = status;
-
-    floats_restore_if_seen(&served.floats);
-    packet_clear(&served.out);
-    PUT(&served.out, number);
 }
 
 /* Instances */
@@ -378,7 +332,7 @@ static bool serve_next(Status *status) {
     char code;
 
     if (channel_receive(served.channel, &code, &served.in, FOR_EVER) != CAME) {
-        end_process(0); /* the other side is gone, and nobody needs what is there */
+        serving_end(0); /* the other side is gone, and nobody needs what is there */
     }
     if (code == GO_ON) {
         int32_t number;
@@ -422,7 +376,7 @@ static void *end_with_parent(void *unused) {
     while (getppid() == parent) {
         sleep(1);
     }
-    end_process(1);
+    serving_end(1);
     return NULL;
 }
 

@@ -57,6 +57,8 @@ typedef struct {
 
 extern Served served;
 
+/* Ends the process. Nobody can be told, and the other side takes it as a death. */
+void serving_end(int status);
 /* Ends the process if there is no memory left. */
 void *serving_memory(void *old, size_t size);
 char *serving_copy(const char *text);

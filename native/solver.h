@@ -106,10 +106,10 @@ Status solver_enter_events(Solver *me);
 /* Integrates to this time, and handles all events until then and at it. */
 Status solver_advance(Solver *me, double until);
 
-/* For crossings.c: moves the FMU to a time and state, and reads the event indicators there. */
+/* In equations.c: moves the FMU to a time and state, and reads the event indicators there. */
 Status solver_place(Solver *me, double time, const double *x);
 Status solver_indicators(Solver *me, double *z);
-/* Finds the first crossing in the step that ends at *end. Moves the end and next to just after
+/* In crossings.c: finds the first crossing in the step that ends at *end. Moves the end and next to just after
  * it. */
 Status solver_locate(Solver *me, double *end);
 /* Whether an indicator becomes positive or ceases to be: FMI's events. */
@@ -122,7 +122,7 @@ static inline bool solver_crosses(const Solver *me, const double *before, const 
     return any;
 }
 
-/* For clocks.c. The first logs a message like one of the FMU, and returns an Error. */
+/* In equations.c. The first logs a message like one of the FMU, and returns an Error. */
 Status solver_fail(const Solver *me, const char *format, ...);
 void solver_restore_floats(const Solver *me);
 
@@ -139,8 +139,9 @@ static inline double smaller(double a, double b) {
     return b < a ? b : a;
 }
 
-/* For the methods: the rates at a time and state. */
+/* The rates at a time and state, and where the FMU is. In equations.c. */
 Status solver_rates(Solver *me, double time, const double *x, double *rates);
+Status solver_rates_here(Solver *me, double *rates);
 /* Fills jacobian, row by row, and slope: the derivatives of the rates by state and time. In
  * differentials.c. */
 Status solver_differentiate(Solver *me, double step);

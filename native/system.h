@@ -1,8 +1,7 @@
 /* A system: several FMUs that look like one. Its instances have an instance of each FMU.
  *
  * All values of a system are FLOAT64; its parts convert them to the types of their FMUs. A value
- * reference is an index of its variables. fmugym/fmi/system.py does the same operation by
- * operation. */
+ * reference is an index of its variables. */
 
 #ifndef FMUGYM_SYSTEM_H
 #define FMUGYM_SYSTEM_H
@@ -269,8 +268,6 @@ Status part_choose_messages(Composite *me, size_t index);
 bool part_reload(Composite *me, size_t index);
 
 /* The start that parts return to. */
-bool start_allocate(Composite *me);
-void start_free(Composite *me);
 /* Notes what is set before the initialization that comes. */
 bool start_note(Composite *me, double start_time);
 /* Whether this initialization can return to the last one. */
@@ -293,6 +290,8 @@ Status part_judge(Composite *me, size_t index, Status status);
 /* Sets the inputs of a part to its slots; and fills the slots of its outputs. The caller judges the
  * status. */
 Status part_set_inputs(Composite *me, size_t index);
+/* Differentiates variables of a part, after its inputs were set. */
+Status part_derive(Composite *me, size_t index, const Derivation *derivation, double *values);
 Status part_read(Composite *me, size_t index);
 /* A scalar, or the array of an element as a whole, which has slots. The place of the element must
  * stay the same: solvers compare that of its reference. */

@@ -70,13 +70,30 @@ void system_unload(Library *library) {
 
 /* Instances */
 
+static bool allocate_start(Composite *me) {
+    const System *s = me->system;
+
+    me->kept.states = calloc(s->count, sizeof(void *));
+    me->kept.slots = calloc(s->inputs + s->outputs + 1, sizeof(double));
+    me->kept.useless = calloc(s->count, sizeof(bool));
+    return me->kept.states != NULL && me->kept.slots != NULL && me->kept.useless != NULL;
+}
+
+static void free_start(Composite *me) {
+    free((void *)me->kept.states);
+    free(me->kept.slots);
+    free(me->kept.useless);
+    free(me->kept.key);
+    free(me->kept.wanted);
+}
+
 static void free_arrays(Composite *me) {
     free(me->parts.dead);
     free(me->parts.started);
     free(me->parts.failed);
     free((void *)me->parts.before);
     free(me->parts.names);
-    start_free(me);
+    free_start(me);
     free(me->coarse);
     free(me->loop);
     free(me->typed);
@@ -96,7 +113,7 @@ static bool allocate(Composite *me, const System *s) {
     me->whole = me->typed == NULL ? NULL : me->typed + s->scratch + 1;
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&
            me->coarse != NULL && me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
-           me->typed != NULL && start_allocate(me);
+           me->typed != NULL && allocate_start(me);
 }
 
 /* The slots follow the instance, so that a step finds all of it in a few cache lines. */

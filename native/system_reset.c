@@ -262,22 +262,3 @@ void start_blame(Composite *me) {
         me->kept.useless[i] = true;
     }
 }
-
-/* Memory */
-
-bool start_allocate(Composite *me) {
-    const System *s = me->system;
-
-    me->kept.states = calloc(s->count, sizeof(void *));
-    me->kept.slots = calloc(s->inputs + s->outputs + 1, sizeof(double));
-    me->kept.useless = calloc(s->count, sizeof(bool));
-    return me->kept.states != NULL && me->kept.slots != NULL && me->kept.useless != NULL;
-}
-
-void start_free(Composite *me) {
-    free((void *)me->kept.states);
-    free(me->kept.slots);
-    free(me->kept.useless);
-    free(me->kept.key);
-    free(me->kept.wanted);
-}

@@ -117,6 +117,20 @@ Status part_set_inputs(Composite *me, size_t index) {
                       me->inputs + part->first_input, me->typed, me->floats);
 }
 
+Status part_derive(Composite *me, size_t index, const Derivation *derivation, double *values) {
+    const Fmi *fmi = me->system->parts[index].fmi;
+    Status status = STATUS_ERROR;
+
+    me->blamed = NULL;
+    if (fmi->derive != NULL) {
+        status = part_set_inputs(me, index);
+    }
+    if (status <= STATUS_WARNING) {
+        status = fmi->derive(&me->libraries[index], me->components[index], derivation, values);
+    }
+    return part_judge(me, index, status);
+}
+
 Status part_read(Composite *me, size_t index) {
     const Component *part = &me->system->parts[index];
 

@@ -1,4 +1,4 @@
-/* When a clock ticks next: fmugym/fmi/clocks.py does the same. */
+/* When a clock ticks next. */
 
 #include "clock.h"
 

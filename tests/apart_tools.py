@@ -18,7 +18,7 @@ from fmugym import (
     FMUSystem,
     bundled_fmu,
 )
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import Component as Planned
@@ -27,10 +27,9 @@ from fmugym.systems.plan import Link
 LOG = logging.getLogger("fmugym.test")
 MASSES = ["first.y1", "second.y2"]
 
-where_they_run = [
-    pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components"),
-    pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only"),
-]
+where_they_run = pytest.mark.skipif(
+    os.name == "nt", reason="they have processes of their own on Unix only"
+)
 
 
 @pytest.fixture(scope="module", name="fmus")
@@ -50,9 +49,7 @@ def closing_pools():
             fmu = SystemFMU(plan)
             variables = tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs))
             spec = PoolSpec(*variables, time_step, **options)
-            pool = local_pool(
-                fmu, spec, count, LOG, native=True, threads=threads, private_libraries=private
-            )
+            pool = local_pool(fmu, spec, count, LOG, threads=threads, private_libraries=private)
             pool.variable = fmu.variable
             return stack.enter_context(contextlib.closing(pool))
 

@@ -49,23 +49,24 @@ FLAGS = 'canGetAndSetFMUState="true" canSerializeFMUState="true"'
 
 
 def clocks_fmu(
-    path, interface="CoSimulation", event_mode=True, flags="", clocks=None, arrays=False
+    path, interface="CoSimulation", event_mode=True, flags="", clocks=None, arrays=False, scale=1
 ):
     """Write the FMU with one interface; if its clocks are ``FRACTIONS``, it takes no decimals.
 
-    If asked for, it has the arrays.
+    If asked for, it has the arrays. Counters and resolutions of two of its fractions are so many
+    times as large.
     """
     clocks = CLOCKS if clocks is None else clocks
     files = {
         "modelDescription.xml": _describe(interface, event_mode, flags, clocks, arrays),
-        fmu_tools.library_name(3, "Clocks"): _library(clocks is not CLOCKS),
+        fmu_tools.library_name(3, "Clocks"): _library(clocks is not CLOCKS, scale),
     }
     return fmu_tools.write_fmu(Path(path), files)
 
 
-def _library(fractions):
+def _library(fractions, scale):
     source = "exchange/clocks.c"
-    flags = ("-DFRACTIONS",) if fractions else ()
+    flags = ("-DFRACTIONS", f"-DSCALE={scale}") if fractions else ()
     stubs = fmu_tools.stubs(3, "fmi3", building.HERE / source)
     return building.library(source, flags=flags, stubs=stubs)
 

@@ -31,7 +31,7 @@ OTHERS = {
     "circuit": ["duty", "limit", "source", "discharges", "period", "tau"],
     "tank": ["u", "discards"],
     "prothero": ["k"],
-    "relay": ["turns", "last", "speed"],
+    "relay": ["turns", "last", "speed", "steps"],
     "sun": ["now", "sine", "seconds", "u"],
     "season": ["u"],
 }
@@ -39,7 +39,7 @@ OTHERS = {
 
 INDICATORS = {"ball": 1, "friction": 2, "circuit": 1}
 INPUTS = {"u", "duty", "e"}
-OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns"}
+OUTPUTS = {"bounces", "count", "mode", "source", "discharges", "discards", "turns", "steps"}
 OUTPUTS |= {"y", "calls", "now", "sine", "seconds"}
 START = {
     "dahlquist": {"x": 1, "u": 0, "k": 1},

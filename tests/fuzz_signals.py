@@ -125,15 +125,12 @@ class Talkative(fmu_tools.PlainEnv):
 
 WAYS = {
     "logs": Talkative,
-    "logs in Python": functools.partial(Talkative, backend="python"),
     "single": single,
-    "single in Python": functools.partial(single, backend="python"),
     "single isolated": functools.partial(single, isolation="process"),
     "compiled": functools.partial(vector, hooks="compiled", threads=2),
     "array": functools.partial(vector, hooks="array"),
     "per_env": functools.partial(vector, hooks="per_env"),
     "same step": functools.partial(vector, autoreset_mode="same_step"),
-    "vector in Python": functools.partial(vector, backend="python"),
     "isolated": functools.partial(vector, isolation="process", workers=2),
 }
 

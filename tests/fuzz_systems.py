@@ -1,4 +1,4 @@
-"""Random systems: the C extension and Python give the same, bit by bit, whatever is called.
+"""Random systems: each does what it does alone, bit by bit, whatever is called.
 
     python tests/fuzz_systems.py --count 400 --seed 0
 
@@ -19,7 +19,7 @@ from fuzz_driver import Case, main, require
 from system_tools import MATRICES, linear_fmu
 
 from fmugym import Component, Connection, FMUSystem, SimulationError
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
@@ -95,17 +95,17 @@ def spec_of(rng, fmu, versions):
     )
 
 
-class Twins:
-    """The same pool in both engines."""
+class Pools:
+    """Systems that step together, and pools of one in which each does the same alone."""
 
     def __init__(self, system, spec):
         able = system.as_fmu().description.capabilities
+        self.can_save = able.can_get_and_set_fmu_state
         self.can_serialize = able.can_serialize_fmu_state
-        engines = (False, True) if has_native_pool() else (False, False)
-        self.pools, self._saved = [], []
+        self.pools, self.snapshots = [], None
         try:
-            for native in engines:
-                pool = local_pool(system.as_fmu(), spec, COUNT, LOG, native=native)
+            for count in (COUNT, *[1] * COUNT):
+                pool = local_pool(system.as_fmu(), spec, count, LOG)
                 pool.save_by(lambda: SaveMethod.STATE)
                 self.pools.append(pool)
         except BaseException:
@@ -116,74 +116,92 @@ class Twins:
         for pool in self.pools:
             pool.close()
 
-    def both(self, what, call):
-        """Do the same with both, and compare."""
-        found = [self._result(pool, call) for pool in self.pools]
-        require(found[0] == found[1], f"{what}: {found[0][:2]!r} and {found[1][:2]!r}")
+    @property
+    def sound(self):
+        """Whether none has failed."""
+        return not self.pools[0].statuses.any()
 
-    def _result(self, pool, call):
-        try:
-            result = call(pool)
-        except SimulationError:
-            result = "refused"
-        values = pool.outputs.tobytes(), pool.statuses.tobytes()
-        told = result.tobytes() if isinstance(result, np.ndarray) else repr(result)
-        return told, pool.statuses.tolist(), values
+    def all(self, what, call):
+        """Do the same with all, and compare; the call gets a pool and the columns of its own."""
+        together, *alone = self.pools
+        call(together, slice(None))
+        for index, pool in enumerate(alone):
+            call(pool, slice(index, index + 1))
+            self._compare(what, index)
+
+    def each(self, what, call):
+        """Do it with one after the other; the call gets a pool and a mask."""
+        together, *alone = self.pools
+        for index, pool in enumerate(alone):
+            told = _told(call, together, np.arange(COUNT) == index)
+            own = _told(call, pool, None)
+            require(told == own, f"{what}: {told} and {own}")
+            self._compare(what, index)
+
+    def _compare(self, what, index):
+        together, own = self.pools[0], self.pools[1 + index]
+        expected = together.outputs[:, index].tolist(), together.statuses[index]
+        found = own.outputs[:, 0].tolist(), own.statuses[0]
+        require(repr(found) == repr(expected), f"{what}: {found} and {expected}")
 
 
-def reset(rng, twins, spec, starts):
+def _told(call, pool, mask):
+    try:
+        call(pool, mask)
+    except SimulationError:
+        return "refused"
+    return "done"
+
+
+def reset(rng, pools, spec, starts):
     """Two sets of start values, so that some come again."""
     values = np.array([[rng.choice((0.5, -0.2)) for _ in range(COUNT)] for _ in starts])
     values = values.reshape(len(starts), COUNT)
-    mask = rng.choice((None, np.array([True, False])))
-    twins.both("reset", lambda pool: pool.reset(starts, values, mask) and None)
+    mask = rng.choice((np.array([True, True]), np.array([True, False])))
+    pools.all("reset", lambda pool, own: pool.reset(starts, values[:, own], mask[own]))
 
 
-def step(rng, twins, spec, starts):
+def step(rng, pools, spec, starts):
     rows = [[rng.uniform(-1, 1) for _ in range(COUNT)] for _ in spec.inputs]
     values = np.array(rows).reshape(len(spec.inputs), COUNT)
-    twins.both("step", lambda pool: pool.step(values) and None)
+    pools.all("step", lambda pool, own: pool.step(values[:, own]))
 
 
-def save(rng, twins, spec, starts):
-    snapshots = {}
-
-    def keep(pool):
-        snapshots[id(pool)] = pool.save()
-
-    twins.both("save", keep)
-    twins.snapshots = snapshots
+def save(rng, pools, spec, starts):
+    if pools.sound and pools.can_save:
+        pools.snapshots = [pool.save() for pool in pools.pools]
 
 
-def restore(rng, twins, spec, starts):
-    if len(getattr(twins, "snapshots", {})) == len(twins.pools):
-        twins.both("restore", lambda pool: pool.restore(twins.snapshots[id(pool)]) and None)
+def restore(rng, pools, spec, starts):
+    if pools.snapshots:
+        snapshot_of = dict(zip(pools.pools, pools.snapshots, strict=True))
+        pools.each("restore", lambda pool, mask: pool.restore(snapshot_of[pool], mask))
 
 
-def bundle(rng, twins, spec, starts):
-    """Serialized states of one go to the other instance; those of both engines are alike."""
-    one, other = np.array([0]), np.array([1])
-
-    def move(pool):
-        if twins.can_serialize and not pool.statuses.any():
-            pool.restore_instances(pool.save_instances(one), np.array([0]), other)
-
-    twins.both("bundle", move)
+def bundle(rng, pools, spec, starts):
+    """The serialized state of the first goes to the second, alone to another pool."""
+    if pools.sound and pools.can_serialize:
+        together, first, second = pools.pools
+        zero, one = np.array([0]), np.array([1])
+        together.restore_instances(together.save_instances(zero), zero, one)
+        second.restore_instances(first.save_instances(zero), zero, zero)
 
 
-def write(rng, twins, spec, starts):
+def write(rng, pools, spec, starts):
     """Inputs may be set between steps."""
-    if spec.inputs:
+    if spec.inputs and pools.sound:
         value = np.full((1, COUNT), rng.uniform(-1, 1))
-        twins.both("write", lambda pool: pool.write(spec.inputs[:1], value))
+        pools.all("write", lambda pool, own: pool.write(spec.inputs[:1], value[:, own]))
 
 
-def read(rng, twins, spec, starts):
-    twins.both("read", lambda pool: pool.read(spec.outputs).copy())
+def read(rng, pools, spec, starts):
+    if pools.sound:
+        together, *alone = (pool.read(spec.outputs) for pool in pools.pools)
+        require(np.hstack(alone).tolist() == together.tolist(), f"read: {alone} and {together}")
 
 
-def recycle(rng, twins, spec, starts):
-    twins.both("recycle", lambda pool: pool.recycle())
+def recycle(rng, pools, spec, starts):
+    pools.all("recycle", lambda pool, _: pool.recycle())
 
 
 ACTIONS = (*(step,) * 8, *(reset,) * 3, save, restore, restore, bundle, write, read, recycle)
@@ -193,10 +211,10 @@ def play(rng, system, versions):
     fmu = system.as_fmu()
     spec = spec_of(rng, fmu, versions)
     starts = tuple(fmu.variable(f"{n}.x1_0") for n in system.components if rng.random() < 0.5)
-    with contextlib.closing(Twins(system, spec)) as twins:
-        reset(rng, twins, spec, starts)
+    with contextlib.closing(Pools(system, spec)) as pools:
+        pools.all("reset", lambda pool, _: pool.reset((), np.zeros((0, pool.num_instances))))
         for _ in range(CALLS):
-            rng.choice(ACTIONS)(rng, twins, spec, starts)
+            rng.choice(ACTIONS)(rng, pools, spec, starts)
 
 
 @contextlib.contextmanager

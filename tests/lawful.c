@@ -361,6 +361,11 @@ int fmi2GetBooleanStatus(Lawful *me, int kind, int *value) {
     return require(me, GET_STATUS, STEPPING | STEP_FAILED | TERMINATED);
 }
 
+int fmi2GetRealStatus(Lawful *me, int kind, double *value) {
+    *value = me->model.time;
+    return require(me, GET_STATUS, STEPPING | STEP_FAILED | TERMINATED);
+}
+
 int fmi2GetReal(Lawful *me, const unsigned *references, size_t count, double *values) {
     return get(me, references, count, values);
 }

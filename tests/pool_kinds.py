@@ -3,7 +3,6 @@
 import numpy as np
 
 POOLS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 1},
 }

@@ -9,17 +9,13 @@ import pytest
 from scipy.linalg import expm
 
 from fmugym import bundled_fmu
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.systems import FMUSystem
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
 LOG = logging.getLogger("fmugym.test")
-ENGINES = [pytest.param(False, id="python")]
-if has_native_pool():
-    ENGINES.append(pytest.param(True, id="native"))
-in_each_engine = pytest.mark.parametrize("native", ENGINES)
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 
 STATES = {
@@ -44,7 +40,7 @@ def closing_pools():
     """Make pools of plans that are closed after the test."""
     made = []
 
-    def make(plan, inputs=(), outputs=(), native=True, count=1, time_step=0.1, **options):
+    def make(plan, inputs=(), outputs=(), count=1, time_step=0.1, **options):
         fmu = plan.as_fmu() if isinstance(plan, FMUSystem) else SystemFMU(plan)
         spec = PoolSpec(
             tuple(map(fmu.variable, inputs)),
@@ -52,7 +48,7 @@ def closing_pools():
             time_step,
             **options,
         )
-        pool = local_pool(fmu, spec, count, LOG, native=native)
+        pool = local_pool(fmu, spec, count, LOG)
         pool.variable = fmu.variable
         made.append(pool)
         return pool

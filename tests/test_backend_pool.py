@@ -399,7 +399,7 @@ def test_a_rig_is_recorded(tmp_path):
         (object(), "a backend needs the methods reset, step and stop"),
         ([Oscillator(), Oscillator()], "1 backends are needed, got 2"),
         (lambda count: [], "1 backends are needed, got 0"),
-        ("fpu", "unknown backend 'fpu'; did you mean 'fmu'"),
+        ("fpu", "unknown backend 'fpu'; did you mean 'fm(py|u)'"),
     ],
 )
 def test_what_is_no_backend(backend, text):
@@ -408,8 +408,8 @@ def test_what_is_no_backend(backend, text):
 
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
-    env = RigEnv("python")
-    assert type(env._pool).__name__ == "PythonPool"
+    env = RigEnv("fmpy")
+    assert not env._pool.is_real
     env.close()
 
 
@@ -500,6 +500,14 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
+def test_hooks_of_real_plants_are_not_compiled():
+    with pytest.raises(ConfigError, match="the pool is not the native one"):
+        FMUVectorEnv(lambda: RigEnv(Oscillator()), 1, hooks="compiled")
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", backend=Oscillator())
+    with env, pytest.raises(ConfigError, match="the pool is not a native one"):
+        env.reset()
+
+
 class Twin:
     """A function of the number of rigs that makes rigs in one thread, by Python's iterators."""
 
@@ -515,7 +523,7 @@ class Simulated:
 
     def __init__(self, spec):
         self.fmu = FMU(PENDULUM)
-        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "python")
+        self.pool = make_pool(self.fmu, spec, 1, logging.getLogger("fmugym.test"), "fmpy")
 
     def reset(self, start_values):
         variables = tuple(map(self.fmu.variable, start_values))
@@ -563,9 +571,9 @@ class TestPool:
             np.testing.assert_allclose(pools[0].observations, pools[0].outputs.T, atol=1e-6)
 
     def test_there_are_no_states(self, pools):
-        with pytest.raises(SimulationError, match="no state that could be saved"):
+        with pytest.raises(SimulationError, match="no states that could be saved"):
             pools[0].save()
-        with pytest.raises(SimulationError, match="no state that could be restored"):
+        with pytest.raises(SimulationError, match="no states that could be restored"):
             pools[0].restore(None)
 
     def test_closed(self, pools):

@@ -87,7 +87,7 @@ class TestFoldersOfDeadProcesses:
         return folder
 
     def test_a_number_that_no_process_has_stops_nobody(self, planted):
-        CartPoleEnv(backend="python").close()
+        CartPoleEnv().close()
         assert not planted.exists()
 
     def test_those_of_others_stay(self, planted, monkeypatch):
@@ -99,4 +99,4 @@ class TestFoldersOfDeadProcesses:
         planted.rmdir()
         planted.symlink_to(temp / "nowhere")
         Path(f"{planted}c").touch()
-        CartPoleEnv(backend="python").close()
+        CartPoleEnv().close()

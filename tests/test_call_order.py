@@ -26,7 +26,7 @@ from hypothesis.stateful import (
 )
 
 from fmugym import FMU, FMUGymError
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
 
@@ -51,13 +51,6 @@ FAULTS = st.sampled_from((*lawful_tools.CALLS, "step", "step", "get", "set", "re
 GAINS = st.sampled_from([1.0, 2.0])
 ACTIONS = st.sampled_from([0.5, 0.5, -1.0, -1.0, np.nan])
 MASKS = st.lists(st.booleans(), min_size=N, max_size=N).map(np.array)
-BACKENDS = [
-    "python",
-    pytest.param(
-        "native",
-        marks=pytest.mark.skipif(not has_native_pool(), reason="the C extension was not built"),
-    ),
-]
 
 
 class LawfulEnv(PlainEnv):
@@ -65,7 +58,7 @@ class LawfulEnv(PlainEnv):
 
     steps_after_end = True
 
-    def __init__(self, path, backend="auto", **changes):
+    def __init__(self, path, **changes):
         config = {
             "model_input_names": "u",
             "model_output_names": "y",
@@ -73,7 +66,7 @@ class LawfulEnv(PlainEnv):
             "time_step": 0.5,
             "bounds": {"u": (-1, 1)},
         }
-        super().__init__(path, config | changes, logging.CRITICAL, backend=backend)
+        super().__init__(path, config | changes, logging.CRITICAL)
 
     def _is_done(self):
         return self.state[0] < -1.5
@@ -86,9 +79,9 @@ class Machine(RuleBasedStateMachine):
     step it.
     """
 
-    def __init__(self, path, version, backend, record):
+    def __init__(self, path, version, record):
         super().__init__()
-        self.path, self.version, self.backend, self.record = path, version, backend, record
+        self.path, self.version, self.record = path, version, record
         record.clear()
         self.subject = None
 
@@ -162,7 +155,7 @@ class SingleMachine(Machine):
         self.subject.step([0.5])
 
     def make(self):
-        return LawfulEnv(self.path, self.backend, **self.options)
+        return LawfulEnv(self.path, **self.options)
 
     @rule(gain=GAINS, override=st.booleans())
     def reset(self, gain, override):
@@ -203,7 +196,7 @@ class VectorMachine(Machine):
         self.subject.step(np.full((N, 1), 0.5))
 
     def make(self):
-        options = {"backend": self.backend, "private_libraries": False} | self.vector_options
+        options = {"private_libraries": False} | self.vector_options
         return FMUVectorEnv(lambda: LawfulEnv(self.path, **self.options), N, **options)
 
     @rule(mask=MASKS, masked=st.booleans())
@@ -247,7 +240,7 @@ class PoolMachine(Machine):
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.5, **self.options)
         self.snapshots = []
         self.gain = fmu.variable("k")
-        return make_pool(fmu, spec, N, LOG, self.backend, private_libraries=False)
+        return make_pool(fmu, spec, N, LOG, private_libraries=False)
 
     @rule(gain=GAINS, mask=st.none() | MASKS)
     def reset(self, gain, mask):
@@ -297,9 +290,8 @@ def fixture_record(tmp_path, monkeypatch):
     return record
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("version", MAJOR_VERSIONS)
 @pytest.mark.parametrize("machine", [SingleMachine, VectorMachine, PoolMachine])
-def test_no_illegal_call(machine, version, backend, record, tmp_path):
+def test_no_illegal_call(machine, version, record, tmp_path):
     path = lawful_tools.lawful_fmu(tmp_path, version)
-    run_state_machine_as_test(lambda: machine(path, version, backend, record), settings=SETTINGS)
+    run_state_machine_as_test(lambda: machine(path, version, record), settings=SETTINGS)

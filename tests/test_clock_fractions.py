@@ -15,9 +15,7 @@ from fmpy.fmi3 import FMU3Model
 from pool_kinds import POOLS
 
 from fmugym import FMU, FMULoadError
-from fmugym import pool as pools
 from fmugym.archive.variable import Interval
-from fmugym.fmi.clocks import Ticks
 from fmugym.pool import PoolSpec
 from fmugym.trial import opening
 
@@ -39,8 +37,6 @@ def fmu_path(tmp_path_factory):
 
 
 def open_pool(path, kind, step, outputs):
-    if kind == "native" and not pools.has_native_pool():
-        pytest.skip("the C extension was not built")
     fmu = FMU(path, probe_timeout=None)
     spec = PoolSpec((), tuple(map(fmu.variable, outputs)), time_step=step)
     return closing(opening.make_pool(fmu, spec, 1, LOG, **POOLS[kind]))
@@ -120,9 +116,8 @@ def test_a_restored_state_goes_on_with_the_same_ticks(fmu_path, interface):
     assert ends[0] == ends[1]
 
 
-@pytest.mark.parametrize("kind", ["native", "python"])
-def test_a_fraction_that_is_none_is_named(fmu_path, kind):
-    with open_pool(fmu_path["ModelExchange"], kind, 0.1, OUTPUTS) as pool:
+def test_a_fraction_that_is_none_is_named(fmu_path):
+    with open_pool(fmu_path["ModelExchange"], "native", 0.1, OUTPUTS) as pool:
         variable = FMU(fmu_path["ModelExchange"]).variable("bad counter")
         pool.reset((variable,), np.full((1, 1), 5.0))
         assert "value reference 2" in pool.failure(0)
@@ -164,10 +159,19 @@ def test_fmpy_gets_the_same_fractions(fmu_path):
     assert constant.by_fractions
 
 
-def test_numbers_too_large_for_exact_fractions_begin_anew():
-    """The common denominator of these is about 2**104."""
-    ticks = Ticks(0.0, Interval.of_fraction(1, 2**52 - 1), 2**51)
-    changed = ticks.changed_to(Interval.of_fraction(1, 2**52 - 3))
-    assert changed.passed == 0
-    assert changed.next == ticks.next == pytest.approx(0.5)
-    assert Ticks(0.0, Interval.of_fraction(3, 4), 2**52 - 1).advanced().passed == 0
+@both_interfaces
+def test_numbers_too_large_for_exact_fractions_begin_anew(tmp_path, interface):
+    """No double holds the common denominators of these, nor sums of these counters."""
+    path = clocks_tools.clocks_fmu(
+        tmp_path / "large.fmu", interface, clocks=clocks_tools.FRACTIONS, scale=2**50
+    )
+    with open_pool(path, "native", 10.0, OUTPUTS) as pool:
+        outputs, _ = pool.reset((), np.zeros((0, 1)))
+        for end in (10, 20):
+            outputs, statuses = pool.step()
+            assert not statuses.any(), pool.failure(0)
+            found = dict(zip(OUTPUTS, outputs[:, 0], strict=True))
+            for name in TIMED:
+                count, last = last_tick(name, Fraction(end))
+                assert found[f"count of {name}"] == count
+                assert found[f"last {name}"] == pytest.approx(float(last), abs=1e-9)

@@ -170,10 +170,9 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
         assert play(env) == expected
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
-def test_a_replaced_instance_plays_it_again(copying, backend):
+def test_a_replaced_instance_plays_it_again(copying):
     """Copies are no reason to keep an instance that leaks."""
-    with copying(backend=backend, leak_limit=1000) as env:
+    with copying(leak_limit=1000) as env:
         snapshot = begin(env).save_state()
         expected = play(env)
         pool = env._open_pool("a test")

@@ -14,12 +14,11 @@ from pathlib import Path
 import pytest
 import zoo_tools
 
-from fmugym.pool import has_native_pool, mark
+from fmugym.pool import mark
 from fmugym.pool.mark import remains_of
 
 pytestmark = [
     pytest.mark.skipif(sys.platform != "linux", reason="crashes are only noted on Linux"),
-    pytest.mark.skipif(not has_native_pool(), reason="crashes are noted by the C extension"),
 ]
 
 HOST = Path(__file__).with_name("crash_host.py")
@@ -87,7 +86,7 @@ def place(met, tmp_path):
     return Place(tmp_path)
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native"])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_next_environment_is_isolated_and_goes_on(place, fault, backend):
     answer, code, _ = place.run(f"fault={fault}", f"backend={backend}")
@@ -122,7 +121,7 @@ def test_other_configs_of_the_fmu_are_isolated_too(place):
     assert place.is_isolated("time_step=0.125")
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
+@pytest.mark.parametrize("backend", ["native"])
 def test_a_damaged_heap_that_ends_the_process_elsewhere(place, backend):
     answer, code, errors = place.run("do=damage", f"backend={backend}")
     assert answer is None

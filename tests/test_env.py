@@ -7,7 +7,7 @@ import fmpy
 import gymnasium as gym
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, probe_fmu
+from fmu_tools import probe_fmu
 
 import fmugym
 from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
@@ -463,18 +463,12 @@ class TestTolerance:
     def path(self, tmp_path, request):
         return probe_fmu(tmp_path, request.param, {"<TypeDefinitions>": self.EXPERIMENT})
 
-    @pytest.fixture(params=["native", "python", "process"])
+    @pytest.fixture(params=["none", "process"])
     def seen(self, make_env, path, request):
         """Make what the FMU sees with a config."""
-        way = {"isolation": "process"} if request.param == "process" else {}
-        backend = "auto" if request.param == "process" else request.param
-
-        class Env(PlainEnv):
-            def __init__(self, path, config, **options):
-                super().__init__(path, config, backend=backend, **options)
 
         def make(**config):
-            env = make_env(path=path, cls=Env, **way, **config)
+            env = make_env(path=path, isolation=request.param, **config)
             env.reset()
             return env.read_variables("tolerance")["tolerance"]
 

@@ -139,17 +139,16 @@ class TestMissingLibraries:
         return (needy / "Probe.so").read_bytes()
 
     @staticmethod
-    def run(fmu_path, backend="native", environment=(), **config):
+    def run(fmu_path, environment=(), **config):
         """Step the FMU once; returns what came of it."""
         script = f"""
 import pathlib, sys
 sys.path.insert(0, {str(HERE)!r})
 import fmugym
 from fmu_tools import PlainEnv, probe_config
-from fmugym.vector.making import make_with_pool
 try:
     config = probe_config(**{config!r})
-    env = make_with_pool(lambda: PlainEnv({str(fmu_path)!r}, config), backend={backend!r})
+    env = PlainEnv({str(fmu_path)!r}, config)
     env.reset()
     print(env.step([1.0])[0].tolist())
     env.close()
@@ -168,17 +167,15 @@ except fmugym.FMULoadError as error:
 
     STEPPED = "[0.10000000149011612, 1.0]"
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
-    def test_are_named(self, fmu_path, temp_root, backend):
-        said = self.run(fmu_path, backend)
+    def test_are_named(self, fmu_path, temp_root):
+        said = self.run(fmu_path)
         assert "Probe.fmu needs shared libraries that are not found here: libgave.so" in said
         assert "name their files in preload=[...]" in said
         assert list(temp_root.iterdir()) == []
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
-    def test_are_preloaded(self, fmu_path, needy, backend):
+    def test_are_preloaded(self, fmu_path, needy):
         preload = [str(needy / "libgave.so")]
-        assert self.run(fmu_path, backend, preload=preload) == self.STEPPED
+        assert self.run(fmu_path, preload=preload) == self.STEPPED
 
     def test_are_found_as_the_loader_finds_them(self, fmu_path, needy, tmp_path):
         assert self.run(fmu_path, environment={"LD_LIBRARY_PATH": str(needy)}) == self.STEPPED
@@ -186,16 +183,13 @@ except fmugym.FMULoadError as error:
         add = {beside: (needy / "libgave.so").read_bytes(), library_name(2): self.content(needy)}
         assert self.run(edited_fmu(fmu_path, tmp_path / "other", add=add)) == self.STEPPED
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
-    def test_beside_the_library_where_the_loader_does_not_look(
-        self, fmu_path, needy, tmp_path, backend
-    ):
+    def test_beside_the_library_where_the_loader_does_not_look(self, fmu_path, needy, tmp_path):
         beside = library_name(2).replace("Probe.so", "libgave.so")
         add = {beside: (needy / "libgave.so").read_bytes()}
         path = edited_fmu(fmu_path, tmp_path / "other", add=add)
         assert FMU(path).runs_here
-        assert self.run(path, backend) == self.STEPPED
-        assert self.run(path, backend, isolation="process") == self.STEPPED
+        assert self.run(path) == self.STEPPED
+        assert self.run(path, isolation="process") == self.STEPPED
 
     def test_those_of_libraries_that_the_fmu_brings(self, needy, tmp_path):
         """The FMU's library is fine, but not the one that it needs."""

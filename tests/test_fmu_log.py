@@ -7,13 +7,18 @@ import sys
 import threading
 
 import pytest
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, probe_config
+from fmu_tools import (
+    MAJOR_VERSIONS,
+    PlainEnv,
+    edited_fmu,
+    library_name,
+    probe_config,
+    probe_library,
+)
 
 from fmugym import FMULoadError
-from fmugym.fmi import log as fmu_log
-from fmugym.fmi.log import MessageLog
 
-LEVELS = {0: "INFO", 1: "WARNING", 2: "WARNING", 3: "ERROR", 4: "CRITICAL"}
+LEVELS = {0: "INFO", 1: "WARNING", 2: "WARNING", 3: "ERROR", 4: "CRITICAL", 9: "INFO"}
 
 
 @pytest.fixture(autouse=True)
@@ -99,22 +104,16 @@ def test_what_the_fmu_said_is_in_the_error(probe, tmp_path, version):
         PlainEnv(path, probe_config())
 
 
-def test_a_message_of_nobody_is_logged_too(caplog):
-    fmu_log._deliver(None, 3, b"late", b"after the end\n")
-    assert records(caplog, "fmugym.fmi.log") == [("INFO", "[late] after the end")]
-    fmu_log._by_name(None, b"a name of its own", 0, None, None)
-    assert records(caplog, "fmugym.fmi.log")[1] == ("INFO", "[] ")
-
-
-def test_bytes_that_are_not_utf_8_and_odd_statuses(caplog):
-    log = MessageLog("Model", logging.getLogger("fmugym.odd"))
-    fmu_log._by_name(None, log.instance_name.encode(), 9, b"caf\xe9", b"100%s \xff")
-    log.close()
-    log.close()
-    assert records(caplog, "fmugym.odd") == [
-        ("INFO", f"{log.instance_name}: [caf\ufffd] 100%s \ufffd")
-    ]
-    assert log.said() == "; the FMU said: 100%s \ufffd"
+@pytest.mark.parametrize("version", MAJOR_VERSIONS)
+def test_bytes_that_are_not_utf_8(probe, tmp_path, caplog, version):
+    library = probe_library(version).replace(b" is 100%", b" \xe9\xff 100%")
+    path = edited_fmu(probe(version), tmp_path, add={library_name(version): library})
+    env = PlainEnv(path, probe_config(model_parameters={"log_status": 1}))
+    env.reset()
+    env.step(0.0)
+    env.close()
+    ((_, text),) = records(caplog)
+    assert text.endswith("step 1 of probe \ufffd\ufffd 100%")
 
 
 @pytest.mark.parametrize("version", MAJOR_VERSIONS)

@@ -1,4 +1,4 @@
-"""Results that stay as they were: those of a second implementation, which is to go.
+"""Results that stay as they were: those of a second implementation, which there was once.
 
 ``golden/make.py`` has written them at revision 179b934. They are exact on x86-64 Linux; elsewhere
 compilers and libraries of mathematics round in other ways.
@@ -19,7 +19,6 @@ RESULTS = json.loads((GOLDEN / "results.json").read_text(encoding="utf-8"))
 IS_EXACT = sys.platform == "linux" and platform.machine() == "x86_64"
 
 CASES = cases()
-TASKS = "single ", "vector "
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +32,7 @@ def test_every_result_has_its_case():
 
 @pytest.mark.parametrize("name", RESULTS)
 def test_is_as_it_was(name, folder):
-    require_same(name, CASES[name](folder, native=True))
-
-
-@pytest.mark.parametrize("name", [name for name in RESULTS if not name.startswith(TASKS)])
-def test_of_the_pool_in_python_is_as_it_was(name, folder):
-    require_same(name, CASES[name](folder, native=False))
+    require_same(name, CASES[name](folder))
 
 
 def test_texts_of_mistakes_are_as_they_were(tmp_path):

@@ -3,24 +3,19 @@
 import ctypes
 import itertools
 import logging
-import platform
-import subprocess
 import sys
 
-import building
 import gymnasium as gym
 import lawful_tools
 import numpy as np
 import pytest
-import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
 from gymnasium import spaces
 
 import fmugym
 from fmugym import FMU, ConfigError, SimulationError
 from fmugym.fmi.status import Status
-from fmugym.pool import PoolSpec, has_native_pool
-from fmugym.pool.arithmetic import restore_arithmetic
+from fmugym.pool import PoolSpec
 from fmugym.pool.memory import grown_bytes, heap_is_known
 from fmugym.pool.spec import DEFAULT_LEAK_LIMIT
 from fmugym.trial.opening import make_pool
@@ -31,7 +26,6 @@ MB = 2**20
 every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
 WAYS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"isolation": "process", "workers": 2},
 }
@@ -40,8 +34,6 @@ WAYS = {
 @pytest.fixture(name="way", params=WAYS)
 def fixture_way(request):
     """The options of ``make_pool`` for each pool."""
-    if request.param == "native" and not has_native_pool():
-        pytest.skip("the C extension was not built")
     return WAYS[request.param]
 
 
@@ -70,7 +62,7 @@ def fixture_lawful(tmp_path_factory):
 def fixture_make(lawful, opened):
     """Make pools over the lawful FMU."""
 
-    def make(version, num_instances, time_step=0.8, way=WAYS["python"], **spec):
+    def make(version, num_instances, time_step=0.8, way=WAYS["native"], **spec):
         fmu = FMU(lawful[version])
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step, **spec)
         pool = opened(make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **way))
@@ -125,9 +117,6 @@ class TestFiniteInputs:
 
     @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
     def test_made_by_a_hook_from_integer_actions(self, lawful, opened, hooks):
-        if hooks == "compiled" and not has_native_pool():
-            pytest.skip("the C extension was not built")
-
         class Dividing(LawfulEnv):
             def _get_action_space(self):
                 return spaces.Discrete(2)
@@ -141,68 +130,6 @@ class TestFiniteInputs:
             envs.step(np.array([1, 0]))
         envs.reset(seed=0)
         assert envs.step(np.array([1, 1]))[0].tolist() == [[pytest.approx(0.8)]] * 2
-
-
-class RoundedUp(PlainEnv):
-    """Steps an FMU of the zoo in Python."""
-
-    def __init__(self, path, values):
-        config = {
-            "model_input_names": "u",
-            "model_output_names": "y",
-            "model_parameters": values,
-            "time_step": 0.5,
-            "bounds": {"u": (-1, 1)},
-        }
-        super().__init__(path, config, logging.CRITICAL, backend="python")
-
-
-class TestArithmetic:
-    """In Python's pool; what the native one does is in test_native_pool.py."""
-
-    @pytest.mark.parametrize("call", ["instantiate", "exit", "set", "step", "get", "reset"])
-    def test_the_rounding_mode_of_an_fmu_does_not_stay(self, tmp_path, opened, call):
-        token = "{zoo}"
-        if call == "instantiate":
-            token = f"{{zoo {zoo_tools.FAULTS.index('round_up')} {zoo_tools.CALLS.index(call)} 0}}"
-        values = zoo_tools.parameters("round_up", call, at=0)
-        path = zoo_tools.zoo_fmu(tmp_path, 2, token)
-        tiny = float("1e-30")
-        env = opened(RoundedUp(path, values))
-        assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
-        for _ in range(2):
-            env.reset()
-            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
-            env.step([1.0])
-            assert (1.0 + tiny, 1.0 - tiny) == (1.0, 1.0)
-
-    def test_other_instances_do_not_notice(self, tmp_path, opened):
-        def rollout(fault):
-            fmu = FMU(zoo_tools.zoo_fmu(tmp_path, 2))
-            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
-            pool = opened(make_pool(fmu, spec, 2, LOG, backend="python", private_libraries=False))
-            values = np.zeros((4, 2))
-            values[:, 0] = list(zoo_tools.parameters(fault).values())
-            pool.reset(tuple(map(fmu.variable, zoo_tools.PARAMETERS)), values)
-            return [pool.step(np.full((1, 2), 1 / n))[0][:, 1].tolist() for n in range(3, 50)]
-
-        expected = rollout("none")
-        assert rollout("round_up") == expected
-
-    @pytest.mark.skipif(
-        sys.platform != "linux" or platform.machine() != "x86_64", reason="sets MXCSR"
-    )
-    def test_subnormal_numbers(self, tmp_path):
-        """As the start-up code of -ffast-math turns them off."""
-        library = tmp_path / "fast.so"
-        code = "#include <xmmintrin.h>\nvoid off(void) { _mm_setcsr(_mm_getcsr() | 0x8040); }"
-        command = [*building.compiler(), "-shared", "-fPIC", "-x", "c", "-", "-o", library]
-        subprocess.run(command, input=code, text=True, check=True)
-        ctypes.CDLL(library).off()
-        off = 0.5 * sys.float_info.min == 0.0
-        restore_arithmetic()
-        assert off
-        assert 0.5 * sys.float_info.min > 0.0
 
 
 class TestRetries:
@@ -240,8 +167,11 @@ class TestRetries:
             rows = [step(pool, 0.1 * i, -0.2)[0].copy() for i in range(5)]
             return np.array(rows), pool.health()["retries"]
 
-        (rows, retries), (expected, expected_retries) = rollout(way), rollout(WAYS["python"])
+        (rows, retries), (expected, expected_retries) = rollout(way), rollout(WAYS["native"])
         np.testing.assert_array_equal(rows, expected)
+        count = np.arange(1, 6)
+        by_hand = [0.3 * 0.1 * (count - 1) * count / 2 * 0.7, -0.2 * 0.7 * 0.7 * count]
+        np.testing.assert_allclose(rows[:, 0], np.transpose(by_hand), rtol=1e-13)
         np.testing.assert_array_equal(retries, expected_retries)
         assert (retries > 0).all()
 
@@ -346,14 +276,6 @@ class TestHealth:
             _ = env.health
 
 
-@pytest.fixture(name="backend", params=["python", "native"])
-def fixture_backend(request):
-    """The options of ``make_pool`` for each pool of this process."""
-    if request.param == "native" and not has_native_pool():
-        pytest.skip("the C extension was not built")
-    return WAYS[request.param]
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows is not asked for its memory")
 class TestLeaks:
     RESETS, LEAK, LIMIT = 1200, 64 * 1024, 4 * MB
@@ -378,31 +300,31 @@ class TestLeaks:
         return grown_bytes() - before
 
     @pytest.mark.parametrize("version", [1, 2])
-    def test_instances_are_recycled(self, make, version, backend, caplog):
-        pool = make(version, 1, way=backend, leak_limit=self.LIMIT)
+    def test_instances_are_recycled(self, make, version, caplog):
+        pool = make(version, 1, leak_limit=self.LIMIT)
         growth = self.play(pool, leak=self.LEAK)
         assert growth < 4 * self.LIMIT < self.RESETS * self.LEAK / 4
         assert 0 < pool.health()["recyclings"][0] < 60  # few where there is much free memory
         assert caplog.text == ""
 
-    def test_small_leaks_at_the_default_limit(self, make, backend, caplog):
-        pool = make(2, 1, way=backend, leak_limit=DEFAULT_LEAK_LIMIT)
+    def test_small_leaks_at_the_default_limit(self, make, caplog):
+        pool = make(2, 1, leak_limit=DEFAULT_LEAK_LIMIT)
         assert self.play(pool, 30_000, leak=3600) < 1.25 * DEFAULT_LEAK_LIMIT
         assert pool.health()["recyclings"][0] == 1
         assert caplog.text == ""
 
-    def test_leaks_in_steps(self, make, backend, caplog):
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+    def test_leaks_in_steps(self, make, caplog):
+        pool = make(2, 1, leak_limit=self.LIMIT)
         growth = self.play(pool, 300, steps=16, step_leak=self.LEAK / 4)
         assert growth < 4 * self.LIMIT < 300 * 4 * self.LEAK / 4
         assert pool.health()["recyclings"][0] < 60
         assert caplog.text == ""
 
-    def test_all_growth_is_counted(self, make, backend, tmp_path):
+    def test_all_growth_is_counted(self, make, tmp_path):
         """Also where others have left free memory, which the FMU takes, and the other way round."""
         path = tmp_path / "data"
         path.write_bytes(bytes(100_000))
-        pool = make(2, 1, way=backend, leak_limit=1000 * MB)
+        pool = make(2, 1, leak_limit=1000 * MB)
 
         def read():
             with path.open(buffering=30_000) as file:
@@ -414,9 +336,9 @@ class TestLeaks:
 
     @pytest.mark.parametrize("leak", [0, LEAK])
     @pytest.mark.parametrize("keeps", [False, True])
-    def test_the_caller_may_take_memory(self, make, backend, caplog, leak, keeps):
+    def test_the_caller_may_take_memory(self, make, caplog, leak, keeps):
         """Much for a while, or more and more; the FMU's leaks are found all the same."""
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        pool = make(2, 1, leak_limit=self.LIMIT)
         kept, counter = [], itertools.count()
 
         def allocate():
@@ -432,14 +354,14 @@ class TestLeaks:
         assert (10 if leak else 0) <= recyclings < (60 if leak else 8)
         assert caplog.text == ""
 
-    def test_that_it_does_not_help_is_said_once(self, make, backend, caplog):
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+    def test_that_it_does_not_help_is_said_once(self, make, caplog):
+        pool = make(2, 1, leak_limit=self.LIMIT)
         self.play(pool, leak=-self.LEAK)
         assert caplog.text.count("isolation='process'") == 1
         assert pool.health()["recyclings"][0] < 10
 
-    def test_snapshots_outlive_what_the_caller_takes(self, make, backend):
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+    def test_snapshots_outlive_what_the_caller_takes(self, make):
+        pool = make(2, 1, leak_limit=self.LIMIT)
         set_up(pool)
         step(pool, 1.0)
         snapshot, kept = pool.save(), []
@@ -447,8 +369,8 @@ class TestLeaks:
         assert pool.health()["recyclings"][0] == 0
         assert pool.restore(snapshot)[0].tolist() == [[0.8]]
 
-    def test_snapshots_do_not_outlive_leaks(self, make, backend):
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+    def test_snapshots_do_not_outlive_leaks(self, make):
+        pool = make(2, 1, leak_limit=self.LIMIT)
         set_up(pool)
         snapshot = pool.save()
         assert self.play(pool, leak=self.LEAK) < 5 * self.LIMIT
@@ -465,8 +387,8 @@ class TestLeaks:
         assert health["deaths"].tolist() == [0]
         assert health["memory_growth"][0] < 3 * self.LIMIT
 
-    def test_recycled_instances_are_as_before(self, make, backend):
-        pool = make(2, 2, way=backend)
+    def test_recycled_instances_are_as_before(self, make):
+        pool = make(2, 2)
         set_up(pool, k=[1.0, 3.0])
         expected = step(pool, 1.0, 1.0)[0].copy()
         pool.recycle()
@@ -475,17 +397,17 @@ class TestLeaks:
         np.testing.assert_array_equal(step(pool, 1.0, 1.0)[0], expected)
         assert pool.health()["replacements"].tolist() == [1, 1]
 
-    def test_counts_may_be_forgotten(self, make, backend):
+    def test_counts_may_be_forgotten(self, make):
         """The watch goes on."""
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        pool = make(2, 1, leak_limit=self.LIMIT)
         for _ in range(4):
             assert self.play(pool, 300, leak=self.LEAK) < 4 * self.LIMIT
             pool.forget_health()
 
     @pytest.mark.skipif(not heap_is_known(), reason="needs glibc 2.33")
-    def test_without_knowledge_of_the_heap(self, make, monkeypatch, backend, caplog):
+    def test_without_knowledge_of_the_heap(self, make, monkeypatch, caplog):
         monkeypatch.setattr("fmugym.pool.memory._mallinfo", lambda: None)
-        pool = make(2, 1, way=backend, leak_limit=self.LIMIT)
+        pool = make(2, 1, leak_limit=self.LIMIT)
         assert self.play(pool, leak=self.LEAK) < 4 * self.LIMIT
         assert caplog.text == ""
 

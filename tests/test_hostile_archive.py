@@ -16,7 +16,6 @@ from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, probe_xml, 
 from fmugym import FMU, FMULoadError, SimulationError
 from fmugym.errors import printable
 from fmugym.tools.cli import main
-from fmugym.vector.making import make_with_pool
 
 XML = "modelDescription.xml"
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
@@ -184,16 +183,13 @@ class TestControlCharacters:
             raise SimulationError(f"step of {EVIL}\n failed")
         assert "\n" not in str(caught.value)
 
-    @pytest.mark.parametrize("backend", ["native", "python"])
     @pytest.mark.parametrize("version", [1, 2, 3])
-    def test_messages_in_log_error_and_info(self, probe, caplog, backend, version):
+    def test_messages_in_log_error_and_info(self, probe, caplog, version):
         label = "\x1b[31m\x07red\x9b\nforged line"
         parameters = {"label": label, "log_status": 1, "fault": 3, "fault_step": 2}
         config = probe_config(model_parameters=parameters)
         with caplog.at_level(logging.INFO):
-            env = make_with_pool(
-                lambda: PlainEnv(probe(version), config, logging.INFO), backend=backend
-            )
+            env = PlainEnv(probe(version), config, logging.INFO)
         env.reset()
         infos = [env.step(0.0)[4] for _ in range(2)]
         env.close()

@@ -226,7 +226,7 @@ class TestOutputError:
             noisy(1, 2.0, -1.0, 2.8),
             initial_states=START,
             scales={"q": 0.01, "q_dot": 0.1},
-            backend="python",
+            backend="fmpy",
         )
         assert again.values == pytest.approx(fit.values, rel=1e-9)
 

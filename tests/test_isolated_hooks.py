@@ -19,16 +19,10 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError
-from fmugym.pool import has_native_pool
+from fmugym.pool.process.play import PlayAround
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.vector.engines.compiled import CompiledEngine
 
-if has_native_pool():
-    from fmugym.pool.process.play import PlayAround
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled by the C extension"
-)
 each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 
 
@@ -143,12 +137,6 @@ def test_snapshots_rollouts_and_parameters(make, cls):
         require_equal(again[1], went_on[0][1])
     for ours, theirs in zip(*results, strict=True):
         require_equal(ours, theirs)
-
-
-def test_python_workers_leave_hooks_on_arrays(make):
-    with pytest.raises(ConfigError, match="the pool is not the native one"):
-        make(CART_POLE, backend="python")
-    assert not isinstance(make(CART_POLE, backend="python", hooks="auto")._engine, CompiledEngine)
 
 
 def test_a_process_that_is_killed(make):

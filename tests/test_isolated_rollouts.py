@@ -12,12 +12,8 @@ from vector_tools import CART_POLE, require_equal
 
 import fmugym
 from fmugym import FMUVectorEnv
-from fmugym.pool import has_native_pool
 from fmugym.vector import episodes
 
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled by the C extension"
-)
 N, HORIZON = 7, 25
 
 

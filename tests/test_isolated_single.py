@@ -23,14 +23,9 @@ from vector_tools import Drawing
 
 import fmugym
 from fmugym import ConfigError, SimulationError
-from fmugym.pool import has_native_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.series import RecordSeries
 from fmugym.vector.making import make_with_pool
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled by the C extension"
-)
 
 
 def isolated(make_env, hooks="compiled"):
@@ -131,13 +126,6 @@ def test_hooks_that_cannot_be_compiled():
     env.reset(seed=0)
     env.step(env._no_action)
     assert env._play is None
-    env.close()
-
-
-def test_workers_of_python_run_no_compiled_hooks():
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process", backend="python")
-    with pytest.raises(ConfigError, match="pool"):
-        env.reset(seed=0)
     env.close()
 
 

@@ -23,7 +23,6 @@ from fmugym.trial.neighbours import default_spec
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
-WAYS = ["native", "python"]
 TOKENS = ["licensed", "licensed at initialization"]
 
 
@@ -99,7 +98,7 @@ EXPECTED = expected_outputs(1.5, [0.5] * 3)[-1]
 
 class TestSeats:
     @pytest.mark.parametrize("token", TOKENS)
-    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"backend": "python"}])
+    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}])
     def test_one_is_enough_for_one_environment(self, folder, seats, token, config):
         env = DemandingEnv(make_fmu(folder, token), max_instances=1, **config)
         assert [play(env), play(env)] == [EXPECTED, EXPECTED]
@@ -173,11 +172,9 @@ class TestRefusal:
         envs.close()
         assert "disturb" not in caplog.text
 
-    @pytest.mark.parametrize("backend", WAYS)
-    def test_in_a_later_reset(self, folder, seats, backend):
+    def test_in_a_later_reset(self, folder, seats):
         env = DemandingEnv(
             make_fmu(folder, "licensed at initialization"),
-            backend=backend,
             reset_method="instance",
         )
         env.reset()
@@ -206,9 +203,7 @@ class TestRefusal:
 
 class TestWaiting:
     @pytest.mark.parametrize("token", TOKENS)
-    @pytest.mark.parametrize(
-        "config", [{}, {"backend": "python"}, {"isolation": "process"}, {"probe_timeout": None}]
-    )
+    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"probe_timeout": None}])
     def test_ends_when_another_program_returns_its_seat(
         self, folder, seats, other_program, token, config, caplog
     ):

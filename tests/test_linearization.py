@@ -93,6 +93,21 @@ def derivatives(model, version, names, columns, linear):
 
 
 @each_version
+def test_each_instance_is_differentiated_at_its_own_point(version):
+    fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum", version))
+    torque, theta, speed = map(fmu.variable, ["tau", "theta", "theta_dot"])
+    angles = np.array([[0.0, 1.0, -2.5]])
+    with closing(make_pool(fmu, PoolSpec((torque,), (), 0.02), 3, logging.getLogger())) as pool:
+        with pytest.raises(fmugym.SimulationError, match="needs a reset"):
+            pool.differentiate((theta,), (theta,))
+        pool.reset((fmu.variable("theta_0"),), angles)
+        found = pool.differentiate((speed, fmu.variable("theta_ddot")), (theta, torque))
+    by_angle, by_torque = G / L * np.cos(angles[0]), np.full(3, 1 / (M * L**2))
+    expected = np.array([np.zeros((2, 3)), [by_angle, by_torque]])
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+@each_version
 def test_a_step_from_near_upright_is_that_of_the_linear_model(version):
     linear = linearize("Pendulum", version)
     system = np.zeros((3, 3))

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fmugym.pool import has_native_pool
 from fmugym.vector.hooks import program
 
 pytest.importorskip("ziglang", reason="needs ziglang: the extra test")
@@ -64,7 +63,6 @@ def test_no_object_of_others_is_looked_into():
     assert declaring == {"python.h"}
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 def test_the_extension_loads_without_numpy():
     """It imports numpy when the first array is made."""
     from fmugym import _native
@@ -119,7 +117,6 @@ def test_free_threaded_python_is_refused(tmp_path):
     assert "free-threaded Python is not supported" in done.stderr
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 def test_the_table_of_operations_is_that_of_the_extension():
     from fmugym import _native
 

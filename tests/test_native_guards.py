@@ -11,20 +11,15 @@ from process_tools import run_python
 from test_native_pool import LOG, make, on_linux
 
 import fmugym
-from fmugym import FMU, bundled_fmu
-from fmugym import pool as pools
+from fmugym import FMU, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import no_counts
+from fmugym.pool.native import NativePool
 from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
-
-pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
-if pools.has_native_pool():
-    from fmugym import _native
-    from fmugym.pool.native import NativePool
 
 
 @pytest.fixture
@@ -439,6 +434,15 @@ def test_after_an_error_no_other_type_is_set(probe):
 
 
 # The floating-point environment
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the zoo's faults are those of Linux")
+def test_what_an_instantiation_changes_does_not_stay(tmp_path):
+    fault, call = zoo_tools.FAULTS.index("round_up"), zoo_tools.CALLS.index("instantiate")
+    path = zoo_tools.zoo_fmu(tmp_path, 2, f"{{zoo {fault} {call} 0}}")
+    pool = make(NativePool, path, ["u"], ["y"], 2)
+    assert 1.0 + float("1e-30") == 1.0
+    pool.close()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the zoo's faults are those of Linux")

@@ -7,11 +7,7 @@ import pytest
 from process_tools import run_python
 from test_native_pool import NativePool, busy_fmu, make, on_linux
 
-from fmugym import pool as pools
 from fmugym.pool.processors import available_processors, processor_quota
-
-needs_native = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
-
 
 COUNT = """
 import json, sys, time
@@ -68,33 +64,28 @@ def counted(tmp_path_factory):
     return dict(zip(JOBS, counts, strict=True))
 
 
-@needs_native
 def test_work_for_one_thread_is_no_job(counted):
     assert counted["for one thread"]["jobs"] == 0
 
 
-@needs_native
 def test_a_short_job_wakes_few_of_many_helpers(counted):
     """Work of some 20 us is for two or three threads, whatever the number of threads is."""
     short = counted["short"]
     assert 0 < short["wakes"] <= 8 * short["rounds"]
 
 
-@needs_native
 @pytest.mark.parametrize("job", ["short", "of two", "of many"])
 def test_the_caller_does_its_first_chunk_before_it_wakes_any_helper(counted, job):
     assert counted[job]["wakes"] > 0
     assert counted[job]["early_wakes"] == 0
 
 
-@needs_native
 def test_a_long_job_wakes_no_more_helpers_than_there_are(counted):
     long = counted["long"]
     assert 0 < long["wakes"] <= 2 * long["rounds"]
 
 
 @on_linux
-@needs_native
 def test_a_busy_machine_does_not_shrink_chunks(tmp_path):
     """Samples of the cost that other work has made too high do not count."""
     options = {"jobs": [(2, 400, 1)], "rest": 0, "rounds": 100}
@@ -107,7 +98,6 @@ def test_a_busy_machine_does_not_shrink_chunks(tmp_path):
     assert loaded["chunks"] < 400 * loaded["jobs"] / 4
 
 
-@needs_native
 def test_results_do_not_depend_on_where_ranges_begin(tmp_path):
     """Ranges begin at whole lines of the cache where there are many instances."""
     path = busy_fmu(tmp_path)

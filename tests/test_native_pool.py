@@ -1,4 +1,4 @@
-"""The pool in C against the pool in Python, and what only the pool in C has."""
+"""The native pool: an instance among others, threads, messages, isolation and memory."""
 
 import gc
 import logging
@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import building
@@ -16,17 +17,13 @@ import pytest
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
-from fmugym import pool as pools
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 from fmugym.fmi.status import Status
-from fmugym.pool import PoolSpec, PythonPool
+from fmugym.pool import PoolSpec
+from fmugym.pool.native import NativePool
 from fmugym.trial import opening
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.neighbours import disturb_in_turn
-
-pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
-if pools.has_native_pool():
-    from fmugym.pool.native import NativePool
 
 LOG = logging.getLogger("fmugym.test")
 HERE = Path(__file__).parent
@@ -104,41 +101,48 @@ def shared(tmp_path_factory):
     return busy_fmu(tmp_path_factory.mktemp("shared"), "-DSHARED")
 
 
-# Agreement with the Python pool
+# Agreement of an instance among others with the same one alone
 
 
-class Pair:
-    """The same calls to both pools; every result is compared bit for bit."""
+class Company:
+    """The same calls to a pool of many instances and to a pool of each; all is equal to the bit."""
 
     def __init__(self, path, inputs, outputs, start, count, seed, **options):
-        self.oracle = make(PythonPool, path, inputs, outputs, count, **options)
-        self.native = make(NativePool, path, inputs, outputs, count, **options)
+        self.many = make(NativePool, path, inputs, outputs, count, threads=2, **options)
+        self.alone = [make(NativePool, path, inputs, outputs, **options) for _ in range(count)]
         self.count, self.inputs = count, len(inputs)
         self.start = start
         self.rng = np.random.default_rng(seed)
         self.snapshots = None
-        self.observations = [np.zeros((count, len(outputs)), np.float32) for _ in range(2)]
 
     def close(self):
-        self.oracle.close()
-        self.native.close()
+        for pool in (self.many, *self.alone):
+            pool.close()
 
-    def compare(self, results):
-        (expected, expected_status), (outputs, status) = results
-        assert np.ascontiguousarray(expected).tobytes() == outputs.tobytes()
-        np.testing.assert_array_equal(status, expected_status)
-        for index in np.flatnonzero(status > Status.WARNING):
-            texts = [p.failure(index) for p in (self.oracle, self.native)]
-            expected, text = (re.sub(r"Probe_\d+", "Probe", t) for t in texts)
-            assert text == expected
+    def chosen(self, mask):
+        """The index, as a slice, and the pool of each instance in a mask."""
+        for index, pool in enumerate(self.alone):
+            if mask is None or mask[index]:
+                yield slice(index, index + 1), pool
+
+    def compare(self):
+        for index, pool in self.chosen(None):
+            assert pool.outputs.tobytes() == self.many.outputs[:, index].tobytes()
+            assert pool.statuses == self.many.statuses[index]
+            if pool.statuses > Status.WARNING:
+                texts = pool.failure(0), self.many.failure(index.start)
+                assert len({re.sub(r"Probe_\d+", "Probe", text) for text in texts}) == 1
 
     def mask(self):
         mask = self.rng.random(self.count) < self.rng.choice([0.2, 0.5, 1.0])
         return None if mask.all() and self.rng.random() < 0.5 else mask
 
     def reset(self, values, mask):
-        both = (self.oracle, self.native)
-        self.compare([p.reset(tuple(map(p.variable, self.start)), values, mask) for p in both])
+        variables = tuple(map(self.many.variable, self.start))
+        self.many.reset(variables, values, mask)
+        for index, pool in self.chosen(mask):
+            pool.reset(variables, values[:, index])
+        self.compare()
 
     def random_reset(self):
         rows = [self.rng.choice(START_VALUES[name], self.count) for name in self.start]
@@ -148,32 +152,35 @@ class Pair:
         self.step(0.1 * self.rng.normal(size=(self.inputs, self.count)), self.mask())
 
     def step(self, inputs, skip):
-        self.compare(
-            [
-                pool.step(inputs, skip, observations)
-                for pool, observations in zip(
-                    (self.oracle, self.native), self.observations, strict=True
-                )
-            ]
-        )
-        assert self.observations[0].tobytes() == self.observations[1].tobytes()
+        self.many.step(inputs, skip, self.many.observations)
+        for index, pool in self.chosen(None if skip is None else ~skip):
+            pool.step(inputs[:, index])
+        self.compare()
+        observed = self.many.outputs.T.astype(np.float32)
+        np.testing.assert_array_equal(self.many.observations, observed)
 
     def random_save(self):
         try:
-            self.snapshots = [p.save() for p in (self.oracle, self.native)]
+            snapshot = self.many.save()
         except SimulationError:
             with pytest.raises(SimulationError):
-                self.native.save()
+                self.alone[0].save()
+        else:
+            self.snapshots = snapshot, [pool.save() for pool in self.alone]
 
     def random_restore(self):
         if self.snapshots is not None:
-            mask = self.mask()
-            snapshots = zip((self.oracle, self.native), self.snapshots, strict=True)
-            self.compare([pool.restore(s, mask) for pool, s in snapshots])
+            mask, (snapshot, others) = self.mask(), self.snapshots
+            self.many.restore(snapshot, mask)
+            for index, pool in self.chosen(mask):
+                pool.restore(others[index.start])
+            self.compare()
 
     def random_read(self):
-        read = [p.read(tuple(map(p.variable, self.start))) for p in (self.oracle, self.native)]
-        assert np.ascontiguousarray(read[0]).tobytes() == read[1].tobytes()
+        variables = tuple(map(self.many.variable, self.start))
+        values = self.many.read(variables)
+        for index, pool in self.chosen(None):
+            assert pool.read(variables).tobytes() == values[:, index].tobytes()
 
     def play(self, count):
         actions = [self.random_step] * 6 + [self.random_reset] * 2
@@ -184,36 +191,33 @@ class Pair:
 
 @pytest.mark.parametrize("options", [{}, {"substeps": 3, "start_time": 0.3}, {"warm_up_steps": 2}])
 @pytest.mark.parametrize(("model", "version"), BUNDLED)
-@pytest.mark.parametrize(("seed", "count"), [(0, 7), (1, 7), (2, 1)])
-def test_agrees_with_python_pool(model, version, options, seed, count):
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_calls(model, version, options, seed):
     inputs, outputs, start = INTERFACES[model]
-    pair = Pair(bundled_fmu(model, version), inputs, outputs, start, count, seed, **options)
-    try:
-        pair.random_reset()
-        pair.reset(np.array([[START_VALUES[n][0]] * count for n in start], float), None)
-        pair.play(120)
-    finally:
-        pair.close()
+    company = Company(bundled_fmu(model, version), inputs, outputs, start, 7, seed, **options)
+    with closing(company):
+        company.random_reset()
+        company.reset(np.array([[START_VALUES[n][0]] * 7 for n in start], float), None)
+        company.play(120)
 
 
-@pytest.mark.parametrize("count", [9, 1])
 @pytest.mark.parametrize("version", [1, 2, 3])
-def test_agrees_on_all_types_and_faults(probe, version, count):
+def test_all_types_and_faults(probe, version):
     inputs = ["a", "n", "on", "c", "mode", "n_free"]
     outputs = ["sum", "n_out", "mix", "on_out", "mode_out", "steps", "end"]
     if version == 3:
         inputs += ["Float32_in", "Int8_in", "UInt16_in", "Int64_in"]
         outputs += ["Float32_out", "Int8_out", "UInt16_out", "Int64_out"]
     limits = {"n": 5, "on": 2, "mode": 3, "Int8_in": 100, "UInt16_in": 60000, "Int64_in": 2**40}
-    pair = Pair(probe(version), inputs, outputs, ["fault", "fault_step", "gain"], count, version)
+    count, starts = 9, ["fault", "fault_step", "gain"]
     rng = np.random.default_rng(version)
-    try:
+    with closing(Company(probe(version), inputs, outputs, starts, count, version)) as company:
         for _ in range(60):
             faults = rng.choice([0, 0, 2, 3, 4, 5, 6, 7], count)
             values = np.array(
                 [faults, rng.integers(1, 5, count), rng.choice([1.0, 2.0], count)], float
             )
-            pair.reset(values, rng.random(count) < 0.7)
+            company.reset(values, rng.random(count) < 0.7)
             for _ in range(4):
                 rows = [
                     rng.integers(0, limits[n], count)
@@ -222,27 +226,24 @@ def test_agrees_on_all_types_and_faults(probe, version, count):
                     for n in inputs
                 ]
                 rows[inputs.index("n_free")] = rng.integers(-(2**31), 2**31, count)
-                given = np.array(rows, float)
-                pair.compare([pool.step(given) for pool in (pair.oracle, pair.native)])
-    finally:
-        pair.close()
+                company.step(np.array(rows, float), None)
 
 
 @pytest.mark.parametrize("width", [2, 70])
 @pytest.mark.parametrize("count", [1, 3])
-def test_agrees_on_values_beyond_those_of_observations(probe, count, width):
+def test_values_beyond_those_of_observations(probe, count, width):
     """Outputs may exceed a float32; with inputs that are not finite nothing is stepped."""
-    outputs = ["sum", "steps"] * (width // 2)
-    pair, exceeds = Pair(probe(2), ["a"], outputs, ["gain"], count, 0), False
-    try:
+    outputs, exceeds = ["sum", "steps"] * (width // 2), False
+    with (
+        closing(Company(probe(2), ["a"], outputs, ["gain"], count, 0)) as company,
+        np.errstate(over="ignore"),
+    ):
         for a in (0.5, np.nan, 1e42, np.inf, 0.5):
-            pair.reset(np.full((1, count), 1.5), None)
-            with np.errstate(over="ignore"):
-                pair.step(np.full((1, count), a), None)
-            exceeds |= np.abs(pair.native.outputs).max() > np.finfo(np.float32).max
-        assert exceeds
-    finally:
-        pair.close()
+            company.reset(np.full((1, count), 1.5), None)
+            company.step(np.full((1, count), a), None)
+            assert np.isfinite(a) == (company.many.statuses <= Status.WARNING).all()
+            exceeds |= np.abs(company.many.outputs).max() > np.finfo(np.float32).max
+    assert exceeds
 
 
 # Threads
@@ -638,8 +639,6 @@ class TestIsolation:
             assert envs.step(np.full((3, 1), work, np.float32))[0].tolist() == [alone] * 3
         envs.close()
         single.close()
-        with pytest.raises(FMULoadError, match="which only the native pool or isolation='process'"):
-            fmugym.FMUVectorEnv(Counting, 3, backend="python", isolation="none")
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):

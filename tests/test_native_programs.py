@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from fmugym.pool import has_native_pool
 from fmugym.vector.hooks import loops, lowering, program
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.loops import has_known_sines, loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
-
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="programs run in the native pool")
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
 DOUBLE = np.dtype(np.float64)

@@ -21,16 +21,9 @@ from pythonfmu.builder import FmuBuilder
 from test_native_pool import busy_fmu, make
 
 from fmugym import FMU, SimulationError
-from fmugym import pool as pools
 from fmugym.pool import PoolSpec
-from fmugym.pool.python import PythonPool
+from fmugym.pool.native import NativePool
 from fmugym.vector import FMUVectorEnv
-
-pytestmark = pytest.mark.skipif(not pools.has_native_pool(), reason="no C extension was built")
-if pools.has_native_pool():
-    from fmugym.pool.native import NativePool
-else:
-    NativePool = None
 
 HERE = Path(__file__).parent
 on_linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -258,26 +251,21 @@ class Raising(logging.Handler):
             raise self.error
 
 
-@pytest.fixture(name="pool_class", params=[NativePool, PythonPool])
-def fixture_pool_class(request):
-    return request.param
-
-
-def logging_pool(pool_class, probe, error, at, count=3):
+def logging_pool(probe, error, at, count=3):
     """A pool whose instances say something in each step."""
     log = logging.Logger("raising")
     handler = Raising(error, at)
     log.addHandler(handler)
     fmu = FMU(probe())
-    pool = pool_class(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), count, log)
+    pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), count, log)
     pool.reset((fmu.variable("log_status"),), np.ones((1, count)))
     return pool, handler
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), SystemExit(3), ValueError("!")], ids=repr)
-def test_an_exception_comes_out_of_the_step_that_was_done(pool_class, probe, error):
+def test_an_exception_comes_out_of_the_step_that_was_done(probe, error):
     """It may be one of a signal handler, which runs wherever the main thread is."""
-    pool, handler = logging_pool(pool_class, probe, error, at=2)
+    pool, handler = logging_pool(probe, error, at=2)
     with pytest.raises(type(error)) as caught:
         pool.step()
     assert caught.value is error
@@ -289,11 +277,11 @@ def test_an_exception_comes_out_of_the_step_that_was_done(pool_class, probe, err
     pool.close()
 
 
-def test_an_exception_comes_out_in_its_own_thread(pool_class, probe):
+def test_an_exception_comes_out_in_its_own_thread(probe):
     """That of the other thread, whose step lasts longer, is not for this one."""
     raised, done = threading.Event(), threading.Event()
-    mine, my_handler = logging_pool(pool_class, probe, None, at=0, count=1)
-    other, handler = logging_pool(pool_class, probe, None, at=0, count=2)
+    mine, my_handler = logging_pool(probe, None, at=0, count=1)
+    other, handler = logging_pool(probe, None, at=0, count=2)
     my_handler.emit = lambda _: raised.wait(30)
 
     def emit(_):
@@ -318,7 +306,7 @@ def test_an_exception_comes_out_in_its_own_thread(pool_class, probe):
     other.close()
 
 
-def test_other_lost_exceptions_go_where_they_went_before(pool_class, probe, monkeypatch):
+def test_other_lost_exceptions_go_where_they_went_before(probe, monkeypatch):
     class Odd:
         def __del__(self):
             raise ValueError("in a destructor")
@@ -326,7 +314,7 @@ def test_other_lost_exceptions_go_where_they_went_before(pool_class, probe, monk
     lost = []
     monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: lost.append(str(unraisable[1])))
     hook = sys.unraisablehook
-    pool, handler = logging_pool(pool_class, probe, None, at=0, count=1)
+    pool, handler = logging_pool(probe, None, at=0, count=1)
     handler.emit = lambda _: Odd() and None
     pool.step()
     pool.close()
@@ -363,8 +351,8 @@ def test_an_exception_does_not_repeat_a_step_of_a_vector_environment(probe, hook
     assert len(steps) == 1, "only one step was done"
 
 
-def test_an_exception_while_closing_leaves_nothing_open(pool_class, probe, temp_root):
-    pool, _ = logging_pool(pool_class, probe, KeyboardInterrupt(), at=1)
+def test_an_exception_while_closing_leaves_nothing_open(probe, temp_root):
+    pool, _ = logging_pool(probe, KeyboardInterrupt(), at=1)
     with pytest.raises(KeyboardInterrupt):
         pool.step()
     pool.close()
@@ -378,15 +366,13 @@ import numpy as np
 from fmugym import FMU
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
-from fmugym.pool.python import PythonPool
 
-error, count = getattr(builtins, sys.argv[2]), int(sys.argv[4])
+error, count = getattr(builtins, sys.argv[2]), int(sys.argv[3])
 log = logging.Logger("signals")
 log.addHandler(logging.NullHandler())
 logging.logMultiprocessing = logging.logAsyncioTasks = False  # logging drops exceptions in there
 fmu = FMU(sys.argv[1])
-pool_class = {"native": NativePool, "python": PythonPool}[sys.argv[3]]
-pool = pool_class(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
+pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
 pool.reset((fmu.variable("log_status"),), np.ones((1, 3)))
 rung = came_out = 0
 
@@ -416,13 +402,12 @@ print(came_out, "of", count)
 
 @on_posix
 @pytest.mark.parametrize("error", ["KeyboardInterrupt", "SystemExit", "TimeoutError"])
-@pytest.mark.parametrize("pool", ["python", "native"])
-def test_a_signal_ends_a_loop_of_steps_that_log(probe, pool, error):
+def test_a_signal_ends_a_loop_of_steps_that_log(probe, error):
     """Each step logs, so the handler mostly runs inside of the receiver, or just before it.
 
     In a process of its own: an exception out of a signal handler leaves coverage's lock locked.
     """
-    done = run_python("-c", SIGNALS, str(probe()), error, pool, "400")
+    done = run_python("-c", SIGNALS, str(probe()), error, "400")
     assert done.stdout == "400 of 400\n", done.stdout + done.stderr
     assert done.stderr == ""
 

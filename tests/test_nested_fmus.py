@@ -21,7 +21,6 @@ CONFIG = {
     "time_step": STEP,
 }
 WAYS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "isolated": {"isolation": "process"},
 }

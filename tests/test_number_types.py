@@ -9,7 +9,6 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import Choice, ConfigError, EnvConfig, LogUniform, Normal, Uniform
-from fmugym.vector.making import make_with_pool
 
 TYPES = [
     int,
@@ -101,12 +100,6 @@ def test_vector_environments(number, hooks):
             return Cart(number, distribution)
 
         assert together(fmugym.FMUVectorEnv(make, 2, hooks=hooks)) == expected
-
-
-@types
-def test_native_and_python(number):
-    env = make_with_pool(lambda: Cart(number), backend="python")
-    assert alone(env) == alone(Cart(number))
 
 
 @types

@@ -34,7 +34,6 @@ from process_tools import (
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym import pool as pools
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
@@ -167,18 +166,11 @@ class TestSingle:
         env.reset()
         assert not env.step([1.0])[3]
 
-    @pytest.mark.parametrize(
-        ("backend", "said"),
-        [
-            ("python", "Faulty_1: [last words] this is fault 1"),
-            ("native", "[last words] this is fault 1"),
-        ],
-    )
-    def test_last_words_are_told(self, make_pool, faulty, backend, said):
-        pool = make_pool(backend=backend)
+    def test_last_words_are_told(self, make_pool, faulty):
+        pool = make_pool()
         set_up(pool, faulty, ["crash"], at=1)
         assert step(pool)[1].tolist() == [Status.FATAL]
-        assert pool.failure(0).endswith(f"; the FMU said: {said}")
+        assert pool.failure(0).endswith("; the FMU said: [last words] this is fault 1")
 
     @pytest.mark.parametrize("stage", ["terminate", "free"])
     def test_the_end_of_an_instance(self, make_env, stage, caplog):
@@ -538,11 +530,10 @@ class WorkerThread:
 
 
 @posix_only
-@pytest.mark.parametrize("backend", ["auto", "python"])
-def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch, backend):
+def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch):
     here = make_pool(3, isolation="none")
     monkeypatch.setattr("fmugym.pool.process.transport.launch", WorkerThread)
-    pool = make_pool(3, backend=backend)
+    pool = make_pool(3)
     with pytest.raises(SimulationError):
         pool.save()  # before the first reset
     for one in (here, pool):
@@ -587,9 +578,8 @@ class TestChoice:
         flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
         path = faulty_fmu(tmp_path, capabilities=flag)
         assert not isinstance(make_pool(2, path, isolation="none", workers=None), ProcessPool)
-        if pools.has_native_pool():  # else copies of the library are not to be had
-            options = {"isolation": None, "workers": None, "private_libraries": True}
-            assert not isinstance(make_pool(2, path, **options), ProcessPool)
+        options = {"isolation": None, "workers": None, "private_libraries": True}
+        assert not isinstance(make_pool(2, path, **options), ProcessPool)
 
     def test_with_isolation_asked_for(self, make_pool, tmp_path):
         path = faulty_fmu(tmp_path, "{lonely}")

@@ -47,7 +47,7 @@ cases = pytest.mark.parametrize(("version", "quirk"), CASES, ids=str)
 class QuirkEnv(fmugym.FMUEnv):
     """Reads all outputs; the gain differs from episode to episode."""
 
-    def __init__(self, path, gain=None, way=None, **config):
+    def __init__(self, path, gain=None, **config):
         gain = fmugym.Uniform(0.5, 2.0) if gain is None else gain
         config = {
             "model_input_names": "u",
@@ -55,7 +55,7 @@ class QuirkEnv(fmugym.FMUEnv):
             "model_parameters": {"gain": gain, "tau": 0.3},
             "time_step": STEP,
         } | config
-        super().__init__(path, config, backend=way)
+        super().__init__(path, config)
 
     def _is_done(self):
         return self.out["y"] > 1e9
@@ -185,14 +185,13 @@ def test_verdict(make_fmu, version, quirk, caplog):
     assert bool(warnings) == bool(quirk.log)
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
-def test_outputs_before_the_first_step_are_start_values(make_fmu, backend):
+def test_outputs_before_the_first_step_are_start_values(make_fmu):
     """In each episode, restored ones included; the model description may give other ones than 0."""
     fmu = fmugym.FMU(make_fmu("no reading before a step"))
     outputs = [replace(fmu.variable(name), start=start) for name, start in START_OUTPUTS.items()]
     spec = PoolSpec((fmu.variable("u"),), tuple(outputs), STEP, blind_start=True)
     spec = replace(spec, reset_method=ResetMethod.RESTORE)
-    pool = local_pool(fmu, spec, 2, logging.getLogger(), native=backend == "native")
+    pool = local_pool(fmu, spec, 2, logging.getLogger())
     for _ in range(4):
         outputs, statuses = pool.reset((), np.zeros((0, 2)))
         assert outputs.tolist() == [[0.75, 0.75], [0.0, 0.0]]
@@ -205,19 +204,17 @@ def test_outputs_before_the_first_step_are_start_values(make_fmu, backend):
 START_OUTPUTS = {"y": "0.75", "calls": None}
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
-def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu, backend):
-    env = QuirkEnv(make_fmu("no reading before a step"), way=backend, probe_timeout=None)
+def test_without_a_trial_a_reset_says_what_cannot_be_read(make_fmu):
+    env = QuirkEnv(make_fmu("no reading before a step"), probe_timeout=None)
     with pytest.raises(fmugym.SimulationError, match="reading the outputs returned Error"):
         env.reset()
     env.close()
 
 
-@pytest.mark.parametrize("way", ["native", "python", "process"])
-def test_reading_what_can_only_be_written(make_fmu, way):
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_reading_what_can_only_be_written(make_fmu, isolation):
     """The message names it; the FMU then needs a reset, as the standard says."""
-    options = {"isolation": "process"} if way == "process" else {"way": way}
-    env = QuirkEnv(make_fmu("no reading of inputs"), gain=1.5, **options)
+    env = QuirkEnv(make_fmu("no reading of inputs"), gain=1.5, isolation=isolation)
     env.reset()
     env.step(np.array([0.5], np.float32))
     first = env.read_variables("gain", "y")
@@ -338,7 +335,6 @@ class TestConfig:
             QuirkEnv(make_fmu("well behaved"), reset_method="restoer")
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
 class TestPromiseAboutStates:
     """FMI 2.0 tells an FMU in each step whether a state of an earlier time may be restored."""
 
@@ -346,17 +342,17 @@ class TestPromiseAboutStates:
         env.step(np.zeros(1, np.float32))
         return env.read_variables("returns")["returns"]
 
-    def test_follows_the_reset_method(self, make_fmu, backend):
+    def test_follows_the_reset_method(self, make_fmu):
         for method, expected in (("reset", 0.0), ("restore", 1.0)):
-            env = QuirkEnv(make_fmu("well behaved"), gain=1.0, reset_method=method, way=backend)
+            env = QuirkEnv(make_fmu("well behaved"), gain=1.0, reset_method=method)
             for _ in range(3):
                 env.reset()
                 told = self.returns(env)
             assert told == expected
             env.close()
 
-    def test_holds_from_the_first_snapshot_on(self, make_fmu, backend):
-        env = QuirkEnv(make_fmu("well behaved"), reset_method="reset", way=backend)
+    def test_holds_from_the_first_snapshot_on(self, make_fmu):
+        env = QuirkEnv(make_fmu("well behaved"), reset_method="reset")
         env.reset()
         assert self.returns(env) == 0.0
         snapshot = env._pool.save()

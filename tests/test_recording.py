@@ -50,7 +50,7 @@ def test_a_file_is_replayed_to_the_last_bit(make, version, tmp_path):
     assert len(loaded) == len(recording) == 8
     assert loaded.seed == 5
     assert loaded.drawn == recording.drawn
-    with make(fmi_version=version, backend="python") as env:
+    with make(fmi_version=version, isolation="process") as env:
         report = fmugym.replay(loaded, env)
     assert report.is_equal
     assert str(report) == "8 steps were replayed: all is equal to the last bit"

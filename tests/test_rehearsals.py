@@ -18,7 +18,6 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is 
 STEP = 0.5
 WAYS = {
     "native": {"backend": "native"},
-    "python": {"backend": "python"},
     "isolated": {"backend": "native", "isolation": "process"},
 }
 all_ways = pytest.mark.parametrize("way", WAYS)

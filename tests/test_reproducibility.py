@@ -19,18 +19,14 @@ NUM_ENVS = 3
 STEPS = 60
 """Long enough for random actions to let poles fall, and for tanks to run to their limit."""
 
-PYTHON = {"backend": "python"}
 SINGLE = {
     "native": {},
     "process": {"isolation": "process"},
-    "process, python": {"isolation": "process"} | PYTHON,
 }
 VECTOR = {
-    "python": PYTHON,
     **{f"{threads} threads": {"threads": threads} for threads in (1, 2, 3)},
     "per env": {"hooks": "per_env"},
     **{f"{n} workers": {"isolation": "process", "workers": n} for n in (1, 2, 3)},
-    "2 workers, python": {"isolation": "process", "workers": 2} | PYTHON,
 }
 """Options of single and of vector environments, each a way to run the same FMU."""
 
@@ -56,13 +52,13 @@ def fixture_tank_fmu(tmp_path_factory):
     ids=lambda param: f"{param[0].__name__}{param[1]}",
 )
 def task(request, tank_fmu):
-    """What makes the environment, and what it does alone, stepped by Python."""
+    """What makes the environment, and what it does alone."""
     cls, version = request.param
     if version:
         make = functools.partial(cls, fmi_version=version)
     else:
         make = functools.partial(cls, tank_fmu, max_episode_steps=25)
-    return make, [alone(make, index, **PYTHON)[0] for index in range(NUM_ENVS)]
+    return make, [alone(make, index)[0] for index in range(NUM_ENVS)]
 
 
 def actions_in(space, index):

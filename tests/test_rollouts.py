@@ -15,7 +15,6 @@ WAYS = {
     "compiled": {"hooks": "compiled"},
     "array": {"hooks": "array"},
     "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
     "process": {"isolation": "process"},
 }
 

@@ -7,14 +7,13 @@ import pytest
 
 import fmugym
 from fmugym import FMU, ConfigError, FMUVectorEnv, bundled_fmu
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.spec import SAMPLINGS
 from fmugym.trial.opening import make_pool
 
 SUBSTEPS, STEP = 5, 0.1
 OUTPUTS = ("x", "x_dot", "theta", "theta_dot", "f")
 POOLS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"isolation": "process", "workers": 1},
 }
@@ -22,8 +21,6 @@ POOLS = {
 
 @pytest.fixture(params=POOLS)
 def make(request):
-    if request.param == "native" and not has_native_pool():
-        pytest.skip("the C extension was not built")
     made = []
 
     def make(**spec):

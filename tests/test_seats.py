@@ -11,12 +11,9 @@ import pytest
 
 import fmugym
 from fmugym.errors import LicenceError
-from fmugym.pool import has_native_pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.seats import taking
-
-BACKENDS = ["native", "python"] if has_native_pool() else ["python"]
 
 
 class SeatedEnv(fmugym.FMI2CSEnv):
@@ -35,9 +32,7 @@ def take_one(**config):
     env.close()
 
 
-@pytest.mark.parametrize(
-    "options", [*({"backend": name} for name in BACKENDS), {"isolation": "process"}]
-)
+@pytest.mark.parametrize("options", [{}, {"isolation": "process"}])
 def test_of_two_environments(options):
     first = SeatedEnv(max_instances=2, **options)
     second = SeatedEnv(max_instances=2, **options)

@@ -23,16 +23,11 @@ from vector_tools import Drawing
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.single.compare import require_equal
 from fmugym.single.trace import trace_single
 from fmugym.task.readings import READINGS
 from fmugym.testing import check_fmu_env
 from fmugym.vector.hooks.program import UntraceableError
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 READ = (*READINGS, "time")
 

@@ -12,12 +12,7 @@ from vector_tools import Drawing
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.single.player import Player
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 
 class Task(Drawing):

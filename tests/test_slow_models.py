@@ -98,9 +98,7 @@ class TestProgress:
         monkeypatch.setattr(attempt, "_EVERY", 0.1)
         caplog.set_level(logging.INFO, "fmugym")
 
-    @pytest.mark.parametrize(
-        "config", [{}, {"backend": "python"}, {"isolation": "process", "call_timeout": 60.0}]
-    )
+    @pytest.mark.parametrize("config", [{}, {"isolation": "process", "call_timeout": 60.0}])
     def test_of_an_initialization_is_logged(self, folder, caplog, config):
         path = make_fmu(folder, "slow")
         env = DemandingEnv(path, probe_timeout=None, log_level=logging.INFO, **config)

@@ -132,7 +132,6 @@ WAYS = {
     "compiled": {"hooks": "compiled", "threads": 2},
     "array": {"hooks": "array", "threads": 1},
     "per_env": {"hooks": "per_env"},
-    "python": {"backend": "python"},
     "processes": {"isolation": "process", "workers": 2},
 }
 

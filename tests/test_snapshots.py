@@ -22,7 +22,6 @@ from fmugym.pool.bundle import SaveMethod
 
 POOLS = {
     "native": {},
-    "python": {"backend": "python"},
     "process": {"isolation": "process"},
 }
 VERSIONS = ("1.0", "2.0", "3.0")
@@ -140,7 +139,7 @@ class TestSingle:
     def test_goes_on_in_another_environment_that_was_never_reset(self, halfway, version):
         env = halfway(fmi_version=version)
         copied = pickle.loads(pickle.dumps(env.save_state()))
-        other = Track(fmi_version=version, backend="python")
+        other = Track(fmi_version=version, isolation="process")
         other.restore_state(copied)
         assert other.time == env.time
         assert dict(other.parameters) == dict(env.parameters)
@@ -574,8 +573,8 @@ class TestZoo:
 
 def test_records_have_a_limit_and_say_so(halfway, monkeypatch):
     """What is kept of an episode without saved states cannot be saved if it is not whole."""
-    env = halfway(fmi_version="1.0", backend="python")
-    env._pool._slots[0]._played = None
+    env = halfway(fmi_version="1.0")
+    monkeypatch.setattr(env._pool, "record_of", lambda index: None)
     with pytest.raises(SimulationError, match="too long"):
         env.save_state()
 

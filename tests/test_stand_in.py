@@ -51,17 +51,16 @@ def fmu_path(request, probe, tmp_path_factory):
     return edited_fmu(probe(), folder, add=add)
 
 
-def play(fmu_path, backend, environment=(), **config):
+def play(fmu_path, environment=(), **config):
     """Play some steps in a process of its own, after a trial; returns what came of it."""
     script = f"""
 import sys
 sys.path.insert(0, {str(HERE)!r})
 import fmugym
 from fmu_tools import PlainEnv, probe_config
-from fmugym.vector.making import make_with_pool
 try:
     config = probe_config(**{config!r})
-    env = make_with_pool(lambda: PlainEnv({str(fmu_path)!r}, config), backend={backend!r})
+    env = PlainEnv({str(fmu_path)!r}, config)
     for _ in range(2):
         env.reset()
         observations = [env.step([1.0])[0].tolist() for _ in range(3)]
@@ -92,8 +91,7 @@ def compiler(request, monkeypatch):
 
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
     (name,) = stand_in.replaceable(FMU(fmu_path))
-    for backend in ("native", "python"):
-        assert f"not found here: {name} (no current" in play(fmu_path, backend)
+    assert f"not found here: {name} (no current" in play(fmu_path)
     (command,) = re.findall(r"^fmugym (stand-in model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE)
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
     assert main([replaced.get(word, word) for word in command.split()]) == 0
@@ -103,9 +101,8 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
     assert f'"preload": {json.dumps(preload)}' in said
     assert f"preload = {json.dumps(preload)}" in said
     assert FMU(fmu_path, preload=preload).runs_here
-    for backend in ("native", "python"):
-        assert play(fmu_path, backend, preload=preload) == STEPPED
-    assert play(fmu_path, "native", preload=preload, isolation="process") == STEPPED
+    assert play(fmu_path, preload=preload) == STEPPED
+    assert play(fmu_path, preload=preload, isolation="process") == STEPPED
     for symbol in {*SYMBOLS} - {"_gfortran_matmul_r8"}:
         assert symbol in (tmp_path / name).read_bytes().decode("latin-1")
 
@@ -114,7 +111,7 @@ def test_what_the_stand_in_lacks_ends_the_trial_with_its_name(fmu_path, tmp_path
     (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
     assert built.lacking == ("_gfortran_matmul_r8",)
     environment = {"CALL_MATMUL": "1", "FMUGYM_CACHE_DIR": str(tmp_path)}  # nobody has met it
-    said = play(fmu_path, "native", environment, preload=[str(built.path)])
+    said = play(fmu_path, environment, preload=[str(built.path)])
     assert "has no function _gfortran_matmul_r8, which the FMU calls" in said
 
 
@@ -166,7 +163,7 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
 def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, capsys):
     (name,) = FMU(fmu_path).missing_libraries
     (built,) = stand_in.build_stand_in(FMU(fmu_path), tmp_path)
-    assert play(fmu_path, "native", preload=[str(built.path)]) == STEPPED
+    assert play(fmu_path, preload=[str(built.path)]) == STEPPED
     assert main(["info", str(fmu_path)]) == 0
     said = capsys.readouterr().out
     assert "restore is right" in said

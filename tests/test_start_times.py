@@ -14,7 +14,6 @@ from test_rollouts import WAYS
 
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
-from fmugym import pool as pools
 from fmugym.errors import TaskError
 from fmugym.pool import PoolSpec
 from fmugym.pool.spec import START_TIME
@@ -23,7 +22,6 @@ from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
 KINDS = {
-    "python": {"backend": "python"},
     "native": {"backend": "native"},
     "process": {"backend": "auto", "isolation": "process", "workers": 2},
     "wine": {},
@@ -61,8 +59,6 @@ def make_pool(request, sun):
     made = []
 
     def make(kind, interface="CoSimulation", version=2, n=3, **spec):
-        if kind == "native" and not pools.has_native_pool():
-            pytest.skip("the C extension was not built")
         path = sun(interface, version)
         if kind == "wine":
             request.getfixturevalue("wine")
@@ -142,7 +138,7 @@ def test_saved_states_take_it_to_other_instances_and_pools(make_pool, kind, inte
     start(pool, STARTS)
     steps(pool, 3)
     bundle = pool.save_instances(np.arange(3))
-    other = make_pool("python" if kind == "native" else kind, interface, version)
+    other = make_pool("process" if kind == "native" else kind, interface, version)
     start(other, STARTS + 7.0)
     sources, indices = np.array([2, 0]), np.array([0, 1])
     other.restore_instances(bundle.take([0, 1, 2]), sources, indices)
@@ -158,7 +154,7 @@ def test_saved_states_take_it_to_other_instances_and_pools(make_pool, kind, inte
 class Sun(FMUEnv):
     """Reads the time in all hooks."""
 
-    def __init__(self, path, hooks="auto", backend=None, isolation=None, **config):
+    def __init__(self, path, hooks="auto", isolation=None, **config):
         config = {
             "model_input_names": [],
             "model_output_names": ["x", "now", "sine"],
@@ -168,7 +164,7 @@ class Sun(FMUEnv):
             "max_episode_steps": 5,
             "start_time": Uniform(0, 100),
         } | config
-        super().__init__(path, config, hooks=hooks, backend=backend, isolation=isolation)
+        super().__init__(path, config, hooks=hooks, isolation=isolation)
 
     def _get_action_space(self):
         return gymnasium.spaces.Box(-1, 1, (1,), np.float32)
@@ -356,13 +352,12 @@ def test_an_episode_may_get_another_one(sun):
         env.close()
 
 
-@pytest.mark.parametrize("kind", ["python", "native", "process"])
-def test_all_parts_of_a_system_begin_at_the_same_time(sun, kind):
+@pytest.mark.parametrize("isolation", ["none", "process"])
+def test_all_parts_of_a_system_begin_at_the_same_time(sun, isolation):
     parts = {"a": sun(), "b": sun("ModelExchange", 3)}
     system = FMUSystem(parts, ["a.sine -> b.u"], step_size=STEP)
     own = {"model_output_names": ["b.x", "a.now", "b.now"], "model_parameters": {}}
-    way = {"isolation": "process"} if kind == "process" else {"backend": kind}
-    env = Sun(system, **own, **way, start_time=[0.0, 7.5, 100.25])
+    env = Sun(system, **own, isolation=isolation, start_time=[0.0, 7.5, 100.25])
     seen = set()
     for seed in range(20):
         start = env.reset(seed=seed)[1]["drawn"]["start_time"]

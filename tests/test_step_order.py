@@ -2,11 +2,9 @@
 
 import gymnasium as gym
 import numpy as np
-import pytest
 from vector_tools import Drawing
 
 import fmugym
-from fmugym.pool import has_native_pool
 from fmugym.task.step import ORDER
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.trace import trace_hooks
@@ -105,7 +103,6 @@ class Plain(Recording):
         return self._note("_reward_policy", np.where(self.done, -1.0, 1.0 * self.step_count))
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="the C extension was not built")
 def test_compiled():
     env = Plain()
     CALLED.clear()

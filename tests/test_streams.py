@@ -9,15 +9,12 @@ from vector_tools import Drawing, each_way
 
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
-from fmugym.pool import has_native_pool
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.generators import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector import streams as module
 from fmugym.vector.streams import EpisodeStreams
 
-needs_native = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
-WAYS = (True, False) if has_native_pool() else (False,)
 SEEDS = [
     *range(200),
     *(2**bits + offset for bits in (31, 32, 63, 64, 96, 127, 128, 160, 192) for offset in (-1, 0)),
@@ -47,7 +44,7 @@ class OwnUniform(Uniform):
         return float(rng.uniform(self.low, self.high)) ** 2
 
 
-@pytest.fixture(params=WAYS, ids=lambda native: "native" if native else "python")
+@pytest.fixture(params=[True, False], ids=lambda native: "native" if native else "python")
 def native(request, monkeypatch):
     """Draw with the C extension, and as if there were none."""
     monkeypatch.setattr(module, "has_native_pool", lambda: request.param)
@@ -153,7 +150,6 @@ def test_an_unseeded_stream_can_be_repeated(native):
     assert np.random.default_rng(streams.seed_of(0)).random() == drawn
 
 
-@needs_native
 def test_normals_are_left_to_python_where_numpys_function_is_not_found(monkeypatch):
     monkeypatch.setattr(module, "_standard_normal", lambda: 0)
     streams = EpisodeStreams(1)
@@ -190,12 +186,10 @@ MIXED = {
 
 @each_way
 @pytest.mark.parametrize("own", [False, True], ids=["known", "own"])
-def test_every_distribution_in_episodes(own, backend, hooks):
+def test_every_distribution_in_episodes(own, hooks):
     """Environment i, seeded with s, draws what a single environment seeded with s + i draws."""
     parameters = {**MIXED, "q_dot_0": OwnUniform(0.1, 0.4)} if own else MIXED
-    envs = FMUVectorEnv(
-        lambda: Drawing(model_parameters=parameters), 3, hooks=hooks, backend=backend
-    )
+    envs = FMUVectorEnv(lambda: Drawing(model_parameters=parameters), 3, hooks=hooks)
     single = Drawing(model_parameters=parameters)
     infos = [envs.reset(seed=40)[1], *(envs.reset()[1] for _ in range(4))]
     for index in range(3):
@@ -222,7 +216,6 @@ class BareDrawing(Drawing):
         return self.step_count >= 4
 
 
-@needs_native
 @pytest.mark.parametrize("own", [False, True], ids=["known", "own"])
 def test_every_distribution_in_the_pass(own):
     parameters = {**MIXED, "q_dot_0": OwnUniform(0.1, 0.4)} if own else MIXED
@@ -243,7 +236,6 @@ def test_every_distribution_in_the_pass(own):
         envs.close()
 
 
-@needs_native
 def test_a_refused_step_draws_nothing():
     parameters = {"q_0": OwnUniform(0.1, 0.4)}
     envs, twins = (
@@ -262,7 +254,6 @@ def test_a_refused_step_draws_nothing():
     twins.close()
 
 
-@needs_native
 class TestGuards:
     @pytest.mark.parametrize(
         ("row", "numbers"),

@@ -25,7 +25,7 @@ from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
 from fmugym.archive.fmu import FMU
 from fmugym.archive.texts import number_of, numbers_of
 from fmugym.logs import PlantLog
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
 from fmugym.task.quantity import Quantity
@@ -135,7 +135,7 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     envs.close()
 
 
-@pytest.mark.skipif(not has_native_pool() or not hasattr(os, "fork"), reason="needs C and forks")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_fork_while_a_pool_reads_texts(feedthrough):
     """A lock that another thread holds would stay locked in the child."""
@@ -144,7 +144,7 @@ def test_a_fork_while_a_pool_reads_texts(feedthrough):
     fmu = FMU(feedthrough[3])
     told = tuple(fmu.description.variables[name] for name in ("String_told", "String_out"))
     spec = PoolSpec((), told * 20, 0.1)
-    pool = local_pool(fmu, spec, 1000, logging.getLogger("fmugym.test"), native=True, threads=1)
+    pool = local_pool(fmu, spec, 1000, logging.getLogger("fmugym.test"), threads=1)
     done = threading.Event()
 
     def step():
@@ -278,12 +278,11 @@ def test_a_backend_that_mixes_texts_and_numbers_fails(feedthrough, given, facts)
 
 def test_long_and_foreign_texts(feedthrough):
     texts = ["x" * 199, "日本語", "\n\t"]
-    for backend in ("native", "python"):
-        env = Echo(feedthrough[3], words=Choice(texts), backend=backend)
-        for _ in range(5):
-            _, info = env.reset()
-            assert info["told"] == info["drawn"]["String_parameter"]
-        env.close()
+    env = Echo(feedthrough[3], words=Choice(texts))
+    for _ in range(5):
+        _, info = env.reset()
+        assert info["told"] == info["drawn"]["String_parameter"]
+    env.close()
 
 
 def test_numbers_of_texts():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import container_tools
 import exchange_tools
 import fmpy
+import fmpy_master
 import fmu_tools
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from system_tools import (
     LOG,
     by_each_master,
     closing_pools,  # noqa: F401  # the fixture "make"
-    in_each_engine,
     linear,
     linear_fmu,
     masses,
@@ -28,7 +28,7 @@ from system_tools import (
 import fmugym
 from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
@@ -65,19 +65,16 @@ ORDERS = {
 
 
 class TestAgainstClosedForms:
-    @in_each_engine
     @by_each_master
     @pytest.mark.parametrize("name", ORDERS)
     @pytest.mark.parametrize("steps", [(1, 1), (1, 4), (3, 2)])
-    def test_errors_are_of_the_first_order_in_the_step_size(
-        self, make, fmus, native, master, name, steps
-    ):
+    def test_errors_are_of_the_first_order_in_the_step_size(self, make, fmus, master, name, steps):
         """Inputs are constant over a step, so half the step size gives half the error."""
         build, exact, outputs = ORDERS[name]
         plan = build([fmus[2], fmus[3]], steps, master=master)
         errors = []
         for count in (24, 48, 96):
-            rows = play(make(plan, (), outputs, native, time_step=2.0 / count), count)
+            rows = play(make(plan, (), outputs, time_step=2.0 / count), count)
             expected = exact(np.arange(count + 1) * 2.0 / count).T
             errors.append(np.abs(rows - expected).max())
         assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
@@ -91,8 +88,7 @@ class TestAgainstClosedForms:
         distance = system_tools.POSITIONS[1] - system_tools.POSITIONS[0]
         assert force.tolist() == [system_tools.COUPLING * distance] * 2
 
-    @in_each_engine
-    def test_gauss_seidel_follows_without_delay(self, make, fmus, native):
+    def test_gauss_seidel_follows_without_delay(self, make, fmus):
         """A chain of gains carries the newest value through in one step, a Jacobi step carries it
         by one component."""
         gain = {"d": [[2, 0], [0, 0]]}
@@ -100,7 +96,7 @@ class TestAgainstClosedForms:
         links = (Link("a", "y1", "b", "u1"), Link("b", "y1", "c", "u1"))
         found = {}
         for master in MASTERS:
-            pool = make(system(parts, links, master=master), ["a.u1"], ["c.y1"], native)
+            pool = make(system(parts, links, master=master), ["a.u1"], ["c.y1"])
             found[master] = play(pool, 3, np.array([1.0, 2.0, 3.0]).reshape(3, 1, 1))[:, 0]
         assert found["gauss_seidel"].tolist() == [0.0, 8.0, 16.0, 24.0]
         assert found["jacobi"].tolist() == [0.0, 0.0, 0.0, 8.0]
@@ -131,54 +127,30 @@ def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2
 PENDULUM_OUTPUTS = ["a.theta", "b.theta_dot", "c.q", "c.tau"]
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
-class TestBothEngines:
-    @by_each_master
-    @pytest.mark.parametrize("versions", [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])
-    @pytest.mark.parametrize(
-        "options", [{}, {"substeps": 3, "start_time": 0.5}, {"warm_up_steps": 2}]
+@by_each_master
+@pytest.mark.parametrize("versions", [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])
+@pytest.mark.parametrize("substeps", [1, 3])
+@pytest.mark.parametrize("warm_up", [0, 2])
+def test_steps_are_those_of_a_loop_over_fmpy(make, master, versions, substeps, warm_up):
+    plan = pendulums(master, versions)
+    options = {"substeps": substeps, "start_time": 0.5, "warm_up_steps": warm_up}
+    rows = play(make(plan, (), PENDULUM_OUTPUTS, time_step=0.02, **options), 50)
+    steps = [{}] * substeps * (50 + warm_up)
+    expected = fmpy_master.play(plan, PENDULUM_OUTPUTS, steps, 0.02 / substeps, 0.5)
+    expected = expected[::substeps][warm_up:]
+    assert np.abs(rows).max() > 0.1
+    np.testing.assert_allclose(rows, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("versions", [(1, 2), (2, 1), (3, 3), (1, 1)])
+def test_model_exchange_and_co_simulation_go_together(make, fmus, tmp_path, versions):
+    """x' = 0.5 x - x with its solver beside a gain; two episodes of the same instance."""
+    pool = make(
+        decay_with_gain(tmp_path, fmus, versions), (), ["decay.x", "gain.y1"], time_step=0.02
     )
-    def test_compute_the_same_to_the_last_bit(self, make, master, versions, options):
-        found = []
-        for native in (False, True):
-            pool = make(
-                pendulums(master, versions), (), PENDULUM_OUTPUTS, native, time_step=0.02, **options
-            )
-            found.append(play(pool, 50))
-        assert np.abs(found[0]).max() > 0.1
-        assert found[0].tobytes() == found[1].tobytes()
-
-    @pytest.mark.parametrize("method", ["newton", "fixed_point"])
-    @by_each_master
-    def test_solve_loops_alike(self, make, fmus, method, master):
-        found = []
-        for native in (False, True):
-            plan = loop_of_gains(fmus, Loop(method), master=master)
-            pool = make(plan, ["a.u2"], ["a.y1", "b.y1", "a.u1"], native)
-            found.append(play(pool, 4, np.linspace(1, 2, 4).reshape(4, 1, 1)))
-        assert found[0].tobytes() == found[1].tobytes()
-
-    @pytest.mark.parametrize("versions", [(1, 2), (2, 1), (3, 3), (1, 1)])
-    def test_exchange_model_exchange_and_co_simulation(self, make, fmus, tmp_path, versions):
-        """x' = 0.5 x - x with its solver beside a gain; two episodes of the same instance."""
-        found = []
-        for native in (False, True):
-            plan = decay_with_gain(tmp_path, fmus, versions)
-            pool = make(plan, (), ["decay.x", "gain.y1"], native, time_step=0.02)
-            found += [play(pool, 50), play(pool, 50)]
-        assert all(rows.tobytes() == found[0].tobytes() for rows in found)
-        assert np.allclose(found[0][:, 0], np.exp(-0.5 * np.arange(51) * 0.02), atol=0.01)
-
-    def test_serialize_alike(self, make):
-        found = []
-        for native in (False, True):
-            pool = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
-            pool.reset((), np.zeros((0, 2)))
-            pool.step()
-            data, ends, *_ = pool.serialize_states(np.arange(2))
-            found.append((bytes(data), ends.tolist()))
-        assert found[0][1] == found[1][1]
-        assert len(found[0][0]) == len(found[1][0])
+    rows = play(pool, 50)
+    assert play(pool, 50).tobytes() == rows.tobytes()
+    assert np.allclose(rows[:, 0], np.exp(-0.5 * np.arange(51) * 0.02), atol=0.01)
 
 
 def decay_with_gain(folder, fmus, versions=(2, 1)):
@@ -201,21 +173,27 @@ def loop_of_gains(fmus, loop, gains=(0.5, -0.6), **options):
 
 
 class TestLoops:
-    @in_each_engine
     @pytest.mark.parametrize("method", ["newton", "fixed_point"])
-    def test_are_solved_within_the_tolerance(self, make, fmus, native, method):
+    def test_are_solved_within_the_tolerance(self, make, fmus, method):
         plan = loop_of_gains(fmus, Loop(method, 1e-10))
-        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"], native)
+        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"])
         rows = play(pool, 3, np.array([1.0, -2.0, 5.0]).reshape(3, 1, 1))
         expected = np.array([0.0, 1.0, -2.0, 5.0]) / (1 + 0.3)
         assert np.allclose(rows[:, 0], expected, rtol=1e-9, atol=1e-12)
         assert np.allclose(rows[:, 1], -0.6 * expected, rtol=1e-9, atol=1e-12)
 
-    @in_each_engine
+    @pytest.mark.parametrize("method", ["newton", "fixed_point"])
+    def test_are_solved_only_before_the_first_step_by_jacobi(self, make, fmus, method):
+        pool = make(loop_of_gains(fmus, Loop(method), master="jacobi"), ["a.u2"], ["a.y1", "b.y1"])
+        pool.reset((pool.variable("a.u2"),), np.array([[2.6]]))
+        rows = [pool.outputs[:, 0].copy(), *(pool.step([[2.6]])[0][:, 0].copy() for _ in range(3))]
+        a, b = np.array(rows).T
+        assert (a[0], b[0]) == pytest.approx((2.0, -1.2))
+        assert a[1:] == pytest.approx(0.5 * b[:-1] + 2.6)
+        assert b[1:] == pytest.approx(-0.6 * a[:-1])
+
     @by_each_master
-    def test_of_components_that_cannot_repeat_a_step_are_not_solved(
-        self, make, fmus, native, master
-    ):
+    def test_of_components_that_cannot_repeat_a_step_are_not_solved(self, make, fmus, master):
         """FMI 1.0 knows neither saved states nor an Initialization Mode."""
         parts = loop_of_gains(fmus | {2: fmus[1]}, None).components
         loop = fmugym.FMUSystem(
@@ -223,22 +201,21 @@ class TestLoops:
             ["a.y1 -> b.u1", "b.y1 -> a.u1"],
             master=master,
         )
-        rows = play(make(loop, ["a.u2"], ["a.y1", "b.y1"], native), 3, np.full((3, 1, 1), 2.6))
+        rows = play(make(loop, ["a.u2"], ["a.y1", "b.y1"]), 3, np.full((3, 1, 1), 2.6))
         a, b = rows.T
         assert (a[0], b[0]) == (0.0, 0.0)
         assert a[1:] == pytest.approx(0.5 * b[:-1] + 2.6, rel=1e-12)
         newest = a[1:] if master == "gauss_seidel" else a[:-1]
         assert b[1:] == pytest.approx(-0.6 * newest, rel=1e-12)
 
-    @in_each_engine
-    def test_through_fmi_1_begins_with_its_start_values(self, make, fmus, native):
+    def test_through_fmi_1_begins_with_its_start_values(self, make, fmus):
         a = linear("a", fmus[1], d=[[0.5, 1], [0, 0]])
         values = dict(a.starts) | {"u1": 4.0, "u2": 1.0}
         b = fmugym.Component(fmus[3], dict(linear("b", fmus[3], d=[[2, 0], [0, 0]]).starts))
         loop = fmugym.FMUSystem(
             {"a": fmugym.Component(a.path, values), "b": b}, ["a.y1 -> b.u1", "b.y1 -> a.u1"]
         )
-        outputs, statuses = make(loop, (), ["b.u1", "b.y1"], native).reset(*NO_START)
+        outputs, statuses = make(loop, (), ["b.u1", "b.y1"]).reset(*NO_START)
         assert not statuses.any()
         assert outputs[:, 0].tolist() == [3.0, 6.0]
 
@@ -257,10 +234,9 @@ class TestLoops:
         with pytest.raises(ConfigError, match="algebraic loop"):
             fmugym.FMUSystem(parts, links, loops="refuse")
 
-    @in_each_engine
-    def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus, native):
+    def test_newton_solves_what_a_fixed_point_does_not(self, make, fmus):
         for method, status in (("newton", Status.OK), ("fixed_point", Status.DISCARD)):
-            pool = make(loop_of_gains(fmus, Loop(method), (2.0, 3.0)), ["a.u2"], ["a.y1"], native)
+            pool = make(loop_of_gains(fmus, Loop(method), (2.0, 3.0)), ["a.u2"], ["a.y1"])
             pool.reset(*NO_START)
             outputs, statuses = pool.step(np.array([[1.0]]))
             assert statuses.tolist() == [status]
@@ -271,23 +247,21 @@ class TestLoops:
             else:
                 assert outputs[0, 0] == pytest.approx(1 / (1 - 6))
 
-    @in_each_engine
-    def test_are_solved_before_the_first_step(self, make, fmus, native):
+    def test_are_solved_before_the_first_step(self, make, fmus):
         plan = loop_of_gains(fmus, Loop())
-        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"], native)
+        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"])
         start = (pool.variable("a.u2"),)
         outputs, statuses = pool.reset(start, np.array([[2.6]]))
         assert not statuses.any()
         assert outputs[:, 0] == pytest.approx([2.0, -1.2])
 
-    @in_each_engine
-    def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus, native):
+    def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus):
         """The coupled masses as a loop: what both compute agrees with what both got."""
         plan = masses([fmus[2], fmus[3]])
         loop = Loop("newton", 1e-12)
         plan = replace(plan, groups=(Group(("first", "second"), loop),))
         outputs = ["first.y1", "first.y2", "second.u1", "second.u2", "second.y1", "first.u1"]
-        rows = play(make(plan, (), outputs, native, time_step=0.05), 20)
+        rows = play(make(plan, (), outputs, time_step=0.05), 20)
         assert np.allclose(rows[1:, :2], rows[1:, 2:4], rtol=0, atol=1e-11)
         assert np.allclose(rows[1:, 4], rows[1:, 5], rtol=0, atol=1e-11)
 
@@ -306,8 +280,7 @@ def test_the_pendulum_in_two_parts_comes_near_the_whole(make, fmus, master):
     assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.05)
 
 
-@in_each_engine
-def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, native, tmp_path):
+def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, tmp_path):
     links = (("a", "theta_dot", "b", "tau"), ("b", "theta", "c", "tau"))
     starts = {"a": 0.3, "b": 0.6, "c": 0.9}
     path = bundled_fmu("Pendulum", "3.0")
@@ -324,7 +297,7 @@ def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, native, tmp_path)
     )
     components = [Component(n, path, starts=(("q_0", q),)) for n, q in starts.items()]
     plan = system(components, [Link(*link) for link in links], master="jacobi")
-    rows = play(make(plan, (), [f"{n}.theta" for n in starts], native, time_step=0.02), 50)
+    rows = play(make(plan, (), [f"{n}.theta" for n in starts], time_step=0.02), 50)
     expected = np.array([found[f"{name}.theta"] for name in starts]).T
     assert np.allclose(rows, expected, rtol=0, atol=1e-9)
 
@@ -333,8 +306,7 @@ def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, native, tmp_path)
 
 
 class TestValues:
-    @in_each_engine
-    def test_connectors_stand_for_variables_in_other_units(self, make, fmus, native):
+    def test_connectors_stand_for_variables_in_other_units(self, make, fmus):
         """One input for two components; an output and a parameter in other units."""
         parts = [
             linear(n, fmus[v], b=[[1, 0], [0, 0]], c=np.eye(2)) for n, v in (("a", 2), ("b", 3))
@@ -345,23 +317,21 @@ class TestValues:
             Connector("start", (End("b", "x1_0", 0.01),), "parameter"),
         )
         plan = system(parts, (), connectors=connectors)
-        pool = make(plan, ["push"], ["a.y1", "level"], native)
+        pool = make(plan, ["push"], ["a.y1", "level"])
         outputs, _ = pool.reset((pool.variable("start"),), np.array([[30.0]]))
         assert outputs[:, 0] == pytest.approx([0.0, 29.0])
         outputs, _ = pool.step(np.array([[3.0]]))
         assert outputs[:, 0] == pytest.approx([0.6, 29.0 + 35.0])
 
-    @in_each_engine
-    def test_start_values_win_over_those_of_the_plan(self, make, native):
-        pool = make(pendulums(), (), ["a.q", "b.q"], native, time_step=0.02)
+    def test_start_values_win_over_those_of_the_plan(self, make):
+        pool = make(pendulums(), (), ["a.q", "b.q"], time_step=0.02)
         assert play(pool, 0)[0] == pytest.approx([0.3, 0.6])
         outputs, _ = pool.reset((pool.variable("b.q_0"),), np.array([[1.5]]))
         assert outputs[:, 0] == pytest.approx([0.3, 1.5])
         outputs, _ = pool.reset(*NO_START)
         assert outputs[:, 0] == pytest.approx([0.3, 0.6])
 
-    @in_each_engine
-    def test_types_are_converted_by_each_component(self, make, native, tmp_path):
+    def test_types_are_converted_by_each_component(self, make, tmp_path):
         """A Real drives an Integer and a Boolean; Enumerations of FMI 2.0 and 3.0 are read."""
         probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
         parts = tuple(Component(n, p) for n, p in zip("ab", probes, strict=True))
@@ -374,7 +344,7 @@ class TestValues:
             (Evaluation((0,)), Evaluation((1,))),
         )
         names = ["b.n_out", "a.free_out", "a.mode_out", "b.mode_out"]
-        pool = make(plan, ["b.on", "a.mode", "b.mode"], names, native)
+        pool = make(plan, ["b.on", "a.mode", "b.mode"], names)
         rows = play(pool, 2, np.array([[[1.0], [2.0], [5.0]]] * 2))
         assert rows[-1, 2:].tolist() == [2.0, 5.0]
         assert rows[-1, 1] == 1.0
@@ -396,11 +366,10 @@ class TestValues:
 
 
 class TestFaults:
-    @in_each_engine
     @by_each_master
-    def test_end_one_system_and_name_the_component(self, make, fmus, native, master):
+    def test_end_one_system_and_name_the_component(self, make, fmus, master):
         plan = masses([fmus[2], fmus[2]], master=master)
-        pool = make(plan, (), ["first.y1"], native, 3)
+        pool = make(plan, (), ["first.y1"], 3)
         start = tuple(map(pool.variable, ("second.fails", "second.status")))
         pool.reset(start, np.array([[0.25] * 3, [0.0, 3.0, 0.0]]))
         for expected in (0, 0, Status.ERROR):
@@ -413,10 +382,9 @@ class TestFaults:
         assert not statuses.any()
         assert outputs[0, 1] == system_tools.POSITIONS[0]
 
-    @in_each_engine
-    def test_a_component_that_asks_to_stop_stops_the_system(self, make, fmus, native):
+    def test_a_component_that_asks_to_stop_stops_the_system(self, make, fmus):
         plan = masses([fmus[2], fmus[3]])
-        pool = make(plan, (), ["first.t", "second.t"], native)
+        pool = make(plan, (), ["first.t", "second.t"])
         start = tuple(map(pool.variable, ("first.fails", "first.status")))
         pool.reset(start, np.array([[0.15], [1.0]]))
         pool.step()
@@ -424,22 +392,20 @@ class TestFaults:
         assert statuses.tolist() == [Status.TERMINATED]
         assert outputs[:, 0] == pytest.approx([0.2, 0.2])
 
-    @in_each_engine
-    def test_no_component_gets_what_is_no_number(self, make, fmus, native):
+    def test_no_component_gets_what_is_no_number(self, make, fmus):
         big = linear("big", fmus[2], (1e200, 0.0), c=[[1e200, 0], [0, 0]])
         plan = system((linear("a", fmus[3]), big), (Link("big", "y1", "a", "u1"),))
-        pool = make(plan, (), ["a.y1"], native)
+        pool = make(plan, (), ["a.y1"])
         _, statuses = pool.reset(*NO_START)
         assert statuses[0] > Status.WARNING
         assert "component 'big'" in pool.failure(0)
         assert "not finite" in pool.failure(0)
 
-    @in_each_engine
-    def test_discarded_steps_are_repeated_as_smaller_ones_of_all(self, make, fmus, native):
+    def test_discarded_steps_are_repeated_as_smaller_ones_of_all(self, make, fmus):
         """One component accepts only steps of at most 0.03 s, so the system does four of 0.025."""
         plan = masses([fmus[2], fmus[2]])
-        limited = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.1, fault_retries=3)
-        fine = make(plan, (), ["first.y1", "second.y2"], native, time_step=0.025)
+        limited = make(plan, (), ["first.y1", "second.y2"], time_step=0.1, fault_retries=3)
+        fine = make(plan, (), ["first.y1", "second.y2"], time_step=0.025)
         outputs, _ = limited.reset((limited.variable("second.limit"),), np.array([[0.03]]))
         fine.reset(*NO_START)
         for _ in range(5):
@@ -457,12 +423,11 @@ class TestFaults:
         with pytest.raises(FMULoadError, match=r"component 'second'.*broken\.fmu"):
             make(masses([fmus[2], broken]))
 
-    @pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
     def test_messages_name_the_component(self, make, tmp_path, caplog):
         probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
         parts = tuple(Component(n, p) for n, p in zip(("one", "two"), probes, strict=True))
         plan = SystemPlan("talk", parts, groups=(Group(("one",)), Group(("two",))))
-        pool = make(plan, (), ["one.sum"], True, 2)
+        pool = make(plan, (), ["one.sum"], 2)
         start = (pool.variable("two.log_status"),)
         pool.reset(start, np.array([[-1.0, 1.0]]))
         pool.step()
@@ -475,10 +440,9 @@ class TestFaults:
 
 
 class TestStates:
-    @in_each_engine
     @by_each_master
-    def test_return_as_one(self, make, native, master):
-        pool = make(pendulums(master), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+    def test_return_as_one(self, make, master):
+        pool = make(pendulums(master), (), PENDULUM_OUTPUTS, 2, 0.02)
         pool.reset((), np.zeros((0, 2)))
         for _ in range(7):
             pool.step()
@@ -488,10 +452,9 @@ class TestStates:
         again = [pool.step()[0].copy() for _ in range(5)]
         assert np.array_equal(before, again)
 
-    @in_each_engine
-    def test_pass_to_other_pools_as_bytes(self, make, native):
-        one = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
-        other = make(pendulums(), (), PENDULUM_OUTPUTS, native, 2, 0.02)
+    def test_pass_to_other_pools_as_bytes(self, make):
+        one = make(pendulums(), (), PENDULUM_OUTPUTS, 2, 0.02)
+        other = make(pendulums(), (), PENDULUM_OUTPUTS, 2, 0.02)
         for pool in (one, other):
             pool.reset((), np.zeros((0, 2)))
         for _ in range(5):
@@ -505,24 +468,6 @@ class TestStates:
 
 
 # Where an FMU stands
-
-
-class Chain(fmugym.FMUEnv):
-    """Pushes the first pendulum of a chain."""
-
-    def __init__(self, plan, backend=None, isolation=None):
-        config = {
-            "model_input_names": ["a.tau"],
-            "model_output_names": ["a.theta", "b.theta"],
-            "model_parameters": {"b.q_0": 0.2},
-            "time_step": 0.02,
-            "bounds": {"a.tau": (-1, 1)},
-            "max_episode_steps": 30,
-        }
-        super().__init__(plan, config, backend=backend, isolation=isolation)
-
-    def _is_done(self):
-        return abs(self.out["b.theta"]) > 10
 
 
 def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
@@ -544,14 +489,13 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
     assert known_verdict(SystemFMU(other)) is None
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 @pytest.mark.parametrize("method", list(ResetMethod)[:4])
 def test_episodes_begin_anew_by_each_method(make, method):
     """Each instance has private copies of all libraries, which are also loaded anew."""
     fmu = SystemFMU(pendulums())
     outputs = tuple(map(fmu.variable, PENDULUM_OUTPUTS))
     spec = PoolSpec((), outputs, 0.02, reset_method=method)
-    pool = local_pool(fmu, spec, 2, LOG, native=True, private_libraries=True)
+    pool = local_pool(fmu, spec, 2, LOG, private_libraries=True)
     try:
         episodes = [play(pool, 10) for _ in range(4)]
         assert all(rows.tobytes() == episodes[0].tobytes() for rows in episodes)
@@ -567,7 +511,7 @@ def test_a_system_runs_in_worker_processes(make, workers):
     fmu = SystemFMU(pendulums())
     spec = PoolSpec((), tuple(map(fmu.variable, PENDULUM_OUTPUTS)), 0.02)
     pool = opening.make_pool(fmu, spec, 3, LOG, isolation="process", workers=workers)
-    here = make(pendulums(), (), PENDULUM_OUTPUTS, has_native_pool(), 3, 0.02)
+    here = make(pendulums(), (), PENDULUM_OUTPUTS, 3, 0.02)
     try:
         for one in (pool, here):
             one.reset((), np.zeros((0, 3)))
@@ -578,7 +522,7 @@ def test_a_system_runs_in_worker_processes(make, workers):
 
 
 def test_a_closed_system_says_so(make):
-    pool = make(pendulums(), (), PENDULUM_OUTPUTS, has_native_pool())
+    pool = make(pendulums(), (), PENDULUM_OUTPUTS)
     pool.close()
     with pytest.raises(SimulationError, match="closed"):
         pool.reset(*NO_START)

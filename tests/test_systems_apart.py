@@ -34,7 +34,6 @@ import fmugym
 from fmugym import (
     Component,
     ConfigError,
-    FMULoadError,
     FMUSystem,
     bundled_fmu,
 )
@@ -285,10 +284,6 @@ class TestWhereAnFMUStands:
         pool = opening.make_pool(fmu, spec, 2, LOG)
         with contextlib.closing(pool):
             assert not pool.reset((), np.zeros((0, 2)))[1].any()
-
-    def test_python_refuses_it_by_name(self):
-        with pytest.raises(FMULoadError, match="component 'a'"):
-            Chain(chain(bundled_fmu("Pendulum"), isolate=True), backend="python")
 
     @pytest.mark.parametrize("value", [2, "yes", None])
     def test_the_argument_is_a_flag(self, value):

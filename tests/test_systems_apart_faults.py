@@ -117,7 +117,7 @@ class TestFaults:
     def test_a_library_that_is_gone_for_a_while(self, fmus, tmp_path):
         fmu = SystemFMU(apart(masses([fmus[2], fmus[2]]), "first"))
         spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
-        pool = local_pool(fmu, spec, 1, LOG, native=True)
+        pool = local_pool(fmu, spec, 1, LOG)
         pool.variable = fmu.variable
         with contextlib.closing(pool):
             rows = play(pool, 3)
@@ -153,7 +153,7 @@ class TestFaults:
             plan = with_fault({dict(fmus)!r}, {str(faulty)!r})
             fmu = SystemFMU(plan)
             spec = PoolSpec((), (fmu.variable("bad.y"),), 0.5)
-            pool = local_pool(fmu, spec, 1, LOG, native=True)
+            pool = local_pool(fmu, spec, 1, LOG)
             names = tuple(map(fmu.variable, NAMES))
             pool.reset(names, asking_for("hang", stage={stage!r}))
             print(*children(), flush=True)
@@ -195,4 +195,4 @@ class TestFaults:
         part = fmu.parts[1]
         shutil.copy(_native.__file__, part.extract() / part.library)
         with pytest.raises(FMULoadError, match="'second': it does not export fmi2"):
-            local_pool(fmu, PoolSpec((), (), 0.1), 1, LOG, native=True)
+            local_pool(fmu, PoolSpec((), (), 0.1), 1, LOG)

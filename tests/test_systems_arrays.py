@@ -11,7 +11,6 @@ from scipy.linalg import expm
 from system_tools import (
     by_each_master,
     closing_pools,  # noqa: F401  # the fixture "make"
-    in_each_engine,
     play,
 )
 
@@ -91,28 +90,18 @@ STATES = ["plant.x[1]", "plant.x[2]", "control.x[1]"]
 
 
 class TestConnections:
-    @in_each_engine
     @by_each_master
-    def test_errors_are_of_the_first_order_in_the_step_size(self, make, path, native, master):
+    def test_errors_are_of_the_first_order_in_the_step_size(self, make, path, master):
         errors = []
         for count in (40, 80, 160):
-            pool = make(plant_and_control(path, master=master), (), STATES, native, 1, 2.0 / count)
+            pool = make(plant_and_control(path, master=master), (), STATES, 1, 2.0 / count)
             rows = play(pool, count)
             errors.append(np.abs(rows - exactly(np.arange(count + 1) * 2.0 / count)).max())
         assert errors[2] < 0.08
         assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
         assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
 
-    @by_each_master
-    def test_both_engines_compute_the_same_to_the_last_bit(self, make, path, master):
-        outputs = [*STATES, *(f"control.u[{i}]" for i in (1, 2, 3)), "plant.y[3]"]
-        plan = plant_and_control(path, master=master)
-        rows = [play(make(plan, (), outputs, native), 20) for native in (False, True)]
-        assert np.abs(rows[0]).max() > 0.5
-        assert rows[0].tobytes() == rows[1].tobytes()
-
-    @in_each_engine
-    def test_a_system_does_what_a_loop_over_fmpy_does(self, make, path, native, tmp_path):
+    def test_a_system_does_what_a_loop_over_fmpy_does(self, make, path, tmp_path):
         """A Jacobi step: all inputs are outputs of the beginning of the step."""
         slaves = {n: slave(path, tmp_path / n, v) for n, v in parts().items()}
         rows = []
@@ -131,12 +120,11 @@ class TestConnections:
             one.terminate()
             one.freeInstance()
         outputs = [f"plant.y[{i}]" for i in (1, 2, 3)]
-        pool = make(plant_and_control(path, master="jacobi"), (), outputs, native)
+        pool = make(plant_and_control(path, master="jacobi"), (), outputs)
         assert play(pool, 10) == pytest.approx(np.array(rows), abs=1e-12)
 
-    @in_each_engine
     @pytest.mark.parametrize("loops", ["newton", "fixed_point"])
-    def test_algebraic_loops_of_arrays_are_solved(self, make, path, native, loops):
+    def test_algebraic_loops_of_arrays_are_solved(self, make, path, loops):
         """y1 = D1 y2 and y2 = D2 y1 + c, where c comes from the state."""
         d = np.array([[0.2, 0.4], [-0.3, 0.1]]), np.array([[0.5, 0.0], [0.2, -0.4]])
         rest = {"A": np.zeros((2, 2)), "B": np.zeros((2, 2)), "C": np.eye(2)}
@@ -151,13 +139,12 @@ class TestConnections:
             loop_tolerance=1e-12,
         )
         assert len(system.findings) > 0
-        rows = play(make(system, (), ["a.y[1]", "a.y[2]", "b.u[2]"], native), 2)
+        rows = play(make(system, (), ["a.y[1]", "a.y[2]", "b.u[2]"]), 2)
         expected = d[0] @ np.linalg.solve(np.eye(2) - d[1] @ d[0], start)
         assert rows[:, :2] == pytest.approx(np.tile(expected, (3, 1)), rel=1e-9)
         assert rows[:, 2] == pytest.approx(rows[:, 1], rel=1e-9)
 
-    @in_each_engine
-    def test_elements_that_nothing_drives_stay_as_they_are(self, make, path, native):
+    def test_elements_that_nothing_drives_stay_as_they_are(self, make, path):
         """FMI sets whole arrays: the third element has the start value of the component, and the
         second one that of the system."""
         gains = part(path, {**CONTROL, "B": np.zeros((1, 3)), "D": np.eye(2, 3) + 0.0})
@@ -165,7 +152,7 @@ class TestConnections:
         gains.start_values["C"] = [[0.0], [0.0]]
         gains.start_values["u"] = [5.0, 6.0, 7.0]
         system = FMUSystem({"plant": part(path, PLANT), "g": gains}, ["plant.x[2] -> g.u[1]"])
-        pool = make(system, (), ["g.y[1]", "g.u[1]", "g.u[2]", "g.u[3]"], native)
+        pool = make(system, (), ["g.y[1]", "g.u[1]", "g.u[2]", "g.u[3]"])
         for start, second in (((), 6.0), ((pool.variable("g.u[2]"),), -1.0)):
             pool.reset(start, np.full((len(start), 1), second))
             for _ in range(2):
@@ -174,15 +161,14 @@ class TestConnections:
                 assert u[1:] == [second, 7.0]
                 assert told == u[0] + 10.0 * u[1] + 100.0 * u[2]
 
-    @in_each_engine
-    def test_integers_of_sixteen_bits_pass_as_they_are(self, make, matrices, native):
+    def test_integers_of_sixteen_bits_pass_as_they_are(self, make, matrices):
         system = FMUSystem(
             {"a": matrices, "b": matrices}, ["a.w -> b.v", "b.w[2,1] -> b.Float64_in"]
         )
         names = [f"a.v[{i},{j}]" for i in (1, 2) for j in (1, 2)]
         outputs = [f"b.w[{i},{j}]" for i in (1, 2) for j in (1, 2)] + ["b.Float64_out"]
         values = np.array([[1.0], [-2.0], [32767.0], [-32768.0]])
-        rows = play(make(system, names, outputs, native), 3, [values] * 3)
+        rows = play(make(system, names, outputs), 3, [values] * 3)
         assert rows[3].tolist() == [*values[:, 0], 32767.0]
 
     def test_an_array_without_elements(self, make, path):
@@ -195,12 +181,11 @@ class TestConnections:
         system = FMUSystem(
             {"big": part(path, big, feedthrough=False), "g": part(path, CONTROL)}, ["big.y -> g.u"]
         )
-        for native in (False, True):
-            pool = make(system, (), ["g.x[1]"], native, time_step=60.0)
-            pool.reset((), np.zeros((0, 1)))
-            _, statuses = pool.step()
-            assert statuses[0] == Status.NOT_FINITE
-            assert "component 'big'" in pool.failure(0)
+        pool = make(system, (), ["g.x[1]"], time_step=60.0)
+        pool.reset((), np.zeros((0, 1)))
+        _, statuses = pool.step()
+        assert statuses[0] == Status.NOT_FINITE
+        assert "component 'big'" in pool.failure(0)
 
 
 def parts():
@@ -240,7 +225,7 @@ def slave(path, folder, values):
 class Plant(FMUEnv):
     """A plant whose matrix is drawn, pushed by an array."""
 
-    def __init__(self, fmu, backend=None, **changes):
+    def __init__(self, fmu, **changes):
         config = {
             "model_input_names": "push",
             "model_output_names": ["seen", "plant.x[2]"],
@@ -249,7 +234,7 @@ class Plant(FMUEnv):
             "bounds": {"push": (-1, 1)},
             "max_episode_steps": 5,
         }
-        super().__init__(fmu, config | changes, backend=backend)
+        super().__init__(fmu, config | changes)
 
     def _is_done(self):
         return False
@@ -265,9 +250,8 @@ def own_arrays(path, **options):
 
 
 class TestOwnArrays:
-    @pytest.mark.parametrize("backend", ["python", "native"])
-    def test_an_environment_has_them_by_name(self, path, backend):
-        env = Plant(own_arrays(path), backend=backend)
+    def test_an_environment_has_them_by_name(self, path):
+        env = Plant(own_arrays(path))
         assert env.observation_names == ("seen[1]", "seen[2]", "seen[3]", "plant.x[2]")
         assert env.action_space == spaces.Box(-1, 1, (2,), np.float32)
         env.reset(seed=1)

@@ -18,7 +18,6 @@ from system_tools import (
     POSITIONS,
     STIFFNESS,
     by_each_master,
-    in_each_engine,
     linear,
     linear_fmu,
     masses,
@@ -34,7 +33,7 @@ from test_systems import pendulums
 import fmugym
 from fmugym import ConfigError, FMUSystem, bundled_fmu
 from fmugym.fmi.status import Status
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.systems.fmu import SystemFMU
@@ -49,11 +48,11 @@ def compiled(tmp_path_factory):
     return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
 
 
-def run(plan, names, step, count, native=True, instances=1, stop=False):
+def run(plan, names, step, count, instances=1, stop=False):
     """The values before the first step and after each, shape (count + 1, names)."""
     fmu = SystemFMU(plan)
     outputs = tuple(map(fmu.variable, names))
-    pool = local_pool(fmu, PoolSpec((), outputs, step), instances, LOG, native=native)
+    pool = local_pool(fmu, PoolSpec((), outputs, step), instances, LOG)
     try:
         rows = [pool.reset((), np.zeros((0, instances)))[0][:, 0].copy()]
         for _ in range(count):
@@ -104,32 +103,30 @@ MODELS = {
 }
 
 
-def error_of(name, fmus, tolerance, master, native=True):
+def error_of(name, fmus, tolerance, master):
     """The largest error against the closed form within 4 s, and the number of steps."""
     make, exact = MODELS[name]
     plan = controlled(make([fmus[2], fmus[3]], master=master), tolerance)
-    rows = run(plan, (*NAMES[name], "master.steps"), 0.5, 8, native)
+    rows = run(plan, (*NAMES[name], "master.steps"), 0.5, 8)
     expected = exact(np.arange(9) * 0.5).T
     return np.abs(rows[:, :-1] - expected).max(), rows[-1, -1]
 
 
 class TestAgainstClosedForms:
-    @in_each_engine
     @pytest.mark.parametrize(
         ("name", "master"), [(name, MASTERS[0]) for name in MODELS] + [("coupled", MASTERS[1])]
     )
-    def test_the_error_falls_with_the_root_of_the_tolerance(self, fmus, name, master, native):
+    def test_the_error_falls_with_the_root_of_the_tolerance(self, fmus, name, master):
         """Steps are as long as the root of the tolerance, and the methods are of order 1."""
-        large, few = error_of(name, fmus, 1e-4, master, native)
-        small, many = error_of(name, fmus, 1e-6, master, native)
+        large, few = error_of(name, fmus, 1e-4, master)
+        small, many = error_of(name, fmus, 1e-6, master)
         assert 5 < large / small < 20
         assert 5 < many / few < 20
 
-    @in_each_engine
-    def test_a_value_that_comes_a_step_late_counts_as_an_error(self, fmus, native):
+    def test_a_value_that_comes_a_step_late_counts_as_an_error(self, fmus):
         """In Jacobi steps, what follows an input at once follows it a step later."""
-        few = error_of("tank", fmus, 1e-3, "gauss_seidel", native)[1]
-        error, many = error_of("tank", fmus, 1e-3, "jacobi", native)
+        few = error_of("tank", fmus, 1e-3, "gauss_seidel")[1]
+        error, many = error_of("tank", fmus, 1e-3, "jacobi")
         assert many > 5 * few
         assert error < 2e-3
 
@@ -151,11 +148,10 @@ class TestAgainstClosedForms:
         assert rows[1, 2] == 2
         assert rows[1, 1] == pytest.approx(abs(rows[1, 0] - velocity), rel=0.1)
 
-    @in_each_engine
-    def test_slow_parts_take_fewer_steps(self, fmus, native):
+    def test_slow_parts_take_fewer_steps(self, fmus):
         """What decays is followed by ever larger steps."""
         plan = controlled(tank([fmus[2], fmus[2]]), 1e-5)
-        steps = run(plan, ("master.steps",), 1.0, 20, native)[:, 0]
+        steps = run(plan, ("master.steps",), 1.0, 20)[:, 0]
         per_step = np.diff(steps)
         assert per_step[0] > 5 * per_step[-1]
         assert per_step[-1] >= 2
@@ -169,18 +165,16 @@ class TestAgainstClosedForms:
             errors.append(np.abs(run(plan, names, 0.02, 50) - fine).max())
         assert errors[1] < errors[0] / 3
 
-    @in_each_engine
-    def test_the_pendulum_in_two_parts_comes_near_the_whole(self, fmus, native):
+    def test_the_pendulum_in_two_parts_comes_near_the_whole(self, fmus):
         name = "pendulum.theta_dot"
-        right = run(whole_pendulum(), [name], 0.0025, 400, native)[::40]
+        right = run(whole_pendulum(), [name], 0.0025, 400)[::40]
         plans = [controlled(parted_pendulum(fmus[2]), x) for x in (1e-3, 1e-5)]
-        errors = [np.abs(run(one, [name], 0.1, 10, native) - right).max() for one in plans]
+        errors = [np.abs(run(one, [name], 0.1, 10) - right).max() for one in plans]
         assert np.abs(right).max() > 1.0
         assert 5 < errors[0] / errors[1] < 20
 
 
 class TestBothEngines:
-    @pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
     @by_each_master
     @pytest.mark.parametrize("tolerance", [1e-3, 1e-5])
     @pytest.mark.parametrize("name", MODELS)
@@ -190,16 +184,15 @@ class TestBothEngines:
         fmu = SystemFMU(plan)
         told = [n for n in fmu.description.variables if n.startswith("master.")]
         names = (*NAMES[name], *told)
-        one, other = (run(plan, names, 0.3, 12, native) for native in (False, True))
+        one, other = (run(plan, names, 0.3, 12) for native in (False, True))
         assert len(told) > len(STATISTICS)
         assert one.tobytes() == other.tobytes()
 
-    @pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
     def test_with_a_loop(self, fmus):
         """The loop saves states of its own within each step."""
         loop = looped(fmus)
         names = ("a.y1", "b.y1", *STATISTICS)
-        one, other = (run(loop, names, 0.2, 10, native) for native in (False, True))
+        one, other = (run(loop, names, 0.2, 10) for native in (False, True))
         assert one.tobytes() == other.tobytes()
         assert one[-1, 2] > 20
 
@@ -216,14 +209,13 @@ def looped(fmus):
 
 
 class TestStates:
-    @in_each_engine
-    def test_episodes_begin_anew(self, fmus, native):
+    def test_episodes_begin_anew(self, fmus):
         plan = controlled(masses([fmus[2], fmus[3]]), 1e-5)
         fmu = SystemFMU(plan)
         spec = PoolSpec((), tuple(map(fmu.variable, ("first.y1", *STATISTICS))), 0.3)
         for method in ("restore", "reset", "instance"):
             own = replace(spec, reset_method=fmugym.pool.spec.ResetMethod(method))
-            pool = local_pool(SystemFMU(plan), own, 2, LOG, native=native)
+            pool = local_pool(SystemFMU(plan), own, 2, LOG)
             try:
                 rows = []
                 for _ in range(4):
@@ -233,12 +225,11 @@ class TestStates:
                 pool.close()
             assert all(one.tobytes() == rows[0].tobytes() for one in rows)
 
-    @in_each_engine
-    def test_return_with_the_step_size(self, fmus, native):
+    def test_return_with_the_step_size(self, fmus):
         plan = controlled(masses([fmus[2], fmus[2]]), 1e-5)
         fmu = SystemFMU(plan)
         spec = PoolSpec((), tuple(map(fmu.variable, ("first.y1", *STATISTICS))), 0.3)
-        pools = [local_pool(SystemFMU(plan), spec, 2, LOG, native=native) for _ in range(2)]
+        pools = [local_pool(SystemFMU(plan), spec, 2, LOG) for _ in range(2)]
         one, other = pools
         try:
             for pool in pools:
@@ -259,48 +250,43 @@ class TestStates:
 
 
 class TestLimits:
-    @in_each_engine
-    def test_the_smallest_step_is_taken_whatever_the_error(self, fmus, native):
+    def test_the_smallest_step_is_taken_whatever_the_error(self, fmus):
         plan = controlled(masses([fmus[2], fmus[2]]), 1e-12, 0.05)
-        rows = run(plan, STATISTICS, 0.4, 3, native)
+        rows = run(plan, STATISTICS, 0.4, 3)
         assert rows[-1, 0] == 3 * 2 * 8
         assert rows[-1, 2] == 0.05
         assert rows[-1, 3] > 1
 
-    @in_each_engine
-    def test_a_large_tolerance_takes_no_more_than_two_steps(self, fmus, native):
+    def test_a_large_tolerance_takes_no_more_than_two_steps(self, fmus):
         plan = controlled(masses([fmus[2], fmus[2]]), 1e6)
-        rows = run(plan, STATISTICS, 0.4, 3, native)
+        rows = run(plan, STATISTICS, 0.4, 3)
         assert rows[-1].tolist()[:3] == [6.0, 0.0, 0.4]
 
-    @in_each_engine
-    def test_a_discarded_step_is_repeated_as_smaller_ones(self, fmus, native):
+    def test_a_discarded_step_is_repeated_as_smaller_ones(self, fmus):
         """An FMU that refuses steps beyond a limit gets shorter ones."""
         parts = masses([fmus[2], fmus[2]])
         first = replace(parts.components[0], starts=(*parts.components[0].starts, ("limit", 0.11)))
         plan = controlled(replace(parts, components=(first, parts.components[1])), 1e6)
-        rows = run(plan, STATISTICS, 0.4, 3, native)
+        rows = run(plan, STATISTICS, 0.4, 3)
         assert rows[-1, 1] >= 1
         assert rows[-1, 2] <= 0.11 * 2
         assert rows[-1, 0] >= 3 * 2 * 2
 
-    @in_each_engine
-    def test_who_discards_even_the_smallest_is_named(self, fmus, native):
+    def test_who_discards_even_the_smallest_is_named(self, fmus):
         parts = masses([fmus[2], fmus[2]])
         first = replace(parts.components[0], starts=(*parts.components[0].starts, ("limit", 1e-9)))
         plan = controlled(replace(parts, components=(first, parts.components[1])), 1e6)
-        _, status, text = run(plan, STATISTICS, 0.4, 3, native, stop=True)
+        _, status, text = run(plan, STATISTICS, 0.4, 3, stop=True)
         assert status == Status.DISCARD
         assert "component 'first'" in text
 
-    @in_each_engine
-    def test_steps_that_the_time_would_not_show_are_not_tried(self, fmus, native):
+    def test_steps_that_the_time_would_not_show_are_not_tried(self, fmus):
         """They would go on for ever."""
         parts = masses([fmus[2], fmus[2]])
         first = replace(parts.components[0], starts=(*parts.components[0].starts, ("limit", 1e-19)))
         plan = replace(parts, components=(first, parts.components[1]))
         for smallest in (1e-20, 1e-310):
-            status = run(controlled(plan, 1e6, smallest), STATISTICS, 0.4, 3, native, stop=True)[1]
+            status = run(controlled(plan, 1e6, smallest), STATISTICS, 0.4, 3, stop=True)[1]
             assert status == Status.DISCARD
 
     def test_who_cannot_save_its_state_is_named(self, fmus):
@@ -330,7 +316,6 @@ def two_houses(**options):
     )
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components")
 @pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only")
 def test_components_in_processes_of_their_own(fmus):
     """They save and restore states, too."""

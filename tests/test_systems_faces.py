@@ -489,8 +489,7 @@ class TestPictures:
         FMUSystem({"$x$": HOUSE}, name="$\\alpha").plot(tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("backend", ["native", "python"])
-def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units(backend):
+def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units():
     """273.15 K are 0 degC, by definition; and half a pendulum is a gain of 2."""
     system = fmugym.FMUSystem(
         {"house": fmugym.bundled_fmu("House"), "rod": fmugym.bundled_fmu("Pendulum")},
@@ -508,7 +507,7 @@ def test_inputs_and_parameters_of_the_system_are_read_in_its_own_units(backend):
                 "bounds": {"outside": (-20, 40)},
                 "time_step": 60.0,
             }
-            super().__init__(system, config, backend=backend)
+            super().__init__(system, config)
 
         def _is_done(self):
             return False

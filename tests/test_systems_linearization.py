@@ -9,8 +9,8 @@ import wine_tools
 from system_tools import linear_fmu
 
 from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
-from fmugym.fmi.access import Access
-from fmugym.fmi.system_library import open_library
+from fmugym.pool import PoolSpec
+from fmugym.pool.local import local_pool
 
 MASS, LENGTH, GRAVITY, FRICTION = 0.5, 0.4, 9.81, 0.03
 ANGLES = (0.3, -0.8)
@@ -67,16 +67,12 @@ def houses():
 def rates(system, names, values):
     """What the derivatives are after an initialization with these start values."""
     fmu = system.as_fmu()
-    log = logging.getLogger("fmugym.test")
-    with closing(open_library(fmu, log, None, (), ())) as library:
-        instance = library.instantiate()
-        given = Access(
-            instance, [fmu.variable(name) for name in values], np.array([*values.values()])
-        )
-        instance.initialize(0.0, None, None, given.set)
-        read = Access(instance, [fmu.variable(name) for name in names])
-        assert read.get() == 0
-        return read.values
+    spec = PoolSpec((), tuple(map(fmu.variable, names)), 1.0)
+    with closing(local_pool(fmu, spec, 1, logging.getLogger("fmugym.test"))) as pool:
+        starts = np.array([[value] for value in values.values()])
+        outputs, statuses = pool.reset(tuple(map(fmu.variable, values)), starts)
+        assert not statuses.any()
+        return outputs[:, 0].copy()
 
 
 def test_it_is_the_difference_quotient_of_houses_in_a_loop():

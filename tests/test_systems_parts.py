@@ -13,7 +13,7 @@ from fmpy.container_fmu import config
 from fmpy.container_fmu.cli import create_container_fmu
 
 from fmugym import FMU, Component, Connection, FMUSystem, bundled_fmu
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 
 LOG = logging.getLogger("fmugym.test")
@@ -33,7 +33,7 @@ def played(fmu, outputs, end, count, substeps=1, **parameters):
     """The outputs after 0, 1 ... count steps, shape (count + 1, k)."""
     fmu = FMU.of(fmu)
     spec = PoolSpec((), tuple(map(fmu.variable, outputs)), end / count, substeps=substeps)
-    with closing(local_pool(fmu, spec, 1, LOG, native=has_native_pool())) as pool:
+    with closing(local_pool(fmu, spec, 1, LOG)) as pool:
         starts = np.array([list(parameters.values())], float).T
         rows = [pool.reset(tuple(map(fmu.variable, parameters)), starts)[0][:, 0].copy()]
         for _ in range(count):

@@ -14,7 +14,7 @@ import ssp_tools
 from exchange_tools import exchange_fmu
 
 from fmugym import Component, FMUSystem
-from fmugym.pool import PoolSpec, has_native_pool
+from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
@@ -26,10 +26,6 @@ from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade
 
 LOG = logging.getLogger("fmugym.test")
-ENGINES = [pytest.param(False, id="python")]
-if has_native_pool():
-    ENGINES.append(pytest.param(True, id="native"))
-in_each_engine = pytest.mark.parametrize("native", ENGINES)
 RESTORE, RESET, INSTANCE, LIBRARY, PROCESS = ResetMethod
 MIXES = list(itertools.product((RESTORE, RESET, INSTANCE), repeat=3))
 NAMES = ("a", "b", "c")
@@ -85,36 +81,35 @@ def play(pool, fmu, gain, length):
     return np.array(rows)
 
 
-def open_pool(system, native, count, methods=(), **options):
+def open_pool(system, count, methods=(), **options):
     fmu = system.as_fmu()
     spec = spec_of(fmu, component_resets=tuple(methods))
-    if native and spec.reloads:
+    if spec.reloads:
         options["private_libraries"] = True
-    return fmu, local_pool(fmu, spec, count, LOG, native=native, **options)
+    return fmu, local_pool(fmu, spec, count, LOG, **options)
 
 
-def fresh_episode(system, native, gain, length, count=2):
-    options = {"private_libraries": True} if native else {}
-    fmu, pool = open_pool(system, native, count, **options)
+def fresh_episode(system, gain, length, count=2):
+    fmu, pool = open_pool(system, count, private_libraries=True)
     try:
         return play(pool, fmu, gain, length)
     finally:
         pool.close()
 
 
-def episodes(system, native, methods, count=2, lengths=LENGTHS):
-    fmu, pool = open_pool(system, native, count, methods)
+def episodes(system, methods, count=2, lengths=LENGTHS):
+    fmu, pool = open_pool(system, count, methods)
     try:
         return [play(pool, fmu, *one) for one in zip(GAINS, lengths, strict=False)]
     finally:
         pool.close()
 
 
-def is_right(system, native, methods):
+def is_right(system, methods):
     """Whether each of many episodes equals one of a fresh system, bit by bit."""
-    expected = {gain: fresh_episode(system, native, gain, max(LENGTHS)) for gain in set(GAINS)}
+    expected = {gain: fresh_episode(system, gain, max(LENGTHS)) for gain in set(GAINS)}
     pairs = zip(GAINS, LENGTHS, strict=True)
-    found = episodes(system, native, methods)
+    found = episodes(system, methods)
     return all(
         rows.tobytes() == expected[gain][: length + 1].tobytes()
         for rows, (gain, length) in zip(found, pairs, strict=True)
@@ -131,70 +126,52 @@ LIARS = {
 }
 
 
-LIARS_IN_ENGINES = [
-    (token, native)
-    for token, method in LIARS.items()
-    for native in (False, True)[: 1 + has_native_pool()]
-    if native or method is not LIBRARY  # which Python cannot load anew
-]
-
-
 class TestMethods:
-    @pytest.mark.parametrize(("token", "native"), LIARS_IN_ENGINES)
-    def test_a_liar_begins_by_its_own_one(self, fmu_of, token, native):
+    @pytest.mark.parametrize("token", LIARS)
+    def test_a_liar_begins_by_its_own_one(self, fmu_of, token):
         system = chain(fmu_of, "well behaved", token, "well behaved")
-        assert is_right(system, native, (RESTORE, LIARS[token], RESET))
+        assert is_right(system, (RESTORE, LIARS[token], RESET))
 
-    @in_each_engine
     @pytest.mark.parametrize("token", ["reset does nothing", "reset keeps the state"])
-    def test_this_test_would_find_a_liar(self, fmu_of, token, native):
+    def test_this_test_would_find_a_liar(self, fmu_of, token):
         system = chain(fmu_of, "well behaved", token)
-        assert not is_right(system, native, (RESET, RESET))
+        assert not is_right(system, (RESET, RESET))
 
-    @in_each_engine
     @pytest.mark.parametrize("token", ["restore forgets", "restore keeps the time"])
-    def test_who_restores_something_else_is_found_out(self, fmu_of, token, native):
+    def test_who_restores_something_else_is_found_out(self, fmu_of, token):
         """The other components are restored all the same, as their FMUs see."""
         system = chain(fmu_of, "well behaved", token, "well behaved")
-        assert is_right(system, native, (RESTORE, RESTORE, RESTORE))
+        assert is_right(system, (RESTORE, RESTORE, RESTORE))
 
-    @in_each_engine
     @pytest.mark.parametrize("version", [2, 3])
     @pytest.mark.parametrize("methods", MIXES)
-    def test_in_any_mix(self, fmu_of, native, version, methods):
+    def test_in_any_mix(self, fmu_of, version, methods):
         system = chain(fmu_of, *["well behaved"] * 3, version=version)
-        assert is_right(system, native, methods)
+        assert is_right(system, methods)
 
-    @in_each_engine
-    def test_some_are_really_not_initialized_again(self, fmu_of, native, monkeypatch):
+    def test_some_are_really_not_initialized_again(self, fmu_of, monkeypatch):
         """The state of the first is restored in all but the first two of like episodes."""
         system = chain(fmu_of, "reset does nothing", "well behaved")
-        right = fresh_episode(system, native, 1.5, 25)
-        found = episodes(system, native, (RESTORE, INSTANCE), lengths=(25, 25, 25))
+        right = fresh_episode(system, 1.5, 25)
+        found = episodes(system, (RESTORE, INSTANCE), lengths=(25, 25, 25))
         # the reset of the first does nothing, so that only its restored state can be right
         assert found[2].tobytes() != right.tobytes()
         assert found[2].tobytes() == found[1].tobytes() != found[0].tobytes()
 
-    @pytest.mark.skipif(not has_native_pool(), reason="the C extension runs these components")
     @pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only")
     def test_of_components_in_processes_of_their_own(self, fmu_of):
         tokens = "well behaved", "reset does nothing", "well behaved"
         methods = (RESTORE, INSTANCE, RESTORE)
-        one = episodes(chain(fmu_of, *tokens), True, methods)
-        other = episodes(chain(fmu_of, *tokens, isolate="bc"), True, methods)
+        one = episodes(chain(fmu_of, *tokens), methods)
+        other = episodes(chain(fmu_of, *tokens, isolate="bc"), methods)
         assert [rows.tobytes() for rows in one] == [rows.tobytes() for rows in other]
 
-    def test_both_engines_agree(self, fmu_of):
-        if not has_native_pool():
-            pytest.skip("no C extension was built")
+    def test_two_liars_at_once(self, fmu_of):
         system = chain(fmu_of, "well behaved", "reset does nothing", "restore forgets")
-        methods = (RESTORE, INSTANCE, RESET)
-        one, other = (episodes(system, native, methods) for native in (False, True))
-        assert [rows.tobytes() for rows in one] == [rows.tobytes() for rows in other]
+        assert is_right(system, (RESTORE, INSTANCE, RESET))
 
-    @in_each_engine
     @pytest.mark.parametrize("version", [1])
-    def test_without_a_function_for_resets(self, fmu_of, native, version, tmp_path):
+    def test_without_a_function_for_resets(self, fmu_of, version, tmp_path):
         """Model exchange of FMI 1.0 has none: only this component is made anew."""
         ball = exchange_fmu(tmp_path / "ball.fmu", "ball", version)
         system = FMUSystem({"a": fmu_of("well behaved"), "b": ball}, ["a.y -> b.e"])
@@ -204,7 +181,7 @@ class TestMethods:
         assert fitted.reset_method is INSTANCE
         assert fitted.whole_reset_method is RESET
         spec = PoolSpec((fmu.variable("a.u"),), (fmu.variable("b.h"),), 0.1)
-        pool = local_pool(fmu, spec, 2, LOG, native=native)
+        pool = local_pool(fmu, spec, 2, LOG)
         try:
             rows = []
             for _ in range(3):
@@ -215,11 +192,10 @@ class TestMethods:
         assert np.array_equal(rows[0], rows[1])
         assert np.array_equal(rows[0], rows[2])
 
-    @in_each_engine
-    def test_snapshots_end_with_the_instance(self, fmu_of, native):
+    def test_snapshots_end_with_the_instance(self, fmu_of):
         """A state of a component that was made anew belongs to nobody."""
         system = chain(fmu_of, "well behaved", "well behaved")
-        fmu, pool = open_pool(system, native, 2, (RESTORE, INSTANCE))
+        fmu, pool = open_pool(system, 2, (RESTORE, INSTANCE))
         try:
             play(pool, fmu, 1.5, 5)
             snapshot = pool.save()
@@ -288,15 +264,11 @@ class TestTrial:
     def test_finds_who_lies(self, fmu_of, token):
         system = chain(fmu_of, "well behaved", token, "well behaved")
         verdict = verdict_of(system)
-        if LIARS[token] is LIBRARY and not has_native_pool():
-            assert verdict.reset_method is PROCESS
-        else:
-            others = {RESTORE}
-            assert {verdict.components[0], verdict.components[2]} == others
-            # a liar that gives itself away is not restored by the pool either
-            assert verdict.components[1] in {LIARS[token], RESTORE}
-            if "reset" in token or token == "library keeps":
-                assert verdict.components[1] is LIARS[token]
+        assert {verdict.components[0], verdict.components[2]} == {RESTORE}
+        # a liar that gives itself away is not restored by the pool either
+        assert verdict.components[1] in {LIARS[token], RESTORE}
+        if "reset" in token or token == "library keeps":
+            assert verdict.components[1] is LIARS[token]
 
     def test_honest_ones_are_restored_together(self, fmu_of):
         verdict = verdict_of(chain(fmu_of, *["well behaved"] * 3))
@@ -332,7 +304,7 @@ class TestTrial:
         finally:
             pool.close()
         for rows, gain, length in zip(found, GAINS, LENGTHS, strict=True):
-            right = fresh_episode(system, has_native_pool(), gain, length, 3)
+            right = fresh_episode(system, gain, length, 3)
             assert rows.tobytes() == right.tobytes()
         assert "component 'a' begins by the method 'restore'" in caplog.text
 

@@ -643,10 +643,9 @@ class TestLarge:
         fmu = FMUSystem.read(pack(self.chain(20))).as_fmu(probe_timeout=None)
         assert len({id(part) for part in fmu.description.parts}) == 1
 
-    @pytest.mark.parametrize("backend", ["python", None])
-    def test_three_hundred_components_play(self, pack, backend):
+    def test_three_hundred_components_play(self, pack):
         names = {"model_input_names": "T", "model_output_names": "c299.T_air"}
         config = names | {"bounds": {"T": (0, 30)}, "time_step": 60.0}
-        with PlainEnv(pack(self.chain(300)), config, backend=backend) as env:
+        with PlainEnv(pack(self.chain(300)), config) as env:
             env.reset(seed=0)
             assert env.step(env.action_space.sample())[0] == pytest.approx(290.0, abs=5.0)

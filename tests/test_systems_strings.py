@@ -7,7 +7,6 @@ import ssp_tools
 import values_tools
 from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
-    in_each_engine,
     play,
 )
 
@@ -40,14 +39,14 @@ def labelled(fmus, **starts):
 
 
 class Env(FMUEnv):
-    def __init__(self, fmu, backend=None, **parameters):
+    def __init__(self, fmu, **parameters):
         config = {
             "model_input_names": [],
             "model_output_names": LENGTHS,
             "model_parameters": parameters,
             "time_step": 0.1,
         }
-        super().__init__(fmu, config, backend=backend)
+        super().__init__(fmu, config)
 
     def _is_done(self):
         return False
@@ -59,29 +58,26 @@ class Env(FMUEnv):
         return []
 
 
-@in_each_engine
-def test_each_component_has_its_own(make, fmus, native):
+def test_each_component_has_its_own(make, fmus):
     system = three(fmus, a="four", b="", c="gr\u00fc\u00df dich")
-    assert play(make(system, (), LENGTHS, native), 1).tolist() == [[4, 0, 11]] * 2
+    assert play(make(system, (), LENGTHS), 1).tolist() == [[4, 0, 11]] * 2
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
-def test_those_of_an_environment_win(fmus, backend):
+def test_those_of_an_environment_win(fmus):
     parameters = {"a.String_parameter": "longer", "b.String_parameter": "b"}
-    env = Env(three(fmus, a="four", c="c"), backend, **parameters)
+    env = Env(three(fmus, a="four", c="c"), **parameters)
     for _ in range(2):
         env.reset()
         assert env.state == (6.0, 1.0, 1.0)
     env.close()
 
 
-@pytest.mark.parametrize("backend", ["python", "native"])
-def test_one_parameter_of_the_system_is_that_of_several(fmus, backend):
-    env = Env(labelled(fmus, b="b", c="short"), backend, label="the same")
+def test_one_parameter_of_the_system_is_that_of_several(fmus):
+    env = Env(labelled(fmus, b="b", c="short"), label="the same")
     env.reset()
     assert env.state == (8.0, 1.0, 8.0)
     env.close()
-    env = Env(labelled(fmus, b="b", c="short"), backend)
+    env = Env(labelled(fmus, b="b", c="short"))
     env.reset()
     assert env.state == (0.0, 1.0, 5.0), "without a text, each component starts as it would"
     env.close()

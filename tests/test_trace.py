@@ -6,13 +6,9 @@ import pytest
 
 import fmugym
 from fmugym import ConfigError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.trace import trace_hooks
 
-needs_native = pytest.mark.skipif(
-    not has_native_pool(), reason="the C extension was not built: no compiler at install"
-)
 START = {name: Uniform(-0.5, 0.5) for name in ("x_0", "x_dot_0", "phi_0", "phi_dot_0")}
 
 
@@ -63,7 +59,6 @@ class Rich(Plain):
         return bonus - weight * (self.out["theta"] - np.pi / 2) * self.time - phi * phi
 
 
-@needs_native
 @pytest.mark.parametrize("num_envs", [1, 31, 33, 200])
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
 def test_compiled_hooks_are_identical_to_those_on_arrays(num_envs, mode):
@@ -89,13 +84,11 @@ def test_compiled_hooks_are_identical_to_those_on_arrays(num_envs, mode):
     arrays.close()
 
 
-@needs_native
 @pytest.mark.parametrize("name", ["CartPole", "ModelicaCartPole", "Pendulum", "CloudPendulum"])
 def test_the_bundled_environments_are_compiled(name):
     gym.make_vec(f"fmugym/{name}-v0", num_envs=2, hooks="compiled").close()
 
 
-@needs_native
 def test_bad_actions_are_refused_before_anything_is_stepped():
     envs = fmugym.FMUVectorEnv(Plain, 3, hooks="compiled")
     twin = fmugym.FMUVectorEnv(Plain, 3, hooks="compiled")

@@ -13,7 +13,7 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 import fmugym
 from fmugym import ConfigError, SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
-from fmugym.fmi.instance import Instance
+from fmugym.pool.native import NativePool
 from fmugym.vector.trajectories import discrete
 
 TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
@@ -317,19 +317,17 @@ class TestTimeDependentFMU:
         return Season
 
     @pytest.mark.parametrize("passed", [0, 3])
-    @pytest.mark.parametrize("kind", ["python", "native"])
-    def test_is_the_solution_of_the_equation(self, make_env, kind, passed):
+    def test_is_the_solution_of_the_equation(self, make_env, passed):
         """Without a trial, saved states are not trusted, and episodes are played again."""
-        assert self.check(make_env, kind, passed).method == "replay"
+        assert self.check(make_env, passed).method == "replay"
 
-    @pytest.mark.parametrize("kind", ["python", "native"])
-    def test_with_restored_states(self, make_env, kind, monkeypatch):
+    def test_with_restored_states(self, make_env, monkeypatch):
         monkeypatch.setenv("FMUGYM_PROBE", "on")
-        method = self.check(make_env, kind, 3).method
+        method = self.check(make_env, 3).method
         has_states = make_env.fmu_version != "1"
         assert method == ("state" if has_states else "replay")
 
-    def check(self, make_env, kind, passed):
+    def check(self, make_env, passed):
         """Compare the matrices with the solution; returns the snapshot where they begin."""
         actions = np.linspace(-0.5, 0.8, 7, dtype=np.float32)[:, None]
         with make_env() as env:
@@ -337,7 +335,7 @@ class TestTimeDependentFMU:
             for _ in range(passed):
                 env.step(np.zeros(1, np.float32))
             snapshot = env.save_state()
-        envs = vector_of(make_env, 4, **POOLS[kind])
+        envs = vector_of(make_env, 4)
         try:
             envs.reset(seed=1)
             envs.step(np.zeros((4, 1), np.float32))
@@ -360,12 +358,12 @@ class TestTimeDependentFMU:
 def test_wrong_derivatives_are_told(monkeypatch, caplog):
     along(exact)
     assert not caplog.records
-    kept = Instance.jacobian
+    kept = NativePool.differentiate
 
     def wrong(self, unknowns, knowns):
         return 1.5 * kept(self, unknowns, knowns)
 
-    monkeypatch.setattr(Instance, "jacobian", wrong)
+    monkeypatch.setattr(NativePool, "differentiate", wrong)
     along(exact)
     (record,) = caplog.records
     assert "Pendulum" in record.getMessage()

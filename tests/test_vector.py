@@ -6,7 +6,6 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     IDS,
-    each_backend,
     each_mode,
     each_way,
     make_pair,
@@ -21,11 +20,9 @@ import fmugym
 @each_way
 @each_mode
 @pytest.mark.parametrize("env_id", IDS)
-def test_each_environment_is_what_it_is_alone(env_id, mode, backend, hooks):
+def test_each_environment_is_what_it_is_alone(env_id, mode, hooks):
     options = {"max_episode_steps": 25}
-    ours = gym.make_vec(
-        env_id, num_envs=5, autoreset_mode=mode, hooks=hooks, backend=backend, **options
-    )
+    ours = gym.make_vec(env_id, num_envs=5, autoreset_mode=mode, hooks=hooks, **options)
     theirs = SyncVectorEnv([lambda: gym.make(env_id, **options)] * 5, autoreset_mode=mode)
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.observation_space == theirs.observation_space
@@ -39,19 +36,17 @@ def test_each_environment_is_what_it_is_alone(env_id, mode, backend, hooks):
     theirs.close()
 
 
-@each_backend
 @pytest.mark.parametrize("fmi_version", ["1.0", "3.0"])
-def test_other_fmi_versions(fmi_version, backend):
-    ours, theirs = make_pair(fmugym.envs.CartPoleEnv, backend=backend, fmi_version=fmi_version)
+def test_other_fmi_versions(fmi_version):
+    ours, theirs = make_pair(fmugym.envs.CartPoleEnv, fmi_version=fmi_version)
     assert run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 100) > 5
     ours.close()
     theirs.close()
 
 
-@each_backend
 @pytest.mark.parametrize("num_envs", [1, 2, 7, 64])
-def test_any_number_of_environments(num_envs, backend):
-    ours = gym.make_vec("fmugym/CartPole-v0", num_envs=num_envs, backend=backend)
+def test_any_number_of_environments(num_envs):
+    ours = gym.make_vec("fmugym/CartPole-v0", num_envs=num_envs)
     theirs = gym.make_vec("fmugym/CartPole-v0", num_envs=num_envs, vectorization_mode="sync")
     assert run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 60) > 0
     ours.close()

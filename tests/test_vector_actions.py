@@ -7,7 +7,6 @@ from vector_tools import (
     CART_POLE,
     Drawing,
     Remembering,
-    each_backend,
     each_way,
     make_pair,
     require_equal,
@@ -31,8 +30,8 @@ def test_actions_may_be_lists_and_any_integers():
 
 
 @each_way
-def test_actions_that_do_not_fit(backend, hooks):
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks, backend=backend)
+def test_actions_that_do_not_fit(hooks):
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
     vector.reset(seed=0)
     for actions in ([0], [0, 1, 1], [0, 2], [-1, 0]):
         with pytest.raises(ConfigError, match="action"):
@@ -45,9 +44,8 @@ def test_actions_that_do_not_fit(backend, hooks):
     vector.close()
 
 
-@each_backend
-def test_a_bad_action_is_forgotten(backend):
-    vector, theirs = make_pair(Remembering, backend=backend, num_envs=2)
+def test_a_bad_action_is_forgotten():
+    vector, theirs = make_pair(Remembering, num_envs=2)
     vector.reset(seed=0)
     theirs.reset(seed=0)
     good, better = sampled_actions(vector, 2)
@@ -64,15 +62,15 @@ def test_a_bad_action_is_forgotten(backend):
 
 
 @each_way
-def test_an_action_that_does_not_fit_changes_nothing(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+def test_an_action_that_does_not_fit_changes_nothing(hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     first = vector.reset(seed=0)[0]
     with pytest.raises(ConfigError, match=r"environment 2.* is not in Discrete"):
         vector.step(np.array([0, 1, 7]))
     assert vector.get_attr("step_count") == (0, 0, 0)
     assert vector.get_attr("action") == (0, 0, 0)
     np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)
-    twin = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    twin = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     twin.reset(seed=0)
     for actions in sampled_actions(vector, 20):
         require_equal(vector.step(actions)[0], twin.step(actions)[0])
@@ -82,10 +80,9 @@ def test_an_action_that_does_not_fit_changes_nothing(backend, hooks):
 
 @each_way
 @pytest.mark.parametrize("env_id", ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"])
-def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, backend, hooks):
+def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks):
     """In the third step environment 1 starts its second episode."""
-    ways = {"hooks": hooks, "backend": backend}
-    vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, **ways)
+    vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, hooks=hooks)
     vector.reset(seed=0)
     good = np.zeros(vector.action_space.shape, vector.action_space.dtype)
     vector.step(good)
@@ -102,12 +99,12 @@ def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, backe
 
 
 @each_way
-def test_a_nan_is_refused_even_where_no_hook_reads_it(backend, hooks):
+def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks):
     class Deaf(Drawing):
         def _get_inputs(self):
             return 0.0 * self.step_count
 
-    vector = FMUVectorEnv(Deaf, 2, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(Deaf, 2, hooks=hooks)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
         vector.step(np.array([[0.0], [np.nan]], np.float32))

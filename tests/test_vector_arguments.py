@@ -84,8 +84,8 @@ def test_options_that_are_no_dict(options):
 
 
 @each_way
-def test_unknown_options_are_named(backend, hooks):
-    vector = FMUVectorEnv(Drawing, 2, hooks=hooks, backend=backend)
+def test_unknown_options_are_named(hooks):
+    vector = FMUVectorEnv(Drawing, 2, hooks=hooks)
     with pytest.raises(ConfigError, match="did you mean 'model_parameters'"):
         vector.reset(options={"model_parameter": {}})
     with pytest.raises(ConfigError, match="unknown"):

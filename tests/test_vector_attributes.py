@@ -15,7 +15,6 @@ from vector_tools import (
 )
 
 from fmugym import ConfigError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 
@@ -28,9 +27,9 @@ def cart_pole_with(attributes=None, **parameters):
 
 
 @each_way
-def test_attributes_for_each_environment(backend, hooks):
+def test_attributes_for_each_environment(hooks):
     forces, limits = [5.0, 10.0, 15.0], [0.1, 2.4, 0.2]
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     vector.set_attr("force_mag", forces)
     vector.set_attr("x_threshold", np.array(limits))
     vector.set_attr("sutton_barto_reward", True)
@@ -49,7 +48,6 @@ def test_attributes_for_each_environment(backend, hooks):
     theirs.close()
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="hooks are compiled for the native pool")
 @pytest.mark.parametrize("values", [[0.5, 1.5, -2.0], [1, 2, 3], [True, False, True], [2.0] * 3])
 def test_hooks_stay_compiled_with_attributes_for_each_environment(values, monkeypatch):
     """They ran on arrays until now. The program reads the values as it reads a parameter's."""
@@ -104,10 +102,10 @@ def test_done_is_that_of_the_last_step_in_all_ways_of_calling_hooks(mode):
 
 
 @each_way
-def test_parameters_for_each_environment(backend, hooks):
+def test_parameters_for_each_environment(hooks):
     """They hold from the next episode on, several at a time, and options come before them."""
     masses, frictions = [0.05, 0.1, 0.2], [0.0, 0.5, 1.0]
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     vector.reset(seed=8)
     vector.set_attr("m_pole", masses)
     vector.set_attr("m_cart", 0.9)
@@ -129,8 +127,8 @@ def test_parameters_for_each_environment(backend, hooks):
 
 
 @each_way
-def test_parameters_that_the_config_does_not_name_or_draws(backend, hooks):
-    vector = FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend)
+def test_parameters_that_the_config_does_not_name_or_draws(hooks):
+    vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
     vector.reset(seed=0)
     vector.set_attr("b", [0.0, 1e-4, 2e-4])
     vector.set_attr("q_0", [0.1, 0.2, 0.3])
@@ -148,8 +146,8 @@ def test_parameters_that_the_config_does_not_name_or_draws(backend, hooks):
 
 
 @each_way
-def test_values_that_do_not_fit(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+def test_values_that_do_not_fit(hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     with pytest.raises(ConfigError, match="there are 2 values of 'force_mag', expected 3"):
         vector.set_attr("force_mag", [1.0, 2.0])
     for values in (["a", 1.0, 1.0], [1.0, 1.0, np.nan]):
@@ -162,8 +160,8 @@ def test_values_that_do_not_fit(backend, hooks):
 
 
 @each_way
-def test_misspelt_attributes_and_parameters(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+def test_misspelt_attributes_and_parameters(hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     for misspelt, meant in (("force_magg", "force_mag"), ("m_poles", "m_pole")):
         with pytest.raises(ConfigError, match=f"{misspelt!r}; did you mean {meant!r}"):
             vector.set_attr(misspelt, [1.0, 2.0, 3.0])
@@ -175,8 +173,8 @@ def test_misspelt_attributes_and_parameters(backend, hooks):
 
 
 @each_way
-def test_methods_are_called_for_each_environment(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+def test_methods_are_called_for_each_environment(hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
     observations, _ = vector.reset(seed=0)
     read = vector.call("read_variables", "x")
     if hooks == "per_env":
@@ -227,8 +225,8 @@ class Limited(CART_POLE):
 
 
 @each_way
-def test_what_a_method_assigns_takes_effect(backend, hooks):
-    vector = FMUVectorEnv(Limited, 3, hooks=hooks, backend=backend)
+def test_what_a_method_assigns_takes_effect(hooks):
+    vector = FMUVectorEnv(Limited, 3, hooks=hooks)
     vector.reset(seed=0)
     assert vector.step(np.zeros(3, np.int64))[2].tolist() == [False] * 3
     assert vector.call("set_limit", 0.0) == (0.0,) * 3
@@ -261,8 +259,8 @@ def test_what_a_method_cannot_do_to_one_of_many_is_refused_and_changes_nothing()
 
 
 @each_way
-def test_methods_that_no_environment_can_do_alone(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+def test_methods_that_no_environment_can_do_alone(hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
     vector.reset(seed=0)
     for method in ("reset", "step", "close"):
         with pytest.raises(ConfigError, match=f"{method!r} cannot be called on single"):
@@ -285,8 +283,8 @@ ODD_VALUES = (
 
 @pytest.mark.parametrize("values", ODD_VALUES, ids=str)
 @each_way
-def test_values_that_are_no_numbers(values, backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks, backend=backend)
+def test_values_that_are_no_numbers(values, hooks):
+    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     with pytest.raises(ConfigError, match="m_pole"):
         vector.set_attr("m_pole", values)
     if hooks != "per_env":
@@ -298,8 +296,8 @@ def test_values_that_are_no_numbers(values, backend, hooks):
 
 
 @each_way
-def test_what_the_environments_keep_themselves_cannot_be_set(backend, hooks):
-    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks, backend=backend)
+def test_what_the_environments_keep_themselves_cannot_be_set(hooks):
+    vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
     for name in ("state", "step_count", "time", "action_space", "_pool", "step", "_is_done", "fmu"):
         with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
             vector.set_attr(name, 1.0)

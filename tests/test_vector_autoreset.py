@@ -9,8 +9,8 @@ from fmugym.vector import FMUVectorEnv
 
 
 @each_way
-def test_a_partial_reset_leaves_the_others_alone(backend, hooks):
-    vector, untouched = (FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend) for _ in range(2))
+def test_a_partial_reset_leaves_the_others_alone(hooks):
+    vector, untouched = (FMUVectorEnv(Drawing, 3, hooks=hooks) for _ in range(2))
     vector.reset(seed=0)
     untouched.reset(seed=0)
     actions = sampled_actions(vector, 3)
@@ -42,8 +42,8 @@ def test_the_first_reset_is_of_all():
 
 
 @each_way
-def test_disabled_autoreset_wants_a_reset(backend, hooks):
-    vector = FMUVectorEnv(Drawing, 2, autoreset_mode="disabled", hooks=hooks, backend=backend)
+def test_disabled_autoreset_wants_a_reset(hooks):
+    vector = FMUVectorEnv(Drawing, 2, autoreset_mode="disabled", hooks=hooks)
     vector.reset(seed=0)
     actions = sampled_actions(vector, 4)
     for action in actions[:3]:
@@ -60,13 +60,12 @@ def test_disabled_autoreset_wants_a_reset(backend, hooks):
 
 @each_way
 @pytest.mark.parametrize(("own", "given", "expected"), [(3, None, 3), (8, 4, 4), (2, 9, 2)])
-def test_truncation_at_the_smaller_limit(own, given, expected, backend, hooks):
+def test_truncation_at_the_smaller_limit(own, given, expected, hooks):
     vector = FMUVectorEnv(
         lambda: Drawing(max_episode_steps=own),
         3,
         max_episode_steps=given,
         hooks=hooks,
-        backend=backend,
     )
     vector.reset(seed=0)
     for _ in range(3):  # episodes
@@ -77,13 +76,12 @@ def test_truncation_at_the_smaller_limit(own, given, expected, backend, hooks):
 
 
 @each_way
-def test_the_reset_step_does_not_step_the_fmu(backend, hooks, make_env):
+def test_the_reset_step_does_not_step_the_fmu(hooks, make_env):
     """The probe FMU counts its steps."""
     vector = FMUVectorEnv(
         lambda: make_env(model_output_names=["steps", "sum"], max_episode_steps=2),
         2,
         hooks=hooks,
-        backend=backend,
     )
     vector.reset()
     counts, rewards = [], []

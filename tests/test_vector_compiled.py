@@ -13,7 +13,6 @@ from vector_tools import (
     CART_POLE,
     Drawing,
     PushedCart,
-    each_backend,
     each_mode,
     each_way,
     require_equal,
@@ -25,15 +24,10 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.hooks.symbols import Symbols
 from fmugym.vector.hooks.trace import trace_hooks
-
-needs_native = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 
 class Branching(Drawing):
@@ -45,14 +39,12 @@ class Branching(Drawing):
         return -ranks[0] + float(len(self.state)) // 2
 
 
-@each_backend
-def test_what_cannot_be_compiled_is_left_to_numpy(backend):
-    require_pair_equal(Branching, hooks="auto", backend=backend, rtol=1e-12)
+def test_what_cannot_be_compiled_is_left_to_numpy():
+    require_pair_equal(Branching, hooks="auto", rtol=1e-12)
     with pytest.raises(ConfigError, match="cannot be compiled"):
-        FMUVectorEnv(Branching, 2, hooks="compiled", backend=backend)
+        FMUVectorEnv(Branching, 2, hooks="compiled")
 
 
-@needs_native
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="Windows has no signals of users")
 @pytest.mark.parametrize("moment", ["construction", "assignment"])
 def test_the_exception_of_a_signal_handler_is_not_that_of_a_hook(moment):
@@ -92,12 +84,9 @@ def test_the_exception_of_a_signal_handler_is_not_that_of_a_hook(moment):
         signal.signal(signal.SIGUSR1, usual)
 
 
-@needs_native
 def test_plain_arithmetic_is_compiled():
     for cls in (fmugym.envs.CartPoleEnv, fmugym.envs.ModelicaCartPoleEnv, PushedCart):
         FMUVectorEnv(cls, 2, hooks="compiled").close()
-    with pytest.raises(ConfigError, match="the pool is not the native one"):
-        FMUVectorEnv(fmugym.envs.CartPoleEnv, 2, hooks="compiled", backend="python")
 
 
 class Arithmetic(Drawing):
@@ -145,9 +134,9 @@ class MoreArithmetic(Arithmetic):
 @each_way
 @each_mode
 @pytest.mark.parametrize("cls", [Arithmetic, MoreArithmetic])
-def test_compiled_arithmetic_is_that_of_numbers(cls, mode, backend, hooks):
-    ways = {"backend": backend, "hooks": hooks if hooks != "auto" else "compiled"}
-    assert require_pair_equal(cls, steps=150, mode=mode, num_envs=7, **ways) > 20
+def test_compiled_arithmetic_is_that_of_numbers(cls, mode, hooks):
+    way = hooks if hooks != "auto" else "compiled"
+    assert require_pair_equal(cls, steps=150, mode=mode, num_envs=7, hooks=way) > 20
 
 
 NOT_COMPILED = {
@@ -158,7 +147,6 @@ NOT_COMPILED = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("reason", NOT_COMPILED)
 def test_reasons_against_compiling(reason):
     class Other(Arithmetic):
@@ -172,7 +160,6 @@ def test_reasons_against_compiling(reason):
     assert re.match(rf"_reward_policy, line \d+: .*{reason}", left["_reward_policy"])
 
 
-@needs_native
 def test_why_hooks_are_not_compiled_stands_in_the_log(caplog):
     with caplog.at_level("INFO", "fmugym"):
         FMUVectorEnv(Branching, 2).close()
@@ -195,7 +182,6 @@ CHANGES = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("change", CHANGES)
 def test_compiled_hooks_after_a_change(change, monkeypatch):
     """Once the episodes from before have ended, steps are as fast as before."""
@@ -231,7 +217,6 @@ class NotANumber(Arithmetic):
         return np.sqrt(self.state[1])
 
 
-@needs_native
 def test_programs_whose_results_are_nan_are_the_hooks():
     FMUVectorEnv(NotANumber, 2, hooks="compiled").close()
 
@@ -260,7 +245,6 @@ def dividing(env):
     return 1.0 / env.state[0]
 
 
-@needs_native
 @pytest.mark.parametrize(
     ("reward", "is_finite"),
     [

@@ -15,11 +15,9 @@ from vector_tools import (
 
 import fmugym
 from fmugym import SimulationError
-from fmugym.pool import has_native_pool
 from fmugym.series import RecordVectorSeries
 from fmugym.vector import FMUVectorEnv
 
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 each_kind = pytest.mark.parametrize("hooks", ["compiled", "array"])
 
 

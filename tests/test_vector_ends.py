@@ -28,14 +28,12 @@ from vector_tools import (
 )
 
 from fmugym import FMUVectorEnv, SimulationError
-from fmugym.pool import has_native_pool
 
 try:
     import _testcapi as testcapi
 except ImportError:
     testcapi = None
 
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 
 SAME_STEP = AutoresetMode.SAME_STEP
 NUM_ENVS, STEPS = 6, 60

@@ -28,7 +28,7 @@ from fmugym.vector import FMUVectorEnv
 @each_way
 @each_mode
 @pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
-def test_a_fault_ends_its_own_episode_only(on_fault, mode, backend, hooks):
+def test_a_fault_ends_its_own_episode_only(on_fault, mode, hooks):
     for cls, fine, absurd in ((Cart, [0.5], [ABSURD]), (PushedCart, 0, 1)):
         vector, healthy = (
             FMUVectorEnv(
@@ -36,7 +36,6 @@ def test_a_fault_ends_its_own_episode_only(on_fault, mode, backend, hooks):
                 3,
                 autoreset_mode=mode,
                 hooks=hooks,
-                backend=backend,
             )
             for _ in range(2)
         )
@@ -72,9 +71,9 @@ def test_a_fault_ends_its_own_episode_only(on_fault, mode, backend, hooks):
 
 @each_way
 @each_mode
-def test_faults_are_those_of_single_environments(mode, backend, hooks):
+def test_faults_are_those_of_single_environments(mode, hooks):
     logging.getLogger("fmugym.Cart").setLevel(logging.CRITICAL)
-    ours, theirs = make_pair(Cart, mode, hooks=hooks, backend=backend)
+    ours, theirs = make_pair(Cart, mode, hooks=hooks)
     for env in (ours, theirs):
         env.reset(seed=4)
     rng = np.random.default_rng(1)
@@ -101,8 +100,8 @@ def test_faults_are_those_of_single_environments(mode, backend, hooks):
 
 @each_way
 @pytest.mark.parametrize("cls", [Cart, PushedCart])
-def test_a_fault_may_be_raised(cls, backend, hooks):
-    vector = FMUVectorEnv(lambda: cls(on_fault="raise"), 3, hooks=hooks, backend=backend)
+def test_a_fault_may_be_raised(cls, hooks):
+    vector = FMUVectorEnv(lambda: cls(on_fault="raise"), 3, hooks=hooks)
     vector.reset(seed=0)
     fine, absurd = ([0.5], [ABSURD]) if cls is Cart else (0, 1)
     with pytest.raises(SimulationError, match="returned Discard"):
@@ -114,7 +113,7 @@ def test_a_fault_may_be_raised(cls, backend, hooks):
 
 @each_way
 @pytest.mark.parametrize("version", [2, 3])
-def test_an_fmu_may_ask_for_the_end(version, backend, hooks, probe):
+def test_an_fmu_may_ask_for_the_end(version, hooks, probe):
     """The one whose parameters say so stops in its third step."""
 
     class Stopping(fmu_tools.PlainEnv):
@@ -126,7 +125,7 @@ def test_an_fmu_may_ask_for_the_end(version, backend, hooks, probe):
             return np.where(self.done, -5.0, self.inputs[0])
 
     stop = {"fault": 6, "fault_step": 3}
-    vector = FMUVectorEnv(Stopping, 3, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(Stopping, 3, hooks=hooks)
     for name, value in stop.items():
         vector.set_attr(name, [0, value, 0])
     theirs = SyncVectorEnv([Stopping, lambda: Stopping(**stop), Stopping])
@@ -167,8 +166,8 @@ class StoppingSteered(fmu_tools.PlainEnv):
 
 
 @each_way
-def test_the_reward_of_a_step_with_which_the_fmu_stops(backend, hooks, probe):
-    vector = FMUVectorEnv(lambda: StoppingSteered(probe()), 3, hooks=hooks, backend=backend)
+def test_the_reward_of_a_step_with_which_the_fmu_stops(hooks, probe):
+    vector = FMUVectorEnv(lambda: StoppingSteered(probe()), 3, hooks=hooks)
     vector.reset()
     assert vector.step(np.array([2, 1, 0]))[1].tolist() == [2.0, 1.0, 0.0]
     assert vector.step(np.array([0, 1, 2]))[1].tolist() == [0.0, 10.0, 20.0]
@@ -176,8 +175,8 @@ def test_the_reward_of_a_step_with_which_the_fmu_stops(backend, hooks, probe):
 
 
 @each_way
-def test_a_start_that_fails_is_an_error(backend, hooks, make_env):
-    vector = FMUVectorEnv(make_env, 2, hooks=hooks, backend=backend)
+def test_a_start_that_fails_is_an_error(hooks, make_env):
+    vector = FMUVectorEnv(make_env, 2, hooks=hooks)
     vector.reset()
     with pytest.raises(SimulationError, match="init"):
         vector.reset(options={"model_parameters": {"init_status": 3}})
@@ -212,13 +211,9 @@ class Rewarding(Drawing):
 @each_way
 @each_mode
 @pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
-def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(
-    on_fault, mode, backend, hooks
-):
+def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(on_fault, mode, hooks):
     logging.getLogger("fmugym.Rewarding").setLevel(logging.CRITICAL)
-    ours, theirs = make_pair(
-        Rewarding, mode, hooks=hooks, backend=backend, num_envs=6, on_fault=on_fault
-    )
+    ours, theirs = make_pair(Rewarding, mode, hooks=hooks, num_envs=6, on_fault=on_fault)
     assert run_side_by_side(ours, theirs, mode, 60) > 20
     counts = ours.health["not_finite"]
     assert counts.tolist() == [env.health["not_finite"] for env in theirs.envs]
@@ -228,8 +223,8 @@ def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(
 
 
 @each_way
-def test_a_number_that_is_not_finite_may_be_raised(backend, hooks):
-    vector = FMUVectorEnv(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks, backend=backend)
+def test_a_number_that_is_not_finite_may_be_raised(hooks):
+    vector = FMUVectorEnv(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks)
     vector.reset(seed=1)
     actions = sampled_actions(vector, 12)
     with pytest.raises(SimulationError, match=r"environment \d: (_reward_policy returned|the obs)"):
@@ -251,9 +246,9 @@ class Overflowing(Drawing):
 
 
 @each_way
-def test_an_observation_that_overflows_is_a_fault(backend, hooks):
+def test_an_observation_that_overflows_is_a_fault(hooks):
     logging.getLogger("fmugym.Overflowing").setLevel(logging.CRITICAL)
-    vector = FMUVectorEnv(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks)
     vector.reset(seed=1)
     faults = 0
     for actions in sampled_actions(vector, 30):
@@ -275,10 +270,9 @@ class Choosing(PushedCart):
 
 
 @each_way
-def test_an_infinite_reward_of_plain_arithmetic(backend, hooks):
+def test_an_infinite_reward_of_plain_arithmetic(hooks):
     logging.getLogger("fmugym.Choosing").setLevel(logging.CRITICAL)
-    ways = {"backend": backend, "hooks": "compiled" if hooks == "auto" else hooks}
-    vector = FMUVectorEnv(Choosing, 3, **ways)
+    vector = FMUVectorEnv(Choosing, 3, hooks="compiled" if hooks == "auto" else hooks)
     vector.reset(seed=0)
     first = vector.step(np.array([1, 1, 1]))[0]
     observations, rewards, _, truncated, infos = vector.step(np.array([1, 0, 1]))
@@ -294,12 +288,12 @@ def test_an_infinite_reward_of_plain_arithmetic(backend, hooks):
 
 
 @each_way
-def test_a_first_observation_that_is_not_finite(backend, hooks):
+def test_a_first_observation_that_is_not_finite(hooks):
     class Blind(Drawing):
         def _get_observation(self):
             return np.array(self.state) / (0.0 * self.step_count + 0.0)
 
-    vector = FMUVectorEnv(Blind, 2, hooks=hooks, backend=backend)
+    vector = FMUVectorEnv(Blind, 2, hooks=hooks)
     with (
         np.errstate(all="ignore"),
         pytest.raises(SimulationError, match="the first observation"),

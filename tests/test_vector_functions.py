@@ -7,17 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmugym.pool import has_native_pool
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import numpy_of
 from fmugym.vector.hooks.program import UntraceableError, evaluate
 from fmugym.vector.hooks.sorting import sorts_stably
 from fmugym.vector.hooks.symbols import as_symbols, loaded, same_for_all
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 COUNT = 150
 

@@ -12,7 +12,6 @@ from vector_tools import (
     Reaching,
     Remembering,
     Shifted,
-    each_backend,
     each_mode,
     make_pair,
     require_pair_equal,
@@ -195,11 +194,10 @@ DIFFERENT = {
 }
 
 
-@each_backend
 @pytest.mark.parametrize("cls", DIFFERENT, ids=lambda cls: cls.__name__)
-def test_hooks_for_one_environment_only_are_called_one_by_one(cls, backend, caplog):
+def test_hooks_for_one_environment_only_are_called_one_by_one(cls, caplog):
     with caplog.at_level(logging.WARNING, "fmugym"):
-        require_pair_equal(cls, steps=30, hooks="auto", backend=backend)
+        require_pair_equal(cls, steps=30, hooks="auto")
     (message,) = [r.getMessage() for r in caplog.records if "one environment" in r.getMessage()]
     assert message.startswith(f"{cls.__name__}: {DIFFERENT[cls]}")
 

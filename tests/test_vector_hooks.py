@@ -5,13 +5,11 @@ import numpy as np
 import pytest
 from vector_tools import (
     CART_POLE,
-    POOLS,
     Drawing,
     Historic,
     Reaching,
     Remembering,
     Shifted,
-    each_backend,
     each_mode,
     each_way,
     require_pair_equal,
@@ -20,15 +18,14 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.pool.native import NativePool
 from fmugym.vector import FMUVectorEnv
 
 
 @each_way
 @each_mode
-def test_hooks_read_what_they_read_in_a_single_environment(mode, backend, hooks):
-    ends = require_pair_equal(
-        Remembering, mode=mode, hooks=hooks, backend=backend, substeps=2, warm_up=0.04
-    )
+def test_hooks_read_what_they_read_in_a_single_environment(mode, hooks):
+    ends = require_pair_equal(Remembering, mode=mode, hooks=hooks, substeps=2, warm_up=0.04)
     assert ends > 10
 
 
@@ -38,14 +35,14 @@ class Imprecise(Drawing):
 
 
 @each_way
-def test_observations_have_the_type_of_the_space(backend, hooks):
-    require_pair_equal(Imprecise, hooks=hooks, backend=backend)
+def test_observations_have_the_type_of_the_space(hooks):
+    require_pair_equal(Imprecise, hooks=hooks)
 
 
 @each_way
-def test_goal_tasks(backend, hooks):
-    require_pair_equal(Reaching, hooks=hooks, backend=backend)
-    vector = FMUVectorEnv(Reaching, 3, hooks=hooks, backend=backend)
+def test_goal_tasks(hooks):
+    require_pair_equal(Reaching, hooks=hooks)
+    vector = FMUVectorEnv(Reaching, 3, hooks=hooks)
     vector.reset(seed=0)
     observations, rewards, *_, infos = vector.step(sampled_actions(vector, 1)[0])
     goals = observations["achieved_goal"], observations["desired_goal"]
@@ -54,13 +51,13 @@ def test_goal_tasks(backend, hooks):
 
 
 @each_way
-def test_an_episode_variable_may_hold_several_numbers(backend, hooks):
-    require_pair_equal(Historic, hooks=hooks, backend=backend)
+def test_an_episode_variable_may_hold_several_numbers(hooks):
+    require_pair_equal(Historic, hooks=hooks)
 
 
 @each_way
-def test_discrete_actions_with_another_start(backend, hooks):
-    require_pair_equal(Shifted, hooks=hooks, backend=backend)
+def test_discrete_actions_with_another_start(hooks):
+    require_pair_equal(Shifted, hooks=hooks)
 
 
 @each_way
@@ -77,7 +74,7 @@ def test_discrete_actions_with_another_start(backend, hooks):
     ],
     ids=["reals", "mixed", "integer", "enumeration", "boolean", "tunable", "start"],
 )
-def test_types_of_inputs_and_outputs(config, backend, hooks, probe):
+def test_types_of_inputs_and_outputs(config, hooks, probe):
     class Typed(fmu_tools.PlainEnv):
         def __init__(self):
             defaults = {"max_episode_steps": 4, "episode_variables": {"x": Uniform(0, 1)}}
@@ -86,13 +83,12 @@ def test_types_of_inputs_and_outputs(config, backend, hooks, probe):
         def _get_info(self):
             return {"inputs": np.array(self.inputs), "x": self.variables["x"]}
 
-    require_pair_equal(Typed, steps=30, hooks=hooks, backend=backend)
+    require_pair_equal(Typed, steps=30, hooks=hooks)
 
 
-@each_backend
-def test_discrete_observations(backend, make_env):
+def test_discrete_observations(make_env):
     """The default hook looks a value up, which takes one environment at a time."""
-    vector = FMUVectorEnv(lambda: make_env(model_output_names="mode_out"), 3, backend=backend)
+    vector = FMUVectorEnv(lambda: make_env(model_output_names="mode_out"), 3)
     observations, _ = vector.reset()
     assert observations.dtype == np.int64
     assert observations.tolist() == [0, 0, 0]
@@ -146,8 +142,8 @@ def reset_and_step(vector):
     ],
 )
 @each_way
-def test_mistakes_in_hooks(cls, error, text, backend, hooks):
-    vector = FMUVectorEnv(cls, 2, hooks=hooks, backend=backend)
+def test_mistakes_in_hooks(cls, error, text, hooks):
+    vector = FMUVectorEnv(cls, 2, hooks=hooks)
     with pytest.raises(error, match=text):
         reset_and_step(vector)
     vector.close()
@@ -168,8 +164,8 @@ class Delegating(fmugym.envs.CartPoleEnv):
 
 
 @each_way
-def test_bound_methods_in_attributes(backend, hooks):
-    require_pair_equal(Delegating, hooks=hooks, backend=backend)
+def test_bound_methods_in_attributes(hooks):
+    require_pair_equal(Delegating, hooks=hooks)
 
 
 class OwnStep(CART_POLE):
@@ -189,19 +185,16 @@ class Branching(CART_POLE):
 
 
 @pytest.mark.parametrize("cls", [OwnStep, Branching])
-@each_backend
 @each_mode
-def test_hooks_that_branch(cls, backend, mode):
-    assert require_pair_equal(cls, mode=mode, hooks="per_env", backend=backend) > 5
+def test_hooks_that_branch(cls, mode):
+    assert require_pair_equal(cls, mode=mode, hooks="per_env") > 5
 
 
-@each_backend
-def test_fmus_step_together_whatever_the_hooks_are(backend, monkeypatch):
-    vector = FMUVectorEnv(Branching, 5, hooks="per_env", backend=backend)
+def test_fmus_step_together_whatever_the_hooks_are(monkeypatch):
+    vector = FMUVectorEnv(Branching, 5, hooks="per_env")
     vector.reset(seed=0)
-    calls, pool = [], POOLS[backend]
-    step = pool.step
-    monkeypatch.setattr(pool, "step", lambda *given: calls.append(1) or step(*given))
+    calls, step = [], NativePool.step
+    monkeypatch.setattr(NativePool, "step", lambda *given: calls.append(1) or step(*given))
     for actions in sampled_actions(vector, 30):
         vector.step(actions)
     assert len(calls) == 30

@@ -28,9 +28,9 @@ def arrays_of(value):
 
 @each_way
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_results_belong_to_the_caller(mode, backend, hooks):
+def test_results_belong_to_the_caller(mode, hooks):
     """Spoiling results changes nothing, and later steps do not change results."""
-    keywords = {"autoreset_mode": mode, "hooks": hooks, "backend": backend}
+    keywords = {"autoreset_mode": mode, "hooks": hooks}
     for cls in (Remembering, fmugym.envs.CartPoleEnv):
         careful, careless = (FMUVectorEnv(cls, 3, **keywords) for _ in range(2))
         kept = [careful.reset(seed=0)]
@@ -52,8 +52,8 @@ def test_results_belong_to_the_caller(mode, backend, hooks):
 
 
 @each_way
-def test_infos_as_lists(backend, hooks):
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks, backend=backend)
+def test_infos_as_lists(hooks):
+    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, hooks=hooks)
     wrapped = gym.wrappers.vector.DictInfoToList(vector)
     _, infos = wrapped.reset(seed=0)
     assert [sorted(info["drawn"]) for info in infos] == [
@@ -83,8 +83,8 @@ def require_zero_outside_of_masks(infos):
 @each_way
 @each_mode
 @pytest.mark.parametrize("cls", [Remembering, CART_POLE])
-def test_infos_are_zero_outside_of_their_masks(cls, mode, backend, hooks):
-    vector = FMUVectorEnv(cls, 4, autoreset_mode=mode, hooks=hooks, backend=backend)
+def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks):
+    vector = FMUVectorEnv(cls, 4, autoreset_mode=mode, hooks=hooks)
     require_zero_outside_of_masks(vector.reset(seed=0)[1])
     told = 0
     for actions in sampled_actions(vector, 40):

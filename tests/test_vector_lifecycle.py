@@ -141,8 +141,8 @@ def test_the_mode_is_where_callers_look_for_it(mode):
 
 
 @each_way
-def test_calls_out_of_order(backend, hooks):
-    vector = FMUVectorEnv(Drawing, 2, hooks=hooks, backend=backend)
+def test_calls_out_of_order(hooks):
+    vector = FMUVectorEnv(Drawing, 2, hooks=hooks)
     actions = np.zeros((2, 1), np.float32)
     with pytest.raises(SimulationError, match="step was called before the first reset"):
         vector.step(actions)

@@ -90,8 +90,8 @@ class WithHelper(Drawing):
 
 
 @each_way
-def test_constructors_may_make_and_use_environments(backend, hooks):
-    vector = FMUVectorEnv(WithHelper, 3, hooks=hooks, backend=backend)
+def test_constructors_may_make_and_use_environments(hooks):
+    vector = FMUVectorEnv(WithHelper, 3, hooks=hooks)
     theirs = gym.vector.SyncVectorEnv([WithHelper] * 3)
     run_side_by_side(vector, theirs, vector.autoreset_mode, 12)
     vector.close()
@@ -111,8 +111,8 @@ class UsesItself(Drawing):
 
 
 @each_way
-def test_constructors_may_play(backend, hooks):
-    vector = FMUVectorEnv(UsesItself, 3, hooks=hooks, backend=backend)
+def test_constructors_may_play(hooks):
+    vector = FMUVectorEnv(UsesItself, 3, hooks=hooks)
     theirs = gym.vector.SyncVectorEnv([UsesItself] * 3)
     run_side_by_side(vector, theirs, vector.autoreset_mode, 12)
     vector.close()
@@ -167,7 +167,7 @@ def test_what_was_made_is_closed_if_a_later_one_cannot_be_made(temp_root):
 
 
 def test_a_pool_of_other_options():
-    env = make_with_pool(Drawing, backend="python")
+    env = make_with_pool(Drawing, isolation="process")
     native = Drawing()
     require_equal(env.reset(seed=3)[0], native.reset(seed=3)[0])
     env.close()

@@ -13,10 +13,7 @@ from gymnasium.vector import AutoresetMode
 from vector_tools import CART_POLE, Drawing, PushedCart, require_equal
 
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector.engines.compiled import CompiledEngine
-
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 
 
 class Pictured(Drawing):

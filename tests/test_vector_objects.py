@@ -8,13 +8,8 @@ from vector_tools import Drawing, each_way, make_pair, require_pair_equal, sampl
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.contents import Contents
-
-needs_native = pytest.mark.skipif(
-    not has_native_pool(), reason="the C extension was not built: no compiler at install"
-)
 
 
 class WithCost(Drawing):
@@ -60,8 +55,8 @@ class RewardInAttribute(Drawing):
 
 @pytest.mark.parametrize("cls", [WithCost, Judged, RewardInAttribute])
 @each_way
-def test_functions_and_objects_that_refer_to_the_environment(cls, backend, hooks):
-    require_pair_equal(cls, steps=30, hooks=hooks, backend=backend)
+def test_functions_and_objects_that_refer_to_the_environment(cls, hooks):
+    require_pair_equal(cls, steps=30, hooks=hooks)
 
 
 def test_a_hook_in_an_attribute_is_called():
@@ -167,7 +162,6 @@ class Remembering(fmugym.FMUEnv):
         return self.state[0] > 100.0
 
 
-@needs_native
 @pytest.mark.parametrize("hooks", ["auto", "array", "compiled"])
 def test_checks_and_traces_leave_nothing_in_the_users_objects(hooks):
     seen = {}
@@ -178,7 +172,6 @@ def test_checks_and_traces_leave_nothing_in_the_users_objects(hooks):
     assert seen == {}
 
 
-@needs_native
 def test_what_is_traced_reads_through_functions_in_attributes():
     class Plain(fmugym.envs.CartPoleEnv):
         def __init__(self):

@@ -23,7 +23,6 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, SimulationError
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.overlap import NoStepError, PendingStepError, StepTimeoutError
 
@@ -41,11 +40,8 @@ ZEROS = np.zeros(3, np.int64)
 
 @each_mode
 @each_way
-def test_results_are_those_of_step(mode, backend, hooks):
-    first, second = (
-        FMUVectorEnv(CART_POLE, 4, autoreset_mode=mode, backend=backend, hooks=hooks)
-        for _ in range(2)
-    )
+def test_results_are_those_of_step(mode, hooks):
+    first, second = (FMUVectorEnv(CART_POLE, 4, autoreset_mode=mode, hooks=hooks) for _ in range(2))
     require_equal(first.reset(seed=2)[0], second.reset(seed=2)[0])
     for actions in sampled_actions(first, 40):
         first.step_async(actions)
@@ -168,7 +164,7 @@ class Waiting(Drawing):
 @pytest.fixture
 def waiting():
     Waiting.gate.set()
-    envs = FMUVectorEnv(Waiting, 2, hooks="array", backend="python")
+    envs = FMUVectorEnv(Waiting, 2, hooks="array")
     envs.reset(seed=0)
     Waiting.gate.clear()
     yield envs
@@ -219,7 +215,6 @@ def test_a_fork_has_no_step_under_way(envs):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-@pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 def test_the_fmus_step_while_the_caller_runs(tmp_path):
     """The caller's own code runs before the step, which is long, has ended."""
 

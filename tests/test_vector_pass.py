@@ -19,11 +19,9 @@ from vector_tools import (
 )
 
 from fmugym import SimulationError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 SAME_STEP, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 

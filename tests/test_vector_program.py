@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from vector_tools import Drawing, require_equal, require_same_infos, sampled_actions
 
 from fmugym import ConfigError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.task.readings import reading
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.contents import borrowed
@@ -18,10 +17,6 @@ from fmugym.vector.hooks.compare import require_same as require_same_programs
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.trace import trace_hooks
 from fmugym.vector.views import copied
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 
 def require_same(cls, num_envs=40, steps=25, mode="next_step", ways=("compiled", "array")):

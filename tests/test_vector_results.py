@@ -11,10 +11,7 @@ import pytest
 from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sampled_actions
 
 from fmugym import ConfigError, FMUVectorEnv
-from fmugym.pool import has_native_pool
 from fmugym.task.values import LateDict
-
-pytestmark = pytest.mark.skipif(not has_native_pool(), reason="no C extension was built")
 
 NUM_ENVS, STEPS = 3, 40
 

@@ -5,7 +5,6 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
-    each_backend,
     each_mode,
     each_way,
     make_pair,
@@ -41,9 +40,9 @@ OPTIONS = (
 
 @each_way
 @pytest.mark.parametrize("kind", PARAMETERS)
-def test_options_take_the_streams_back(kind, backend, hooks):
+def test_options_take_the_streams_back(kind, hooks):
     keywords = {"model_parameters": PARAMETERS[kind], "episode_variables": VARIABLES}
-    ours, theirs = make_pair(Drawing, hooks=hooks, backend=backend, **keywords)
+    ours, theirs = make_pair(Drawing, hooks=hooks, **keywords)
     run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 5)
     for options in OPTIONS * 2:
         mask = np.array([True, False, True, True])
@@ -60,11 +59,8 @@ def test_options_take_the_streams_back(kind, backend, hooks):
     theirs.close()
 
 
-@each_backend
-def test_drawn_values_are_told_and_used(backend):
-    vector = FMUVectorEnv(
-        lambda: Drawing(model_parameters=UNIFORM, episode_variables=VARIABLES), 6, backend=backend
-    )
+def test_drawn_values_are_told_and_used():
+    vector = FMUVectorEnv(lambda: Drawing(model_parameters=UNIFORM, episode_variables=VARIABLES), 6)
     observations, infos = vector.reset(seed=0)
     drawn = infos["drawn"]
     assert set(drawn) == {"q_0", "_q_0", "m", "_m", "target", "_target"}
@@ -76,8 +72,8 @@ def test_drawn_values_are_told_and_used(backend):
 
 
 @each_way
-def test_seeds(backend, hooks):
-    vector = FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend)
+def test_seeds(hooks):
+    vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
     first = vector.reset(seed=10)[0]
     following = vector.reset()[0]
     assert first.tolist() != following.tolist()
@@ -90,10 +86,10 @@ def test_seeds(backend, hooks):
 
 
 @each_way
-def test_an_unseeded_reset_draws_from_somewhere(backend, hooks):
+def test_an_unseeded_reset_draws_from_somewhere(hooks):
     starts = []
     for _ in range(2):
-        vector = FMUVectorEnv(Drawing, 3, hooks=hooks, backend=backend)
+        vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
         starts += vector.reset()[0][:, 0].tolist()
         vector.close()
     assert len(set(starts)) == 6
@@ -138,10 +134,10 @@ class Targets(Drawing):
 
 @each_mode
 @each_way
-def test_a_distribution_for_each_element(backend, hooks, mode):
+def test_a_distribution_for_each_element(hooks, mode):
     """Drawn, reset, told and seen as in single environments, whatever way hooks are called."""
     way = "compiled" if hooks == "auto" else hooks
-    ours, theirs = make_pair(Targets, mode, num_envs=5, hooks=way, backend=backend)
+    ours, theirs = make_pair(Targets, mode, num_envs=5, hooks=way)
     assert run_side_by_side(ours, theirs, mode, 20) >= 20
     for first, second in zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True):
         require_equal(dict(first), dict(second))
@@ -151,11 +147,9 @@ def test_a_distribution_for_each_element(backend, hooks, mode):
 
 @each_mode
 @each_way
-def test_elements_that_only_python_can_draw(backend, hooks, mode):
+def test_elements_that_only_python_can_draw(hooks, mode):
     variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
-    ours, theirs = make_pair(
-        Targets, mode, num_envs=3, hooks=hooks, backend=backend, variables=variables
-    )
+    ours, theirs = make_pair(Targets, mode, num_envs=3, hooks=hooks, variables=variables)
     assert run_side_by_side(ours, theirs, mode, 12) >= 6
     ours.close()
     theirs.close()
@@ -183,8 +177,8 @@ def test_elements_are_drawn_in_the_documented_order():
 
 
 @each_way
-def test_options_and_arrays_with_distributions(backend, hooks):
-    ours, theirs = make_pair(Targets, hooks=hooks, backend=backend)
+def test_options_and_arrays_with_distributions(hooks):
+    ours, theirs = make_pair(Targets, hooks=hooks)
     options = {"model_parameters": {"b": Uniform(0.0, 1e-5)}}
     for given in (options, {}):
         first = ours.reset(seed=3, options=dict(given))

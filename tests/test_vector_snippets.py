@@ -11,16 +11,11 @@ import pytest
 from test_vector_program import Task, require_same
 from vector_tools import Drawing
 
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.check import find_difference, sample_states
 from fmugym.vector.hooks.compare import require_same as require_same_programs
 from fmugym.vector.hooks.tables import Table
 from fmugym.vector.hooks.trace import trace_hooks
-
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 
 GAINS = np.array([1.5, -0.7])
 MATRIX = np.array([[1.0, 2.0], [3.0, 4.0]])

@@ -16,13 +16,9 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, Uniform
-from fmugym.pool import has_native_pool
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.compiled import CompiledEngine
 
-pytestmark = pytest.mark.skipif(
-    not has_native_pool(), reason="hooks are compiled for the native pool"
-)
 each_mode = pytest.mark.parametrize("mode", ["next_step", "same_step"])
 
 

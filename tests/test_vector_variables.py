@@ -5,13 +5,11 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 from test_single_compiled import require_same, with_hooks
-from vector_tools import BACKENDS, Drawing, require_equal, require_pair_equal, sampled_actions
+from vector_tools import Drawing, require_equal, require_pair_equal, sampled_actions
 
 import fmugym
 from fmugym import Uniform
 from fmugym.vector import FMUVectorEnv
-
-needs_native = pytest.mark.skipif("native" not in BACKENDS, reason="the extension is not built")
 
 
 class Summing(Drawing):
@@ -30,7 +28,6 @@ class Summing(Drawing):
         return self.variables["sum"] + self.variables["left"] * self.variables["count"]
 
 
-@needs_native
 def test_sums_in_place_are_compiled():
     """``+=`` changes an array in place, where a number is replaced."""
     for mode in AutoresetMode:
@@ -78,7 +75,7 @@ class Changing(Drawing):
 
 
 @pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
-@pytest.mark.parametrize("hooks", ["array", *(["compiled"] if "native" in BACKENDS else [])])
+@pytest.mark.parametrize("hooks", ["array", "compiled"])
 def test_each_episode_starts_with_the_whole_value(mode, hooks):
     """The first episode and later ones, while others have other types."""
     assert require_pair_equal(Changing, steps=20, mode=mode, hooks=hooks) > 5
@@ -117,7 +114,6 @@ def test_what_another_hook_than_update_writes_is_kept(hook):
             FMUVectorEnv(writing(hook), 2, hooks="array")
 
 
-@needs_native
 @pytest.mark.parametrize("hook", HOOKS)
 def test_hooks_that_write_variables_are_not_compiled(hook):
     with pytest.raises(fmugym.ConfigError, match="_update"):
@@ -154,7 +150,6 @@ class Queueing(Drawing):
         return np.cumsum(self.variables["queue"])[-1] - self.variables["bits"] + whole / (1 + rest)
 
 
-@needs_native
 def test_a_variable_that_is_an_index_is_compiled_in_one_environment():
     """In random states it is outside of its table; hooks in Python would raise there, too."""
     compiled, ended = require_same(lambda hooks: with_hooks(Queueing, hooks), steps=60)
@@ -190,7 +185,6 @@ class Adding(Summing):
         self.variables["sum"] = self.variables["sum"] + self.state[0]
 
 
-@needs_native
 def test_sums_go_on_when_steps_are_compiled_again():
     """While one episode has parameters of its own, all steps are done on arrays."""
     ours, theirs = (
@@ -225,7 +219,6 @@ class Scaling(Drawing):
         return self.variables["scaled"]
 
 
-@needs_native
 def test_the_first_step_of_one_environment_reads_the_whole_start_value():
     compiled, ended = require_same(lambda hooks: with_hooks(Scaling, hooks), steps=40)
     assert compiled > 20

@@ -57,13 +57,12 @@ def test_array_wrappers_over_single_transforms():
 
 
 @each_way
-def test_pictures_of_all(backend, hooks):
+def test_pictures_of_all(hooks):
     vector = gym.make_vec(
         "fmugym/ModelicaCartPole-v0",
         num_envs=3,
         render_mode="rgb_array",
         hooks=hooks,
-        backend=backend,
         theta_0=Uniform(1.4, 1.7),
     )
     with pytest.raises(SimulationError, match="before the first reset"):

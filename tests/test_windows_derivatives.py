@@ -66,7 +66,7 @@ class TestInWine:
     def test_an_fmu_that_fails(self, tmp_path):
         probe = fmu_tools.probe_fmu(tmp_path, edits=fmu_tools.CLAIMING_DERIVATIVES)
         path = for_windows(probe, tmp_path)
-        with pytest.raises(SimulationError, match="a derivative returned Error"):
+        with pytest.raises(SimulationError, match="the derivative by 'sum' returned Error"):
             linearize(path, at={"label": "derived", "gain": 2.0})
         with pytest.raises(SimulationError, match="initialization returned Error"):
             linearize(path, at={"init_status": 3})

@@ -25,7 +25,7 @@ from vector_tools import run_side_by_side
 from wine_tools import exchange_fmu, for_windows
 
 import fmugym
-from fmugym import FMU, FMULoadError, FMUSystem, SimulationError, bundled_fmu
+from fmugym import FMU, ConfigError, FMULoadError, FMUSystem, SimulationError, bundled_fmu
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.shared_memory import Memory, make_bell, size_for
@@ -105,12 +105,14 @@ class TestChoice:
         (text,) = FMU(path).obstacles
         assert "32-bit Windows" in text
 
-    @pytest.mark.parametrize(
-        "wish", [{"backend": "python"}, {"isolation": "none"}, {"private_libraries": True}]
-    )
+    @pytest.mark.parametrize("wish", [{"isolation": "none"}, {"private_libraries": True}])
     def test_what_is_impossible_in_wine_is_refused(self, cart_pole, wish):
         with pytest.raises(FMULoadError, match=next(iter(wish))):
             open_pool(cart_pole, **wish)
+
+    def test_fmpy_does_not_step_it(self, cart_pole):
+        with pytest.raises(ConfigError, match="libraries for Windows"):
+            open_pool(cart_pole, backend="fmpy")
 
     def test_this_process_cannot_load_it(self, cart_pole):
         fmu = FMU(cart_pole)

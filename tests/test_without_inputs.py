@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.pool import has_native_pool
 
 SETTINGS = [
     (hooks, isolation)
     for hooks in ("array", "per_env", "auto")
     for isolation in ("none", "process")
-] + ([("compiled", "none")] if has_native_pool() else [])
+]
+SETTINGS.append(("compiled", "none"))
 
 
 class FallingEnv(fmugym.FMI2CSEnv):

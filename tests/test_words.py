@@ -16,9 +16,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is 
 
 WAYS = {
     "native": {"backend": "native"},
-    "python": {"backend": "python"},
     "isolated": {"backend": "native", "isolation": "process"},
-    "isolated python": {"backend": "python", "isolation": "process"},
 }
 LEVELS = (logging.INFO, logging.WARNING, logging.CRITICAL)
 all_ways = pytest.mark.parametrize("way", WAYS)
@@ -76,39 +74,35 @@ def test_a_refusal(make_env, way, version, level):
         make_env(version, "refuse", way, level=level)
 
 
-@pytest.mark.parametrize("way", ["native", "python"])
 @pytest.mark.parametrize(("version", "categories"), [(1, ()), (2, ()), (3, ("logEvents",))])
-def test_without_categories_the_second_fault_is_explained(make_env, way, version, categories):
+def test_without_categories_the_second_fault_is_explained(make_env, version, categories):
     """The FMU is silent unless it logs everything, which it is asked to once it has failed."""
-    env = make_env(version, "step", way, categories, at=2)
+    env = make_env(version, "step", categories=categories, at=2)
     assert fault(env).endswith("returned Error")
     assert fault(env).endswith("the FMU said: the valve is stuck because of step")
     asked = [fault(env).endswith("because of step") for _ in range(10)]
     assert asked == [False, True] * 3 + [False] * 4
 
 
-@pytest.mark.parametrize("way", ["native", "python"])
 @all_versions
-def test_an_fmu_without_a_word(make_env, way, version):
-    env = make_env(version, "mute step", way, at=2)
+def test_an_fmu_without_a_word(make_env, version):
+    env = make_env(version, "mute step", at=2)
     for _ in range(10):
         assert fault(env).endswith("the step at t = 0.5 s returned Error")
 
 
-@pytest.mark.parametrize("way", ["native", "python"])
 @newer_versions
 @pytest.mark.parametrize("token", ["deaf", "strict"])
-def test_an_fmu_that_cannot_be_asked_works_all_the_same(make_env, way, version, token):
-    env = make_env(version, token, way)
+def test_an_fmu_that_cannot_be_asked_works_all_the_same(make_env, version, token):
+    env = make_env(version, token)
     assert fault(env) == ""
     assert env.state == pytest.approx([0.75, 0.0])
 
 
-@pytest.mark.parametrize("way", ["native", "python"])
 @newer_versions
-def test_an_fmu_that_logs_more_than_asked_for_is_hushed(make_env, caplog, way, version):
+def test_an_fmu_that_logs_more_than_asked_for_is_hushed(make_env, caplog, version):
     caplog.set_level(logging.DEBUG)
-    env = make_env(version, "chatty", way)
+    env = make_env(version, "chatty")
     assert fault(env, 1001) == ""
     assert env.state[1] == 1.0
     env.reset()
@@ -164,10 +158,9 @@ def test_environments_of_a_vector_say_their_own(tmp_path):
 class TestOutput:
     """The last lines that a worker has printed."""
 
-    @pytest.mark.parametrize("way", ["isolated", "isolated python"])
     @pytest.mark.parametrize("token", ["step", "step mute", "crash", "crash mute", "hang"])
-    def test_is_quoted(self, make_env, way, token, capfd):
-        env = make_env(2, f"prints {token}", way, at=2, call_timeout=2.0)
+    def test_is_quoted(self, make_env, token, capfd):
+        env = make_env(2, f"prints {token}", "isolated", at=2, call_timeout=2.0)
         text = fault(env)
         assert text.endswith("; it printed: the solver gives up | CPU time: 3 s | the oil is cold")
         assert ("because of step" in text) is ("mute" not in token)

@@ -199,9 +199,7 @@ STEP = 0.1
 
 POOLS = {
     "native": {},
-    "python": {"backend": "python"},
     "isolated": {"isolation": "process"},
-    "isolated python": {"isolation": "process", "backend": "python"},
 }
 
 pools = pytest.mark.parametrize("options", POOLS.values(), ids=POOLS)
@@ -235,9 +233,9 @@ LARGER = {
 class Env(fmugym.FMUEnv):
     """An FMU without a task."""
 
-    def __init__(self, path, backend=None, isolation=None, **config):
+    def __init__(self, path, isolation=None, **config):
         defaults = {"time_step": STEP, "probe_timeout": None}
-        super().__init__(path, defaults | config, backend=backend, isolation=isolation)
+        super().__init__(path, defaults | config, isolation=isolation)
 
     def _is_done(self):
         return self.out["y"][0] > 1e9 if "y" in self.out else False

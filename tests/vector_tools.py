@@ -10,18 +10,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import fmugym
 from fmugym import Uniform
-from fmugym.pool import has_native_pool
-from fmugym.pool.python import PythonPool
 from fmugym.vector import FMUVectorEnv
 
-BACKENDS = ("python", "native") if has_native_pool() else ("python",)
-POOLS = {"python": PythonPool}
-if has_native_pool():
-    from fmugym.pool.native import NativePool
-
-    POOLS["native"] = NativePool
-WAYS = [(backend, hooks) for backend in BACKENDS for hooks in ("array", "per_env")]
-WAYS += [("native", "auto")] if has_native_pool() else []  # compiled, where that is possible
 IDS = (
     "fmugym/CartPole-v0",
     "fmugym/Pendulum-v0",
@@ -30,8 +20,7 @@ IDS = (
 )
 MODES = tuple(AutoresetMode)
 ABSURD = 1e308
-each_backend = pytest.mark.parametrize("backend", BACKENDS)
-each_way = pytest.mark.parametrize(("backend", "hooks"), WAYS)
+each_way = pytest.mark.parametrize("hooks", ["array", "per_env", "auto"])
 each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 CART_POLE = fmugym.envs.CartPoleEnv
 
@@ -95,10 +84,8 @@ def run_side_by_side(ours, theirs, mode, steps, seed=3, rtol=0.0):
     return ends
 
 
-def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, hooks="array", backend="auto", **kw):
-    ours = FMUVectorEnv(
-        lambda: cls(**kw), num_envs, autoreset_mode=mode, hooks=hooks, backend=backend
-    )
+def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, hooks="array", **kw):
+    ours = FMUVectorEnv(lambda: cls(**kw), num_envs, autoreset_mode=mode, hooks=hooks)
     theirs = SyncVectorEnv([lambda: cls(**kw)] * num_envs, autoreset_mode=mode)
     return ours, theirs
 

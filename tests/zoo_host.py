@@ -16,12 +16,11 @@ from pathlib import Path
 import zoo_tools
 
 from fmugym.caching import cache_folder
-from fmugym.pool import has_native_pool
+from fmugym.pool import native  # noqa: F401 (so that the forks need not import it)
 from fmugym.pool.process.last_words import describe_exit
 
 
 def main(folder, *modes):
-    has_native_pool()  # so that the forks need not import it
     answers = os.fdopen(os.dup(1), "w")
     output = os.open(folder / "output", os.O_CREAT | os.O_RDWR | os.O_APPEND)
     os.dup2(output, 1)

@@ -15,12 +15,12 @@ __all__ = ["chained_jacobian"]
 
 FloatArray = npt.NDArray[np.float64]
 Ends = Sequence[Sequence[PartVariable]]
-Differentiate = Callable[[int, Sequence[Variable], Sequence[Variable]], FloatArray]
-"""Takes the number of a component, its unknowns and its knowns; see ``Instance.jacobian``."""
+Differentiate = Callable[[int, tuple[Variable, ...], tuple[Variable, ...]], FloatArray]
+"""Takes the number of a component, its k unknowns and its m knowns; gives shape (N, k, m)."""
 
 
 def chained_jacobian(
-    layout: Layout, differentiate: Differentiate, unknowns: Ends, knowns: Ends
+    layout: Layout, differentiate: Differentiate, count: int, unknowns: Ends, knowns: Ends
 ) -> FloatArray:
     """Differentiate variables of a system by others, as if values were exchanged at all times.
 
@@ -30,16 +30,17 @@ def chained_jacobian(
 
     Args:
         layout: The slots and routes of the system.
-        differentiate: Differentiates one component at the present point.
+        differentiate: Differentiates one component of all instances at the present point.
+        count: The number N of instances.
         unknowns: What stands behind each variable to differentiate; the first end counts.
         knowns: What stands behind each variable to differentiate by: one end or several.
 
     Returns:
-        The partial derivatives, shape (len(unknowns), len(knowns)), in the units of the system.
+        The partial derivatives, shape (N, len(unknowns), len(knowns)), in the units of the system.
     """
     routes = [route for route in layout.routes if _is_continuous(layout, route)]
     carried = [_source(layout, route) for route in routes]
-    chain = _Chain(layout, differentiate, routes)
+    chain = _Chain(layout, differentiate, count, routes)
     links = chain.by_routes(carried)
     direct = chain.by_knowns(carried, knowns)
     by_links = np.linalg.solve(np.eye(len(routes)) - links, direct)
@@ -51,9 +52,10 @@ class _Chain:
     """The derivatives of some variables by connections and by knowns."""
 
     def __init__(
-        self, layout: Layout, differentiate: Differentiate, routes: Sequence[Route]
+        self, layout: Layout, differentiate: Differentiate, count: int, routes: Sequence[Route]
     ) -> None:
-        self._layout, self._differentiate, self._routes = layout, differentiate, routes
+        self._layout, self._differentiate = layout, differentiate
+        self._count, self._routes = count, routes
 
     def by_routes(self, ends: Sequence[PartVariable]) -> FloatArray:
         """By the sources of connections, which act on their targets."""
@@ -62,16 +64,15 @@ class _Chain:
 
     def by_knowns(self, ends: Sequence[PartVariable], knowns: Ends) -> FloatArray:
         """By variables, without the way of connections."""
-        result = np.zeros((len(ends), len(knowns)))
+        result = np.zeros((self._count, len(ends), len(knowns)))
         for part in {end.part for end in ends}:
             rows = [row for row, end in enumerate(ends) if end.part == part]
             pairs = [(j, end) for j, known in enumerate(knowns) for end in _within(known, part)]
-            found = self._differentiate(
-                part, [ends[row].variable for row in rows], [end.variable for _, end in pairs]
-            )
-            for (column, end), values in zip(pairs, found.T, strict=True):
-                gains = np.array([ends[row].reading[0] for row in rows])
-                result[rows, column] += values * gains * end.gain
+            of = tuple(ends[row].variable for row in rows)
+            found = self._differentiate(part, of, tuple(end.variable for _, end in pairs))
+            gains = np.array([ends[row].reading[0] for row in rows])
+            for place, (column, end) in enumerate(pairs):
+                result[:, rows, column] += found[:, :, place] * gains * end.gain
         return result
 
 

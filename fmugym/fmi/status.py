@@ -1,11 +1,11 @@
-"""The status codes of FMI calls, and the states of FMI's state machine."""
+"""The status codes of FMI calls."""
 
 from __future__ import annotations
 
 import enum
 from typing import Final
 
-__all__ = ["TERMINATED_CODE", "WARNING_CODE", "Phase", "Status", "failed_call", "sane"]
+__all__ = ["TERMINATED_CODE", "WARNING_CODE", "Status", "failed_call", "sane"]
 
 
 class Status(enum.IntEnum):
@@ -26,19 +26,6 @@ WARNING_CODE: Final = int(Status.WARNING)
 TERMINATED_CODE: Final = int(Status.TERMINATED)
 """What arrays of statuses are compared with. Numpy asks the class of an enumeration for attributes,
 and drops what a signal handler raises meanwhile."""
-
-
-class Phase(enum.Enum):
-    """The states of FMI's state machine that decide which calls are legal."""
-
-    INSTANTIATED = enum.auto()
-    STEPPING = enum.auto()
-    ENDED = enum.auto()
-    """After a step that was not done: only reading and a reset are legal."""
-    FAILED = enum.auto()
-    """After Error: only a reset is legal."""
-    DEAD = enum.auto()
-    """After Fatal or free: no call is legal."""
 
 
 def sane(status: int) -> int:

@@ -4,7 +4,6 @@ from fmugym.pool.backend.pacing import Paced
 from fmugym.pool.backend.pool import Backend, BackendPool
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.extension import has_native_pool
-from fmugym.pool.python import PythonPool
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec
 
 __all__ = [
@@ -17,7 +16,6 @@ __all__ = [
     "Paced",
     "Pool",
     "PoolSpec",
-    "PythonPool",
     "StatusArray",
     "has_native_pool",
 ]

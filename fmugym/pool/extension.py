@@ -40,8 +40,8 @@ def has_native_pool() -> bool:
 
 @functools.cache
 def warn_of_slow_path() -> None:
-    """Warn once per process that Python steps the FMUs."""
-    logger.warning("FMUs are stepped by Python, which is slow: %s", HOW_TO_BUILD)
+    """Warn once per process that FMPy steps the FMUs."""
+    logger.warning("FMUs are stepped by FMPy, which is slow: %s", HOW_TO_BUILD)
 
 
 _passed: Final[set[CodeType]] = set()

@@ -1,8 +1,7 @@
 """The pool in C: it steps thousands of instances in one call, on several threads.
 
-Its results equal those of ``PythonPool`` bit for bit, for any number of threads. Beyond the
-contract of ``Pool``, it offers the vector environment its internal arrays and calls without any
-conversion:
+Its results do not depend on the number of threads. Beyond the contract of ``Pool``, it offers the
+vector environment its internal arrays and calls without any conversion:
 
 * write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
   ``pool.observations``;
@@ -22,10 +21,12 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
+from fmugym.archive.description import ModelDescription
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
+from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -61,6 +62,8 @@ from fmugym.pool.spec import ResetMethod, start_variables
 from fmugym.pool.systems import system_settings
 from fmugym.pool.tape import TAPE_ROWS, Effort, Judge
 from fmugym.signals import ordinary
+from fmugym.systems.description import SystemDescription
+from fmugym.systems.layout import Layout
 
 __all__ = ["NativePool", "prepare"]
 
@@ -69,6 +72,7 @@ _MOST_CACHED: Final = 64
 ask_for_texts(_native.text_with)
 
 FloatArray32 = npt.NDArray[np.float32]
+Variables = tuple[Variable, ...]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -283,6 +287,39 @@ class NativePool(SavingPool):
             reading = f"reading {names_of(variables)}"
             raise SimulationError(self.failure(failed).replace("reading variables", reading, 1))
         return values
+
+    def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
+        """See ``Pool.differentiate``; of systems by the chain rule."""
+        description, spec = self._fmu.description, self._spec
+        if not isinstance(description, SystemDescription):
+            return self._differentiate(0, description, unknowns, knowns)
+        layout = Layout(description, spec.inputs, spec.outputs)
+
+        def differentiate(part: int, of: Variables, by: Variables) -> FloatArray:
+            found = self._differentiate(part, layout.parts[part].description, of, by)
+            return np.moveaxis(found, -1, 0)
+
+        ends = [[layout.ends_of(variable) for variable in some] for some in (unknowns, knowns)]
+        found = chained_jacobian(layout, differentiate, self.num_instances, *ends)
+        return np.moveaxis(found, 0, -1)
+
+    def _differentiate(
+        self, part: int, description: ModelDescription, unknowns: Variables, knowns: Variables
+    ) -> FloatArray:
+        """Differentiate variables of an FMU, which may be a part of a system."""
+        capabilities = description.capabilities
+        if not capabilities.provides_derivatives:
+            raise SimulationError(f"{description.model_name} provides no derivatives")
+        is_adjoint = not capabilities.provides_directional_derivatives
+        seeded, others = (unknowns, knowns) if is_adjoint else (knowns, unknowns)
+        version = table_of(description)
+        some, rest = (_native.Access(version, *listing(v, version)) for v in (seeded, others))
+        rows = np.zeros((len(seeded) * len(others), self.num_instances))
+        failed = self._open_pool().differentiate(is_adjoint, part, some, rest, rows)
+        if failed >= 0:
+            raise SimulationError(self.failure(failed))
+        found = rows.reshape(len(seeded), len(others), self.num_instances)
+        return found if is_adjoint else found.swapaxes(0, 1)
 
     def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
         """See ``AttendedPool.knows_start``."""

@@ -24,7 +24,8 @@ _LEVELS: Final = (
     logging.ERROR,
     logging.CRITICAL,
 )
-_NO_STRING: Final = 2**32 - 1
+_NO_REFERENCE: Final = 2**32 - 1
+_DERIVATIVES: Final = "the derivative by", "the derivative of"
 _SAID: Final = "\x1d"
 """Stands before the FMU's messages in an error of the extension; see ``native/log.h``."""
 
@@ -36,7 +37,7 @@ class Failure(NamedTuple):
     in_warm_up: bool
     status: int
     time: float
-    string: int
+    reference: int
     said: str
     values: bytes | None
     part: str | None = None
@@ -57,16 +58,18 @@ def _sentence(failure: Failure, description: ModelDescription, name: str) -> str
     doing = failure.doing
     if not math.isnan(failure.time):
         doing = f"the step at t = {failure.time:g} s"
-    elif failure.string != _NO_STRING:
-        doing = f"setting {_string_name(description, failure.string)!r}"
+    elif failure.reference != _NO_REFERENCE:
+        is_string = doing not in _DERIVATIVES
+        name_of = _name_of(description, failure.reference, "string" if is_string else "real")
+        doing = f"{'setting' if is_string else doing} {name_of!r}"
     if failure.status < 0:  # the call was refused, and the text is a whole sentence
         return doing
     return f"{name}: {failed_call(doing, failure.status, failure.part or '')}"
 
 
-def _string_name(description: ModelDescription, reference: int) -> str:
-    strings = (v for v in description.variables.values() if v.kind == "string")
-    return next(v.name for v in strings if v.value_reference == reference)
+def _name_of(description: ModelDescription, reference: int, kind: str) -> str:
+    some = (v for v in description.variables.values() if v.kind == kind)
+    return next(v.name for v in some if v.value_reference == reference)
 
 
 def _not_finite(variables: tuple[Variable, ...], values: bytes) -> str:

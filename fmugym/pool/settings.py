@@ -20,7 +20,14 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, text_of, with_texts
 from fmugym.archive.variable import Variable, unlisted
 from fmugym.pool.bundle import Record
-from fmugym.pool.spec import SAMPLINGS, START_TIME, PoolSpec, ResetMethod, is_start_time
+from fmugym.pool.spec import (
+    DEFAULT_TOLERANCE,
+    SAMPLINGS,
+    START_TIME,
+    PoolSpec,
+    ResetMethod,
+    is_start_time,
+)
 from fmugym.systems.description import SystemDescription
 from fmugym.wine.loader import windows_path, windows_uri
 
@@ -160,7 +167,7 @@ def variable_settings(spec: PoolSpec) -> dict[str, Any]:
 
 
 def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any, ...] | None:
-    """What ``take_solving`` of ``native/python/pool_type.c`` takes; None in co-simulation."""
+    """What ``take_solving`` of ``native/python/solving.c`` takes; None in co-simulation."""
     if isinstance(description, SystemDescription):  # its components have their own
         return None
     model = description.model_exchange
@@ -169,14 +176,15 @@ def solving_settings(description: ModelDescription, spec: PoolSpec) -> tuple[Any
         if not description.uses_event_mode:
             return None
         return (b"by_fmu", 1.0, math.inf, 0, 0, False, None, None, *clocks)
-    solving, states, rates = spec.solving, None, None
+    states, rates = None, None
+    tolerance = DEFAULT_TOLERANCE if spec.tolerance is None else spec.tolerance
     if description.capabilities.provides_directional_derivatives and model.state_references:
         states = np.array(model.state_references, np.uint32).tobytes()
         rates = np.array(model.derivative_references, np.uint32).tobytes()
     return (
-        solving.solver.encode(),
-        solving.tolerance,
-        solving.max_step,
+        spec.solver.encode(),
+        tolerance,
+        spec.max_step or math.inf,
         model.number_of_states,
         model.number_of_event_indicators,
         model.needs_completed_integrator_step,

@@ -11,8 +11,6 @@ from typing import Final
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.archive.variable import Variable
-from fmugym.fmi.methods import METHODS
-from fmugym.fmi.solver import Solving
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -41,11 +39,11 @@ SAMPLINGS: Final = ("last", "mean", "integral", "min", "max")
 The order is that of ``Sampling`` in ``native/pool.h``.
 """
 
-SOLVERS: Final = tuple(METHODS)
-"""The methods of integration for model exchange; see ``fmugym.fmi.methods``."""
+FIXED_STEP_SOLVERS: Final = ("euler", "rk4")
+"""The methods of integration whose steps do not depend on the tolerance."""
 
-FIXED_STEP_SOLVERS: Final = tuple(name for name, method in METHODS.items() if not method.order)
-"""Those whose steps do not depend on the tolerance."""
+SOLVERS: Final = ("dormand_prince", "euler", "rk4", "rosenbrock")
+"""The methods of integration for model exchange; see ``native/methods.h``."""
 
 DEFAULT_TOLERANCE: Final = 1e-6
 """Relative tolerance of the solver where neither the config nor the FMU gives one: float32
@@ -217,12 +215,6 @@ class PoolSpec:
     def reloads(self) -> bool:
         """Whether anything is loaded anew, which must be a private copy then."""
         return ResetMethod.LIBRARY in (self.reset_method, *self.component_resets)
-
-    @property
-    def solving(self) -> Solving:
-        """How the equations of FMUs of model exchange are solved."""
-        tolerance = DEFAULT_TOLERANCE if self.tolerance is None else self.tolerance
-        return Solving(self.solver, tolerance, self.max_step or math.inf)
 
     @property
     def communication_step_size(self) -> float:

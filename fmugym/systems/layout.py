@@ -1,7 +1,6 @@
 """Where the values of a system are: slots of inputs and outputs, and the routes between them.
 
-Both engines read this: ``fmugym.fmi.system`` directly, ``native/system.c`` by way of
-``fmugym.pool.systems``.
+``fmugym.pool.systems`` tells it to ``native/system.c``.
 """
 
 from __future__ import annotations
@@ -63,17 +62,6 @@ class PartLayout:
     def clocks(self) -> tuple[int, ...]:
         """The places of the clocks among the inputs: each tick is for one step only."""
         return tuple(place for place, variable in enumerate(self.inputs) if variable.ticking)
-
-    def waits_for_clock(self, variable: Variable) -> bool:
-        """Whether an input may be set only while one of its clocks ticks."""
-        waiting = {one.value_reference for one in self.description.clocked_inputs}
-        return variable.value_reference in waiting
-
-    def span_of(self, place: int) -> slice:
-        """The places of all elements of an array among the inputs, of which one is at ``place``."""
-        variable = self.inputs[place]
-        first = place - variable.place
-        return slice(first, first + variable.size)
 
     def _settable(self, name: str) -> Variable:
         variable = self.description.variable(name)

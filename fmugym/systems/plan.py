@@ -2,8 +2,8 @@
 
 A plan holds names and numbers only: it can be pickled, compared and hashed. Whoever makes one
 (Python, a task file, an SSP archive) has resolved units into gains and offsets, and has put the
-components and links in order. ``fmugym.systems.fmu`` makes a system of it, which two engines run:
-``native/system.c`` and ``fmugym.fmi.system``.
+components and links in order. ``fmugym.systems.fmu`` makes a system of it, which
+``native/system.c`` runs.
 
 One step of the master with the communication step size h:
 

@@ -27,7 +27,8 @@ def require_saving(pool: Pool) -> None:
         SimulationError: If the pool has no states.
     """
     if pool.save_method is None:
-        raise SimulationError("a real system has no states that could be restored")
+        what = "a real system" if pool.is_real else "an FMU that FMPy steps"
+        raise SimulationError(f"{what} has no states that could be restored")
 
 
 def columns_of(env: Constructed) -> Columns:

@@ -21,17 +21,19 @@ from typing import Any, BinaryIO, Final, cast
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.process.last_words import OutputTail, describe_exit
+from fmugym.pool.process.last_words import OutputTail, describe_exit, lines_of_echo
 from fmugym.pool.progress import INITIALIZATION
 from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
 from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 
-__all__ = ["Outcome", "Request", "Stage", "patience", "run"]
+__all__ = ["ECHO", "Outcome", "Request", "Stage", "patience", "run"]
 
 logger = logging.getLogger(__name__)
 
 _WORKER = "fmugym.trial.worker"
+ECHO: Final = "echo"
+"""The file of a worker's folder that has the last messages of its FMU."""
 
 _LOOK: Final = 0.1
 """Seconds between two looks at a worker."""
@@ -129,6 +131,7 @@ def run(request: Request) -> Outcome:
             end, last_lines = _watch(folder, request)
         except ordinary(OSError) as error:
             end, last_lines = f"found no Python to start: {error}", []
+        last_lines = _echoed(folder) + last_lines
         return Outcome(_stage(folder), _answer(folder), end, last_lines, _sample(folder))
 
 
@@ -137,6 +140,13 @@ def _stage(folder: Path) -> str | None:
         return (folder / "stage").read_text()
     except ordinary(OSError):
         return None
+
+
+def _echoed(folder: Path) -> list[str]:
+    try:
+        return lines_of_echo((folder / ECHO).read_bytes())
+    except ordinary(OSError):
+        return []
 
 
 def _sample(folder: Path) -> bytes | None:

@@ -24,7 +24,6 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.base import FloatArray, Pool, StatusArray
-from fmugym.pool.extension import has_native_pool
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
@@ -200,7 +199,7 @@ def disturb_in_threads(
         FMULoadError: If the FMU cannot be loaded.
         LicenceError: If an instance gets no licence.
     """
-    if not has_native_pool() or candidate.open().in_wine:
+    if candidate.open().in_wine:
         return False  # one thread steps all instances
     spec = replace(
         _with_long_calls(spec, step_seconds),
@@ -261,7 +260,7 @@ class _Life:
     def __init__(self, fmu: FMU, spec: PoolSpec, starts: Starts, index: int) -> None:
         self._variables, self._values = starts.variables, starts.apart().column(index)
         self._inputs = _inputs_of_two(spec, 1.0)[index, :_CALLS]
-        self._pool = local_pool(_lent(fmu), spec, 1, logger, native=True, threads=1)
+        self._pool = local_pool(_lent(fmu), spec, 1, logger, threads=1)
         self.end = self._pool.close
 
     def play(self, barrier: threading.Barrier | None = None) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -20,6 +21,7 @@ from fmugym.errors import (
     unknown_name,
 )
 from fmugym.pool.attendant import Attendant
+from fmugym.pool.backend.by_fmpy import fmpy_pool
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
@@ -57,7 +59,7 @@ _BLIND: Final = (
     "%s cannot be read before its first step: until then, its outputs have the start values of the "
     "model description"
 )
-_NAMES = ("auto", "fmu", "native", "python")
+_NAMES = ("auto", "fmpy", "fmu", "native", "python")
 
 
 def make_pool(
@@ -84,15 +86,16 @@ def make_pool(
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        backend: ``"native"``, ``"python"``, or ``"auto"`` (also ``"fmu"``): native if the
-            extension was built. Or an object that replaces the FMU; see ``BackendPool``.
+        backend: ``"native"``, ``"fmpy"`` (see ``fmpy_pool``), or ``"auto"`` (also ``"fmu"``):
+            native if the extension was built. Or an object that replaces the FMU; see
+            ``BackendPool``.
         starts: The start values of two episodes, for the trial of resets.
         reset_method: One of ``ResetMethod``; by default the fastest one that gives correct
             results in the trial.
-        threads: See ``NativePool``; the Python pool has one thread. By default one if instances
-            disturb each other when they run at the same time.
+        threads: See ``NativePool``; FMPy has one thread. By default one if instances disturb each
+            other when they run at the same time.
         private_libraries: See ``NativePool``; by default True if two instances disturb each other
-            in the trial. The Python pool has one library.
+            in the trial. With FMPy each always has one.
         isolation: ``"process"`` for worker processes, ``"none"`` for this process. By default this
             process, unless the FMU says that it can be instantiated only once per process, or
             instances disturb each other and private libraries do not help.
@@ -112,9 +115,13 @@ def make_pool(
             fmu.close()
             raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
         return BackendPool(fmu, spec, num_instances, backend)
-    native = _is_native(backend)
-    plan = Plan(native, reset_method, threads, private_libraries, isolation, workers)
-    plan = plan.checked(fmu, backend)
+    backend = _chosen(backend)
+    if backend == "fmpy":
+        return fmpy_pool(
+            fmu, spec, num_instances, log, reset_method=reset_method, isolation=isolation
+        )
+    plan = Plan(reset_method, threads, private_libraries, isolation, workers)
+    plan = plan.checked(fmu)
     timeout = math.inf
     if call_timeout is not None:
         timeout = check_number("call_timeout", call_timeout, positive=True)
@@ -182,7 +189,6 @@ def _open_now(
             spec,
             num_instances,
             log,
-            native=plan.native,
             workers=plan.workers,
             threads=plan.threads,
             own_files=plan.own_files,
@@ -196,7 +202,6 @@ def _open_now(
         spec,
         num_instances,
         log,
-        native=plan.native,
         threads=plan.threads,
         private_libraries=plan.private_libraries,
         mark=_mark(Candidate.of(fmu)),
@@ -234,7 +239,7 @@ def _rehearse(
     def keep(found: Verdict) -> None:
         revise(candidate, tried, starts, found)
 
-    pool.rehearse_with(Repetition(candidate, spec, verdict, plan.native, keep, log))
+    pool.rehearse_with(Repetition(candidate, spec, verdict, keep, log))
 
 
 @dataclass(frozen=True)
@@ -274,14 +279,19 @@ def _tried(spec: PoolSpec) -> PoolSpec:
     return replace(spec, num_observed=0, leak_limit=None, fault_retries=0, blind_start=False)
 
 
-def _is_native(backend: str) -> bool:
+def _chosen(backend: str) -> str:
+    """The way to step the FMU: ``"native"`` or ``"fmpy"``."""
     if backend not in _NAMES:
         raise unknown_name("backend", backend, _NAMES)
     if backend == "native" and not has_native_pool():
         raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
+    if backend == "python":
+        warnings.warn("backend='python' means 'fmpy' now: say so", FutureWarning, stacklevel=3)
+        return "fmpy"
     if backend in ("auto", "fmu") and not has_native_pool():
         warn_of_slow_path()
-    return backend != "python" and has_native_pool()
+        return "fmpy"
+    return "fmpy" if backend == "fmpy" else "native"
 
 
 def _tell_of_reading(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:

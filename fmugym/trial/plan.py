@@ -23,7 +23,6 @@ __all__ = ["Plan", "is_alone"]
 class Plan:
     """How to open a pool: the caller's demands, completed with the results of a trial."""
 
-    native: bool
     reset_method: str | None = None
     threads: int | None = None
     private_libraries: bool | None = None
@@ -33,7 +32,7 @@ class Plan:
     one_initialization: bool = False
     own_files: bool = False
 
-    def checked(self, fmu: FMU, backend: str) -> Plan:
+    def checked(self, fmu: FMU) -> Plan:
         """Refuse unknown names; in Wine, refuse what is not possible there."""
         if self.isolation not in (None, *ISOLATIONS):
             raise unknown_name("isolation", self.isolation, ISOLATIONS)
@@ -42,8 +41,8 @@ class Plan:
         if not fmu.in_wine:
             _prepare_components(fmu)
             return self
-        _prepare_wine(fmu, backend, self.private_libraries, self.isolation)
-        return replace(self, native=True, threads=1, private_libraries=None, isolation="process")
+        _prepare_wine(fmu, self.private_libraries, self.isolation)
+        return replace(self, threads=1, private_libraries=None, isolation="process")
 
     @property
     def method(self) -> ResetMethod:
@@ -116,13 +115,13 @@ class Plan:
 
     @property
     def _can_copy_libraries(self) -> bool:
-        return self.native and self.isolation is None
+        return self.isolation is None
 
     def _with_means_of_reset(self, num_instances: int) -> Plan:
         """Provide the private libraries or the processes that the reset method needs."""
         method = self.method
         reloads = ResetMethod.LIBRARY in (method, *self.component_resets)
-        if reloads and (self.isolation == "process" or not self.native):
+        if reloads and self.isolation == "process":
             method = ResetMethod.PROCESS
         elif reloads:
             return replace(self, private_libraries=True)
@@ -132,16 +131,13 @@ class Plan:
         return replace(self, reset_method=method)
 
 
-def _prepare_wine(
-    fmu: FMU, backend: str, private_libraries: bool | None, isolation: str | None
-) -> None:
+def _prepare_wine(fmu: FMU, private_libraries: bool | None, isolation: str | None) -> None:
     """Refuse what is not possible in Wine, and make ready what every worker needs.
 
     Raises:
         FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
     """
     wishes = {
-        "backend='python'": backend == "python",
         "private_libraries": private_libraries,
         "isolation='none'": isolation == "none",
         "preload": fmu.preload,

@@ -22,7 +22,6 @@ def trial_pool(
     num_instances: int,
     log: logging.Logger,
     *,
-    native: bool | None = None,
     private_libraries: bool = False,
 ) -> SavingPool:
     """Make a pool in this process, or in one in Wine if the FMU's library runs only there.
@@ -32,12 +31,11 @@ def trial_pool(
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        native: See ``local_pool``.
         private_libraries: See ``NativePool``.
 
     Raises:
         LicenceError: If the FMU gets no licence.
-        FMULoadError: As ``local_pool``; or if Python or private libraries are wanted in Wine.
+        FMULoadError: As ``local_pool``; or if private libraries are wanted in Wine.
     """
     if not fmu.in_wine:
         return local_pool(
@@ -45,11 +43,10 @@ def trial_pool(
             spec,
             num_instances,
             log,
-            native=native,
             threads=1,
             private_libraries=private_libraries,
         )
-    if native is False or private_libraries:
+    if private_libraries:
         fmu.close()
         raise FMULoadError(f"{fmu.path.name} runs in Wine, with one native library a process")
     return _pool_in_wine(fmu, spec, num_instances, log)

@@ -64,7 +64,6 @@ class Repetition:
         candidate: The FMU.
         spec: That of the pool that records.
         verdict: That of the trial.
-        native: Whether the spare is stepped by the native pool.
         revise: Keeps a new verdict for later environments.
         log: Is warned if episodes do not begin anew.
     """
@@ -74,12 +73,11 @@ class Repetition:
         candidate: Candidate,
         spec: PoolSpec,
         verdict: Verdict,
-        native: bool,
         revise: Callable[[Verdict], None],
         log: logging.Logger,
     ) -> None:
         self._candidate, self._spec, self._verdict = candidate, spec, verdict
-        self._native, self._revise, self._log = native, revise, log
+        self._revise, self._log = revise, log
         self._crash = ""
 
     def __call__(self, tape: Tape, begin_by: Callable[[ResetMethod], bool]) -> bool:
@@ -115,7 +113,6 @@ class Repetition:
             spec,
             1,
             _silent,
-            native=self._native,
             workers=1,
             note_crash=self._note_crash,
         )

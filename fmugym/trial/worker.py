@@ -1,8 +1,8 @@
 """The process in which an FMU is tried for the first time; see ``fmugym.trial.trial``.
 
 It communicates through files in a private folder, so that output of the FMU cannot interfere. It
-reads ``request``, writes ``stage`` before each step, and adds to ``answer`` as results come in. It
-writes the FMU's messages to standard error at once, because the next call may be the last.
+reads ``request``, writes ``stage`` before each step, and adds to ``answer`` as results come in. The
+FMU's messages go to ``echo`` at once, because the next call may be the last.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import functools
 import json
 import logging
 import math
+import mmap
 import os
 import pickle
 import sys
@@ -24,19 +25,19 @@ from typing import Any, Final
 
 import numpy as np
 
+from fmugym import _native
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError, LicenceError
-from fmugym.fmi.instance import Instance
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
-from fmugym.pool.extension import has_native_pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
+from fmugym.pool.process.shared_memory import ECHO_SIZE
 from fmugym.pool.process.windows import ProgramCoding
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.attempt import Request, Stage, patience
+from fmugym.trial.attempt import ECHO, Request, Stage, patience
 from fmugym.trial.inputs import start_inputs
 from fmugym.trial.neighbours import default_spec, disturb_in_threads, disturb_in_turn
 from fmugym.trial.pools import trial_pool
@@ -52,6 +53,9 @@ _NO_DIALOGUES: Final = 0x0003
 
 _MOST_UNREADABLE: Final = 5
 """The most outputs that a verdict names because they cannot be read."""
+
+_SILENT: Final = logging.Logger("fmugym.trial", logging.CRITICAL + 1)
+"""Takes messages that the echo has already."""
 
 _GRACE: Final = 1.0
 """Seconds that the parent has to end this process before it ends itself."""
@@ -107,11 +111,18 @@ def main(folder: Path) -> None:
     notes.call(INITIALIZATION)
     listen(notes.call)
     notes.answer(instances=1)
+    _echo_to(folder / ECHO)
     try:
         _try(request, notes)
     except LicenceError as error:
         notes.answer(refused=str(error))
     notes.answer(finished=True, initializations=_initializations())
+
+
+def _echo_to(path: Path) -> None:
+    with path.open("wb+") as file:
+        file.truncate(ECHO_SIZE)
+        _native.echo_to(np.frombuffer(mmap.mmap(file.fileno(), ECHO_SIZE), np.uint8))
 
 
 def _try(request: Request, notes: Notes) -> None:
@@ -132,12 +143,7 @@ def _try(request: Request, notes: Notes) -> None:
 
 def _initializations() -> int:
     """How many initializations this process has begun."""
-    count: int = Instance.initializations + ProgramCoding.initializations
-    if has_native_pool():
-        from fmugym import _native
-
-        count += _native.initializations()
-    return count
+    return ProgramCoding.initializations + _native.initializations()
 
 
 def _end_after(seconds: float) -> None:
@@ -162,27 +168,21 @@ def _prepare() -> None:
 
 
 def _try_alone(request: Request, notes: Notes) -> bool:
-    """Try one instance; return whether another trial might show more of the FMU.
-
-    The trial begins in Python, where messages arrive while the FMU runs. FMPy requires every
-    function of the standard; the native pool does not.
-    """
-    for native in (False, True) if has_native_pool() else (False,):
-        try:
-            _step_once(request, native, notes)
-            return True
-        except LicenceError:
-            raise
-        except FMUGymError:  # the process is alive, and the caller will get the error too
-            continue
-    return False
+    """Try one instance; return whether another trial might show more of the FMU."""
+    try:
+        _step_once(request, notes)
+    except LicenceError:
+        raise
+    except FMUGymError:  # the process is alive, and the caller will get the error too
+        return False
+    return True
 
 
-def _step_once(request: Request, native: bool, notes: Notes) -> None:
+def _step_once(request: Request, notes: Notes) -> None:
     fmu = request.candidate.open()
     spec = default_spec(fmu)
     notes.stage("loading and instantiation")
-    pool = trial_pool(fmu, spec, 1, _Echo("fmu", logging.WARNING), native=native)
+    pool = trial_pool(fmu, spec, 1, _SILENT)
     try:
         _reset_and_step(pool, spec, notes)
     finally:
@@ -305,7 +305,7 @@ def _methods(request: Request) -> list[ResetMethod]:
 
 
 def _can_copy_libraries(fmu: FMU) -> bool:
-    return has_native_pool() and not fmu.in_wine
+    return not fmu.in_wine
 
 
 def _try_several(request: Request, notes: Notes, alone: Verdict) -> None:
@@ -409,13 +409,6 @@ def _without_reloading(spec: PoolSpec) -> PoolSpec:
     """Instances that share a library, or this process, can only be made anew themselves."""
     reloads = spec.reloads or spec.reset_method is ResetMethod.PROCESS
     return spec.beginning_by(ResetMethod.INSTANCE) if reloads else spec
-
-
-class _Echo(logging.Logger):
-    """Writes every message at once, including those that its level would drop."""
-
-    def log(self, level: int, msg: object, *args: object, **_: Any) -> None:
-        os.write(2, f"{str(msg) % args}\n".encode(errors="replace"))
 
 
 if __name__ == "__main__":

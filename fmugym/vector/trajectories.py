@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -225,11 +224,10 @@ def _require_starts(env: FMUEnv, states: States, obstacle: str) -> None:
 def _by_directional_derivatives(
     envs: FMUVectorEnv, start: Snapshot, nominal: npt.NDArray[Any], states: States
 ) -> Matrices:
-    """Play the trajectory with an instance in Python or Wine, in this process or in a worker."""
+    """Play the trajectory with an instance of its own, and ask that for derivatives."""
     env = envs._maker.make()
     try:
-        opening = env._opening if env.fmu.in_wine else replace(env._opening, backend="python")
-        env._use(opening.open(1, rehearse=False))
+        env._use(env._opening.open(1, rehearse=False))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)

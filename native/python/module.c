@@ -8,8 +8,6 @@
 #include "texts.h"
 #include "threads.h"
 
-PyObject *closed_error;
-
 /* The memory of the echo. It belongs to the whole process. */
 static Py_buffer echo;
 

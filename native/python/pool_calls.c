@@ -3,14 +3,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "derivatives.h"
 #include "python.h"
-
-bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
-    if (given != expected) {
-        PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd", expected, given);
-    }
-    return given == expected;
-}
 
 /* A call and its result. */
 typedef struct {
@@ -224,6 +218,59 @@ PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return done && report_messages(self) ? PyLong_FromSsize_t(writing.failed) : NULL;
 }
 
+typedef struct {
+    Question question;
+    Matrix inputs;
+    double *derivatives;
+    ptrdiff_t failed;
+} Asked;
+
+static void do_differentiate(PyPool *self, bool alone, void *context) {
+    Asked *a = context;
+    (void)alone;
+    a->failed = pool_differentiate(&self->pool, a->inputs, &a->question, a->derivatives);
+}
+
+/* The variables of a part have the functions of its FMU, so that is_access does not fit. */
+static bool take_question(PyPool *self, PyObject *const *args, Question *question) {
+    const System *system = self->pool.settings.system;
+    const Py_ssize_t part = PyLong_AsSsize_t(args[1]);
+
+    if (PyErr_Occurred()) {
+        return false;
+    }
+    if (part < 0 || (size_t)part >= (system == NULL ? 1 : system->count)) {
+        PyErr_Format(PyExc_ValueError, "there is no part %zd", part);
+        return false;
+    }
+    if (!PyObject_TypeCheck(args[2], access_type) || !PyObject_TypeCheck(args[3], access_type)) {
+        PyErr_SetString(PyExc_TypeError, "expected an Access");
+        return false;
+    }
+    *question = (Question){.adjoint = args[0] == Py_True,
+                           .part = (size_t)part,
+                           .seeded = &((PyAccess *)args[2])->access,
+                           .others = &((PyAccess *)args[3])->access};
+    return true;
+}
+
+PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    Py_buffer derivatives;
+    Asked asked = {.inputs = matrix_of(&self->buffers[INPUTS]), .failed = -1};
+
+    if (!has_arguments(nargs, 5) || !take_question(self, args, &asked.question) ||
+        !take_matrix(args[4], &derivatives, WRITTEN, "derivatives", ITEM_FLOAT64,
+                     (Py_ssize_t)(asked.question.seeded->count * asked.question.others->count),
+                     (Py_ssize_t)self->pool.settings.count)) {
+        return NULL;
+    }
+    asked.derivatives = derivatives.buf;
+    const bool done = perform(self, NEVER_SHORT, do_differentiate, &asked);
+    PyBuffer_Release(&derivatives);
+    return done && report_messages(self) ? PyLong_FromSsize_t(asked.failed) : NULL;
+}
+
 /* Queries */
 
 typedef struct {
@@ -267,7 +314,7 @@ PyObject *py_failure(PyObject *object, PyObject *argument) {
     const Failure *f = &asking.failure;
     PyObject *result =
         Py_BuildValue("sOidINNz", f->doing, f->in_warm_up ? Py_True : Py_False, f->status, f->time,
-                      (unsigned)f->string_reference, decode(f->said), values_of(f), f->part);
+                      (unsigned)f->reference, decode(f->said), values_of(f), f->part);
     free(f->said);
     free(f->values);
     return result;

@@ -87,6 +87,8 @@ enum { ALWAYS_SHORT = -1, NEVER_SHORT = -2 };
 /* Does some work. length is one of the operations of pool.h, whose duration the pool knows, or
  * one of the constants above. Returns false with an exception if the pool cannot be entered. */
 bool perform(PyPool *self, int length, Work *work, void *context);
+/* Sets the exception of an entry that was refused. Returns whether it was not. */
+bool explain_entry(Entry entry);
 
 /* Passes the messages of FMUs to Python. Returns false with an exception if that was
  * interrupted. */
@@ -102,6 +104,7 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);

@@ -3,6 +3,7 @@
 #include "answers.h"
 
 #include <stdlib.h>
+#include <string.h>
 
 /* Kinds of errors: a sentence, or why the last status of an instance was bad. */
 enum { ERROR_TEXT, ERROR_FAILURE };
@@ -59,7 +60,7 @@ void write_failure(Worker *w, Writer *writer, size_t index) {
         write_integer(writer, failure.in_warm_up);
         write_integer(writer, failure.status);
         write_number(writer, failure.time);
-        write_integer(writer, failure.string_reference);
+        write_integer(writer, failure.reference);
         write_text(writer, failure.said);
         write_integer(writer, failure.values != NULL);
         write_block(writer, failure.values, failure.number_of_values * sizeof(double));
@@ -76,4 +77,17 @@ void send_failure(Worker *w, size_t index) {
     write_failure(w, &writer, index);
     send_content(CODE_ERROR, writer.bytes, writer.size);
     free(writer.bytes);
+}
+
+void worker_publish(Worker *w) {
+    const Shared *shared = &w->shared;
+    const size_t count = w->settings.count;
+
+    for (size_t i = 0; i < w->outputs.count; i++) {
+        memcpy(shared->outputs + i * shared->stride, w->output_values + i * count,
+               count * sizeof(double));
+    }
+    memcpy(shared->observations, w->observations,
+           count * w->settings.num_observed * sizeof(float));
+    memcpy(shared->statuses, w->statuses, count);
 }

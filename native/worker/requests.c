@@ -3,10 +3,10 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "../derivatives.h"
 #include "../records.h"
 #include "../texts.h"
 #include "answers.h"
-#include "derivatives.h"
 
 /* Windows' own header of this function needs another library. */
 typedef struct {
@@ -39,19 +39,6 @@ enum {
 };
 
 /* Steps */
-
-void worker_publish(Worker *w) {
-    const Shared *shared = &w->shared;
-    const size_t count = w->settings.count;
-
-    for (size_t i = 0; i < w->outputs.count; i++) {
-        memcpy(shared->outputs + i * shared->stride, w->output_values + i * count,
-               count * sizeof(double));
-    }
-    memcpy(shared->observations, w->observations,
-           count * w->settings.num_observed * sizeof(float));
-    memcpy(shared->statuses, w->statuses, count);
-}
 
 static Matrix shared_inputs(const Worker *w) {
     return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
@@ -215,7 +202,7 @@ static void answer_question(Worker *w, const Question *question) {
     double *derivatives = memory_for(NULL, size);
 
     pool_enter(&w->pool);
-    const ptrdiff_t failed = worker_differentiate(w, question, derivatives);
+    const ptrdiff_t failed = pool_differentiate(&w->pool, shared_inputs(w), question, derivatives);
     pool_leave(&w->pool);
     worker_report(w);
     if (failed >= 0) {
@@ -232,7 +219,7 @@ static void answer_differentiate(Worker *w, Reader *reader) {
 
     if (read_access(reader, w->settings.fmi, &seeded) &&
         read_access(reader, w->settings.fmi, &others)) {
-        const Question question = {adjoint, &seeded, &others};
+        const Question question = {adjoint, 0, &seeded, &others};
         answer_question(w, &question);
     } else {
         send_error("a list of variables is damaged");

@@ -137,11 +137,11 @@ int fmi3GetIntervalFraction(Model *me, const unsigned *references, size_t count,
     REQUIRE(count == 1 && references[0] >= CALCULATED && references[0] <= COUNTDOWN);
     qualifiers[0] = 2;
     if (references[0] == CALCULATED) {
-        counters[0] = me->bad_counter > 0.0 ? (uint64_t)me->bad_counter : 1;
-        resolutions[0] = me->bad_counter > 0.0 ? 0 : 3;
+        counters[0] = me->bad_counter > 0.0 ? (uint64_t)me->bad_counter : SCALE;
+        resolutions[0] = me->bad_counter > 0.0 ? 0 : 3 * SCALE;
     } else if (references[0] == TUNABLE) {
-        counters[0] = 1;
-        resolutions[0] = fmod(me->count[TUNABLE], 2.0) == 0.0 ? 3 : 4;
+        counters[0] = SCALE;
+        resolutions[0] = (fmod(me->count[TUNABLE], 2.0) == 0.0 ? 3 : 4) * SCALE;
     } else if (references[0] == CHANGING) {
         counters[0] = 1 + (uint64_t)me->count[CHANGING];
         resolutions[0] = 30;

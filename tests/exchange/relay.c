@@ -1,11 +1,11 @@
 /* Moves up and down between two limits. It asks for its events after complete steps, and to stop
-   after so many turns. */
+   after so many turns. It counts the steps. */
 
 #include "exchange.h"
 
 const size_t STATES = 1, INDICATORS = 0;
 
-enum { X, DER_X, TURNS, LAST, SPEED };
+enum { X, DER_X, TURNS, LAST, SPEED, STEPS };
 
 void model_start(Model *me) {
     me->v[LAST] = 1e9;
@@ -21,6 +21,7 @@ static bool is_beyond(const Model *me) {
 }
 
 void model_complete(Model *me) {
+    me->v[STEPS]++;
     me->wants_event = is_beyond(me);
     me->stops = me->v[TURNS] >= me->v[LAST];
 }

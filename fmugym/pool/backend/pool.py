@@ -23,6 +23,7 @@ from fmugym.pool.backend.pacing import Paced, Schedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.health import Column, CountedPool, no_counts, note
 from fmugym.pool.spec import is_start_time
 from fmugym.signals import ordinary
@@ -50,17 +51,21 @@ class BackendPool(CountedPool):
             or a `Paced` one. The function may have the methods ``open`` and ``close`` for something
             that the backends share. ``open`` is called before each reset, ``close`` after all
             backends have stopped.
+        is_real: Whether a step may move real hardware. What does not is called in the caller's
+            thread, and episodes begin at the time of the config.
 
     Raises:
         ConfigError: If a backend lacks a method, or if there are not N of them.
     """
 
-    def __init__(self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any) -> None:
+    def __init__(
+        self, fmu: FMU, spec: PoolSpec, num_instances: int, backend: Any, *, is_real: bool = True
+    ) -> None:
         if spec.samplings and not getattr(backend, "samples_outputs", False):
             fmu.close()
             raise ConfigError("a backend has no substeps: leave 'samplings' out of the config")
         self.num_instances = num_instances
-        self._spec = spec
+        self._spec, self._is_real = spec, is_real
         self.inputs: FloatArray = np.zeros((len(spec.inputs), num_instances))
         self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
@@ -91,7 +96,7 @@ class BackendPool(CountedPool):
         self._all = self._rigs, self._threads, self._clock, getattr(shared, "close", _nothing)
 
     def _thread(self, index: int, rig: Rig) -> Here | Worker:
-        if self.num_instances == 1 and not rig.can_hold:
+        if not self._is_real or (self.num_instances == 1 and not rig.can_hold):
             return Here()
         paced, name = self._paced, f"backend-{index}"
         if paced is None:
@@ -102,7 +107,7 @@ class BackendPool(CountedPool):
     @property
     def is_real(self) -> bool:
         """See ``Pool.is_real``; a rig may move at every step."""
-        return True
+        return self._is_real
 
     # The contract of Pool.
 
@@ -112,9 +117,9 @@ class BackendPool(CountedPool):
         """See ``Pool.reset``."""
         self._require_open()
         chosen = np.ones(self.num_instances, np.bool_) if mask is None else np.asarray(mask)
-        given = [not is_start_time(variable) for variable in variables]  # a real time begins now
+        given = [not (self._is_real and is_start_time(v)) for v in variables]  # it begins now
         values = values[given]
-        own = [variable for variable in variables if not is_start_time(variable)]
+        own = [v for v, is_given in zip(variables, given, strict=True) if is_given]
         starts = {
             index: _by_name(own, values[:, index].tolist())
             for index in np.flatnonzero(chosen).tolist()
@@ -154,7 +159,10 @@ class BackendPool(CountedPool):
                     start.get(variable.name, variable.start_number)
                     for variable in self._spec.inputs
                 ]
-            self._advance(chosen & self._is_ready)
+            running = chosen & self._is_ready
+            self._advance(running)
+            for index in np.flatnonzero(running & ~self._is_ready).tolist():
+                self._failures[index] = f"the warm-up failed: {self._failures[index]}"
 
     def step(
         self,
@@ -200,7 +208,7 @@ class BackendPool(CountedPool):
         try:
             yield
         except BaseException:
-            self.halt()
+            self._stop_all()
             raise
 
     def _take(self, index: int, outcome: Outcome) -> None:
@@ -218,13 +226,22 @@ class BackendPool(CountedPool):
 
     def save(self) -> Any:
         """Refuse: a real system cannot return to a state."""
-        raise SimulationError("a backend has no state that could be saved")
+        raise self._stateless("saved")
+
+    def save_instances(self, indices: IndexArray) -> Bundle:
+        """Refuse, as ``save`` does."""
+        raise self._stateless("saved")
 
     def restore(
         self, snapshot: Any, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """Refuse: a real system cannot return to a state."""
-        raise SimulationError("a backend has no state that could be restored")
+        raise self._stateless("restored")
+
+    def _stateless(self, done: str) -> SimulationError:
+        if self._is_real:
+            return SimulationError(f"a backend has no states that could be {done}")
+        return SimulationError(f"states are {done} by the C extension only (backend='native')")
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
@@ -263,7 +280,11 @@ class BackendPool(CountedPool):
         }
 
     def halt(self) -> None:
-        """Stop all backends, whatever they do; the next reset starts them again."""
+        """Stop all rigs, whatever they do; the next reset starts them again."""
+        if self._is_real:
+            self._stop_all()
+
+    def _stop_all(self) -> None:
         self._is_ready[:] = False
         _stop(*self._all)
 

@@ -16,7 +16,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.spec import PoolSpec
 from fmugym.signals import ordinary
 
-__all__ = ["Backend", "Outcome", "Outputs", "Rig", "describe_error"]
+__all__ = ["Backend", "FaultError", "Outcome", "Outputs", "Rig", "describe_error"]
 
 logger = logging.getLogger(__name__)
 
@@ -72,6 +72,19 @@ class Backend(Protocol):
         latest when the interpreter exits.
         """
         ...
+
+
+class FaultError(SimulationError):
+    """What a backend of an FMU raises: a fault with its status.
+
+    Args:
+        text: The reason.
+        status: A ``fmugym.Status`` worse than a warning.
+    """
+
+    def __init__(self, text: str, status: int = Status.ERROR) -> None:
+        super().__init__(text)
+        self.status = status
 
 
 class Outcome(NamedTuple):
@@ -154,7 +167,8 @@ class Rig:
             outcome = self._judged(outputs, status)
             measured = float(getattr(self._backend, "sample_time", called_at))
         except ordinary(Exception) as error:
-            outcome, measured = Outcome(Status.ERROR, None, describe_error(error)), called_at
+            status = error.status if isinstance(error, FaultError) else Status.ERROR
+            outcome, measured = Outcome(status, None, describe_error(error)), called_at
         if outcome.reason:
             name = f"{type(self._backend).__name__}.{method}"
             outcome = outcome._replace(reason=f"{name}: {outcome.reason}")

@@ -9,7 +9,7 @@ from typing import BinaryIO, Final
 
 from fmugym.errors import printable
 
-__all__ = ["OutputTail", "describe_exit", "is_crash"]
+__all__ = ["OutputTail", "describe_exit", "is_crash", "lines_of_echo"]
 
 _CRASHES: Final = ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT")
 """The signals by which a process ends if its code goes wrong."""
@@ -46,6 +46,12 @@ def is_crash(return_code: int) -> bool:
     """
     by_signal = -64 <= return_code < 0
     return not by_signal or any(describe_exit(return_code).endswith(name) for name in _CRASHES)
+
+
+def lines_of_echo(memory: bytes) -> list[str]:
+    """The last messages in memory that the C extension has echoed them to."""
+    echo = memory.partition(b"\0")[0].decode(errors="replace")
+    return [printable(line) for line in echo.splitlines()[-_LINES:]]
 
 
 class OutputTail:

@@ -1,9 +1,8 @@
 """The pool of processes: an FMU may harm its own process, but not the caller's.
 
-Each worker process has a block of the instances in a pool of its own (``NativePool`` or
-``PythonPool``) and shares its inputs and outputs through memory. A worker that dies or hangs is
-replaced. Its instances have the status ``FATAL``, with the cause, until the next reset makes them
-anew. The instances of other workers go on.
+Each worker process has a block of the instances in a ``NativePool`` of its own, and shares its
+inputs and outputs through memory. A worker that dies or hangs is replaced. Its instances have the
+status ``FATAL`` and the cause, until the next reset makes them anew. Those of other workers go on.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
-from fmugym.pool.extension import has_native_pool
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
@@ -64,7 +62,6 @@ class ProcessPool(SavingPool):
         spec: What to do at each reset and step.
         num_instances: N.
         log: The logger that gets the FMU's messages.
-        native: Whether the workers have native pools, or Python ones.
         workers: How many processes; by default one for each processor that this process may use,
             and at most N.
         threads: The most threads in each of them; by default, together one for each processor.
@@ -91,7 +88,6 @@ class ProcessPool(SavingPool):
         num_instances: int,
         log: logging.Logger,
         *,
-        native: bool = True,
         workers: int | None = None,
         threads: int | None = None,
         own_files: bool = False,
@@ -119,7 +115,7 @@ class ProcessPool(SavingPool):
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
-        setup = replace(setup, native=native, threads=threads, own_files=own_files)
+        setup = replace(setup, threads=threads, own_files=own_files)
         self._setup, self._arrays = setup, arrays
         self._plays, self._play = 0, None
         setups = _share_out(setup, self.workers)
@@ -257,7 +253,7 @@ class ProcessPool(SavingPool):
     @property
     def can_play(self) -> bool:
         """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
-        return has_native_pool() and self._setup.native and not self._spec.licence_wait
+        return not self._spec.licence_wait
 
     def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., Played]:
         """See ``Pool.prepare_play``."""

@@ -16,7 +16,7 @@ from typing import Any, Final
 from fmugym.errors import printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.channel import Channel, Code
-from fmugym.pool.process.last_words import describe_exit, is_crash
+from fmugym.pool.process.last_words import describe_exit, is_crash, lines_of_echo
 from fmugym.pool.process.launcher import Process
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
@@ -380,8 +380,7 @@ class Supervisor:
         raise LostError(self.reason)
 
     def _cause(self, text: str) -> str:
-        echo = self._echo.tobytes().partition(b"\0")[0].decode(errors="replace")
-        lines = echo.splitlines()[-_TAIL:] or list(self._tail)
+        lines = lines_of_echo(self._echo.tobytes()) or list(self._tail)
         said = quoted(as_messages(lines))
         return printable(f"{self._setup.path.name}: {text}{said}{self.printed}")
 

@@ -74,7 +74,6 @@ class Setup:
         environment: The environment variables.
         block: The indices of the worker's instances.
         number: Which of the pool's workers it is.
-        native: Whether the worker's own pool is a ``NativePool``.
         threads: See ``NativePool``.
         own_files: Whether the worker has a copy of the folder, which is also its working
             directory, because instances would share files otherwise.
@@ -94,7 +93,6 @@ class Setup:
     environment: Mapping[str, str]
     block: slice
     number: int = 0
-    native: bool = False
     threads: int = 1
     own_files: bool = False
     library: str = ""
@@ -251,8 +249,7 @@ class BlockWorker:
         arrays = make_arrays(self._memory, setup.spec, setup.num_instances)
         self._block = arrays.block(setup.block)
         self._progress = make_progress(self._memory, setup.num_instances)[setup.block]
-        if setup.native:
-            _native_echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
+        _echo_to(make_echo(self._memory, setup.spec, setup.num_instances, setup.number))
         self._pool = _make_pool(setup, log, self._block.counts)
         self._growth = ProcessGrowth(self._pool.num_instances)
         np.copyto(self._pool.outputs, self._block.outputs)  # those of the worker before
@@ -367,8 +364,8 @@ class BlockWorker:
         self._pool.close()
 
 
-def _native_echo_to(memory: npt.NDArray[np.uint8]) -> None:
-    """Keep a copy of messages: the native pool logs after a call, which may end the process."""
+def _echo_to(memory: npt.NDArray[np.uint8]) -> None:
+    """Keep a copy of messages: the pool logs after a call, which may end the process."""
     from fmugym import _native
 
     _native.echo_to(memory)
@@ -387,7 +384,6 @@ def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> Saving
         setup.spec,
         setup.block.stop - setup.block.start,
         log,
-        native=setup.native,
         threads=setup.threads,
         first_index=setup.block.start,
         counts=counts,
