@@ -16,6 +16,7 @@ RETIRED: Final = {
     "keep_initial_states": "leave it out; each instance keeps its own state after initialization",
     "max_initializations_per_second": "leave it out; 'max_instances' and 'licence_wait' stay",
     "min_step_size": "leave it out, as 'error_tolerance'",
+    "rehearsals": "leave it out; the trial alone finds how episodes begin, or give 'reset_method'",
 }
 """Keys of configs and task files and arguments of systems that are gone, and what to do now."""
 

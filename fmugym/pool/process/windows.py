@@ -35,14 +35,13 @@ from fmugym.pool.settings import (
     solving_settings,
     variable_settings,
 )
-from fmugym.pool.spec import ResetMethod, start_variables
+from fmugym.pool.spec import start_variables
 from fmugym.wine.loader import windows_path
 
 __all__ = ["REQUESTS", "ProgramCoding"]
 
 REQUESTS: Final = (
     "reset",
-    "begin_by",
     "save",
     "restore",
     "write",
@@ -271,9 +270,6 @@ class ProgramCoding:
         ProgramCoding.initializations += count - self._initializations
         self._initializations = count
         return growth
-
-    def _ask_begin_by(self, writer: _Writer, method: str) -> None:
-        writer.flags(method == ResetMethod.INSTANCE)
 
     def _answer_save(self, reader: _Reader) -> int:
         return reader.integer()
