@@ -210,10 +210,6 @@ class Arrays(TypedDict):
     observations: Array
     health: Array
 
-Recording = tuple[bytes, bytes, bytes, bytes, bytes, bytes, bytes]
-"""An episode: types and elements (see ``Access``) of the start variables, start values, first
-outputs, and rows of inputs, of outputs and of statuses."""
-
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
 
@@ -246,7 +242,6 @@ class Pool:
         count: int,
         threads: int,
         callback: Callable[[int, int, str, str], object],
-        listener: Callable[[Recording], object] | None,
     ) -> Pool: ...
     def step_own(self) -> int:
         """Step all with the pool's own inputs; writes the pool's own observations.
@@ -407,17 +402,6 @@ class Pool:
     def count_steps(self) -> None:
         """Let ``health`` have all steps until now, which it otherwise gets at resets."""
 
-    def record(self, resets: int, steps: int, /) -> None:
-        """Record an episode of the first instance, and pass it to ``listener``.
-
-        Args:
-            resets: How many more resets of this instance come first.
-            steps: How many steps it has to do in all before.
-        """
-
-    def begin_by(self, restores: bool, rebuilds: bool, /) -> None:
-        """Change how episodes begin; states that were not restored before cannot be restored."""
-
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""
 
@@ -505,10 +489,10 @@ class Pool:
     ) -> None:
         """Let an episode count as the one with these start values and inputs."""
 
-    def costs(self) -> tuple[float, float, float, float, float]:
+    def costs(self) -> tuple[float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.
 
-        They are ``step``, ``reset``, ``step_or_reset`` and ``play``, and the first ``reset``.
+        They are ``step``, ``reset``, ``step_or_reset`` and ``play``.
         """
 
     def uses_states(self) -> bool:

@@ -16,7 +16,6 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.checks import (
     check_count,
-    check_flag,
     check_mapping,
     check_number,
     check_option,
@@ -99,8 +98,6 @@ class EnvConfig:
             freed and made anew. None for no limit.
         reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
             or ``"process"``; by default the fastest one that a trial has found to be right.
-        rehearsals: Whether a spare instance plays an episode again now and then, to see whether
-            episodes still begin as they should.
         archive_limits: How large an FMU may be, an ``ArchiveLimits`` or a dict of its arguments; by
             default ``ArchiveLimits()``.
         preload: Shared libraries to load before the FMU's; a relative path is relative to the file
@@ -150,7 +147,6 @@ class EnvConfig:
     fault_reward: float = 0.0
     leak_limit: int | None = DEFAULT_LEAK_LIMIT
     reset_method: str | None = None
-    rehearsals: bool = True
     archive_limits: ArchiveLimits | None = None
     preload: tuple[str, ...] = ()
     probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
@@ -205,7 +201,6 @@ class EnvConfig:
         if self.interface is not None:
             self._set("interface", check_option("interface", self.interface, INTERFACES))
         self._set("solver", check_option("solver", self.solver, SOLVERS))
-        self._set("rehearsals", check_flag("rehearsals", self.rehearsals))
         if self.reset_method is not None:
             methods = list(map(str, ResetMethod))
             self._set("reset_method", check_option("reset method", self.reset_method, methods))

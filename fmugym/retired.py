@@ -11,9 +11,12 @@ __all__ = ["RETIRED", "without_retired"]
 _Value = TypeVar("_Value")
 
 RETIRED: Final = {
+    "error_tolerance": "give 'step_size', or 'substeps' of the environment, to make steps smaller",
     "input_interpolation": "inputs hold their values within a step; take a shorter 'time_step'",
     "keep_initial_states": "leave it out; each instance keeps its own state after initialization",
     "max_initializations_per_second": "leave it out; 'max_instances' and 'licence_wait' stay",
+    "min_step_size": "leave it out, as 'error_tolerance'",
+    "rehearsals": "leave it out; the trial alone finds how episodes begin, or give 'reset_method'",
 }
 """Keys of configs and task files and arguments of systems that are gone, and what to do now."""
 

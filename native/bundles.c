@@ -117,9 +117,6 @@ Status instance_unbundle(Pool *pool, Instance *me, const States *states, size_t 
     Status status = STATUS_OK;
 
     health_count_steps(pool, me);
-    if (index == 0) {
-        tape_drop(&pool->tape);
-    }
     record_drop(pool, index);
     put_outputs(pool, index, states, number);
     if (size == 0) { /* its episode had ended by a fault */

@@ -180,7 +180,6 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
         instance_refuse(&pool->instances[0], "out of memory");
         return 0;
     }
-    tape_drop(&pool->tape);
     for (size_t i = 0; i < pool->settings.count && failed < 0; i++) {
         Instance *me = &pool->instances[i];
         if (write_instance(pool, me, access, memory, values + i) > STATUS_WARNING) {
@@ -189,11 +188,6 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     }
     free(memory);
     return failed;
-}
-
-void pool_begin_by(Pool *pool, bool restores, bool rebuilds) {
-    pool->settings.restores = pool->settings.restores && restores;
-    pool->settings.rebuilds = rebuilds;
 }
 
 void pool_recycle(Pool *pool) {

@@ -239,37 +239,12 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     return restart(pool, me, call, again, scratch);
 }
 
-/* Recording an episode; see tape.h. */
-
-static bool is_to_be_recorded(Pool *pool, const Instance *me) {
-    const int64_t steps = health_of(pool, me)[STEPS] + me->steps - me->counted;
-
-    return index_of(pool, me) == 0 && pool->tape.state != TAPE_OFF &&
-           pool->tape.state != TAPE_READY && tape_turn(&pool->tape, steps);
-}
-
-static void record_start(Pool *pool, const Instance *me, const Call *call, Scratch scratch) {
-    const Settings *s = &pool->settings;
-
-    matrix_gather(&call->start_values, 0, call->start->count, scratch.values);
-    if (tape_begin(&pool->tape, call->start, scratch.values, s->inputs->count, s->outputs->count,
-                   me->steps)) {
-        instance_copy_outputs(pool, me, pool->tape.first_outputs);
-    }
-}
-
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch) {
-    const bool recorded = is_to_be_recorded(pool, me);
     const Status status = reset_instance(pool, me, call, scratch);
 
     if (pool->records != NULL) {
         matrix_gather(&call->start_values, index_of(pool, me), call->start->count, scratch.values);
         record_begin(pool, index_of(pool, me), call->start, scratch.values);
-    }
-    if (recorded && status <= STATUS_WARNING) {
-        record_start(pool, me, call, scratch);
-    } else if (recorded) {
-        tape_drop(&pool->tape);
     }
     return status;
 }

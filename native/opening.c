@@ -173,7 +173,6 @@ void pool_close(Pool *pool) {
     free(pool->chosen);
     free(pool->spares);
     records_close(pool);
-    tape_free(&pool->tape);
     unlink_pool(pool);
 }
 

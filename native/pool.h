@@ -16,7 +16,6 @@
 #include "methods.h"
 #include "platform.h"
 #include "play.h"
-#include "tape.h"
 
 /* What a step gives of the values that an output has after each of its substeps.
  * fmugym/pool/spec.py lists their names in this order. */
@@ -152,8 +151,7 @@ enum { SAMPLES = 8 };
 /* The measured cost of an operation: a low quantile of the last samples. Other load on the
  * machine makes some samples much too high, but none too low. */
 typedef struct {
-    double low;   /* ns per instance; 0 until it is known */
-    double first; /* the first sample: later resets may restore states */
+    double low; /* ns per instance; 0 until it is known */
     double samples[SAMPLES];
     uint32_t taken;
     uint32_t calls;
@@ -188,7 +186,6 @@ typedef struct Pool {
     Records *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
-    Tape tape;
     Atomic states_too_large;
     Atomic deaf;     /* whether the FMU has refused the categories of its own */
     Atomic heard;    /* how often an instance was asked to log everything */
@@ -261,9 +258,6 @@ void pool_count_steps(Pool *pool);
 
 /* Marks each instance for replacement by a new one at its next reset. */
 void pool_recycle(Pool *pool);
-
-/* Changes how episodes begin from now on. */
-void pool_begin_by(Pool *pool, bool restores, bool rebuilds);
 
 /* What became of the episodes in a step that plays. */
 typedef struct {

@@ -16,9 +16,6 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
         return instance_unbundle(task->pool, me, task->states, number);
     }
     health_count_steps(task->pool, me);
-    if (index == 0) {
-        tape_drop(&task->pool->tape);
-    }
     record_drop(task->pool, index);
     const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
     if (status > STATUS_WARNING) {
@@ -369,11 +366,6 @@ static size_t do_each(Task *task, size_t begin, size_t count, Scratch scratch) {
     return troubled;
 }
 
-static void record_step(Pool *pool, Scratch scratch) {
-    tape_add(&pool->tape, scratch.inputs, scratch.outputs, pool->settings.status[0],
-             pool->instances[0].steps);
-}
-
 /* Handles outputs of which some are not finite, or too large for the observations of a float32.
  * The latter are a fault of the episode. */
 static size_t take_not_small(Task *task, size_t begin, size_t count, double *outputs) {
@@ -398,9 +390,6 @@ static size_t hand_out(Task *task, size_t begin, size_t count, Scratch scratch,
         all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT);
     if (!*fits_floats) {
         troubled = take_not_small(task, begin, count, scratch.outputs);
-    }
-    if (begin == 0 && task->pool->tape.state == TAPE_RECORDING) {
-        record_step(task->pool, scratch);
     }
     if (task->call->observations != NULL) {
         write_observations(task, begin, count, scratch.outputs);

@@ -124,7 +124,6 @@ static double low_quantile(const Cost *cost) {
 }
 
 static void add_sample(Cost *cost, double sample) {
-    cost->first = cost->taken == 0 ? sample : cost->first;
     cost->samples[cost->taken++ % SAMPLES] = sample;
     cost->low = low_quantile(cost);
 }

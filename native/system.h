@@ -101,30 +101,10 @@ typedef struct {
     const char *label;
 } Transfer;
 
-/* How the sizes of steps follow from an estimate of the error; see system_control.c. */
-typedef struct {
-    double tolerance; /* 0 for steps of one size */
-    double smallest;  /* step size, or 0 */
-    const uint32_t *sources; /* the slots of the outputs that are compared */
-    const double *nominals;
-    size_t count;
-} StepControl;
-
-/* Slots of outputs that the master fills; fmugym/systems/plan.py lists their names. */
-enum {
-    COUNT_OF_STEPS,
-    COUNT_OF_REJECTIONS,
-    NEXT_SIZE,
-    WORST_ERROR,
-    ERROR_OF_FIRST /* and those of all others that are compared */
-};
-
 typedef struct System {
     Component *parts;
     size_t count;
     size_t inputs, outputs; /* numbers of slots */
-    size_t first_statistic; /* the first slot of the master's own outputs */
-    StepControl control;
     Route *routes;          /* sorted by the parts of their targets */
     size_t number_of_routes;
     PartGroup *groups;
@@ -196,8 +176,6 @@ typedef struct {
     uint64_t environment; /* of the first part */
     bool logging;
     bool hears, has_chosen; /* whether the parts are asked for messages, if they were told */
-    void *beginning; /* the state before a step whose error is estimated */
-    double *coarse;  /* the values after a step that is repeated by halves; then scratch memory */
     double *loop, *typed, *whole; /* scratch memory: of loops; for the values of a part */
     Pending *pending;
     size_t number_pending, room;
@@ -232,12 +210,6 @@ Status system_solve(Composite *me, const PartGroup *group, Span span);
 void system_end_ticks(Composite *me);
 /* Steps of many systems, see system_exchange.c. */
 bool system_exchange(const Library *library, const Exchange *e);
-/* One step without an estimate of its error. */
-Status system_step_once(Composite *me, double time, double step, bool no_return);
-/* As many steps as the tolerance needs. */
-Status system_step_controlled(Composite *me, double time, double step);
-/* Frees the state before the last step. */
-void control_forget(Composite *me);
 Status system_do_step(const Library *library, void *component, double time, double step,
                       bool no_return);
 Status system_reset(const Library *library, void *component);

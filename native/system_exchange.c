@@ -2,7 +2,7 @@
  *
  * A part of one system after that of another runs the same code of the same FMU, and one call of
  * exchange does all of these steps. Each instance of an FMU gets the same calls in the same order as
- * in system_step_once. */
+ * in system_do_step. */
 
 #include "system.h"
 
@@ -262,8 +262,7 @@ static const Fmi one_by_one = {.set = system_set, .do_step = system_do_step, .ge
 
 bool system_exchange(const Library *library, const Exchange *e) {
     const System *s = ((const Composite *)e->components[0])->system;
-    const bool fits = s->control.tolerance == 0.0 &&
-                      has_slots(s, e->input_references, e->number_of_inputs, true) &&
+    const bool fits = has_slots(s, e->input_references, e->number_of_inputs, true) &&
                       has_slots(s, e->output_references, e->number_of_outputs, false);
 
     return fits ? exchange_together(e, s) : exchange_by(&one_by_one, library, e);

@@ -94,7 +94,6 @@ static void free_arrays(Composite *me) {
     free((void *)me->parts.before);
     free(me->parts.names);
     free_start(me);
-    free(me->coarse);
     free(me->loop);
     free(me->typed);
     free(me->pending);
@@ -107,12 +106,11 @@ static bool allocate(Composite *me, const System *s) {
     me->parts.failed = calloc(s->count, sizeof(bool));
     me->parts.before = calloc(s->count, sizeof(void *));
     me->parts.names = calloc(s->count, LOG_NAME);
-    me->coarse = calloc(ERROR_OF_FIRST + 2 * s->control.count, sizeof(double));
     me->loop = calloc(s->memory + 1, sizeof(double));
     me->typed = calloc(2 * (s->scratch + 1), sizeof(double));
     me->whole = me->typed == NULL ? NULL : me->typed + s->scratch + 1;
     return me->parts.dead != NULL && me->parts.started != NULL && me->parts.failed != NULL &&
-           me->coarse != NULL && me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
+           me->parts.before != NULL && me->parts.names != NULL && me->loop != NULL &&
            me->typed != NULL && allocate_start(me);
 }
 
@@ -206,9 +204,6 @@ void system_free(const Library *library, void *component) {
         me->parts.dead != NULL && me->parts.before != NULL && me->kept.states != NULL;
 
     (void)library;
-    if (complete) {
-        control_forget(me);
-    }
     for (size_t i = 0; complete && i < me->system->count; i++) {
         const Fmi *fmi = me->system->parts[i].fmi;
         if (me->components[i] != NULL && !me->parts.dead[i]) {

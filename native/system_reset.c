@@ -73,9 +73,6 @@ static Status begin_anew(Composite *me, size_t index) {
 static Status begin_all_anew(Composite *me) {
     Status worst = STATUS_OK;
 
-    if (me->system->renews) {
-        control_forget(me);
-    }
     for (size_t i = 0; i < me->system->count; i++) {
         const Status status = begin_anew(me, i);
         worst = status > worst ? status : worst;

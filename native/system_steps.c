@@ -167,10 +167,14 @@ void system_end_ticks(Composite *me) {
     }
 }
 
-Status system_step_once(Composite *me, double time, double step, bool no_return) {
+Status system_do_step(const Library *library, void *component, double time, double step,
+                      bool no_return) {
+    Composite *me = component;
     const System *s = me->system;
     const Span span = {time, step, no_return};
 
+    (void)library;
+    me->kept.stepped = true;
     me->blamed = NULL;
     me->terminated = false;
     Status status = me->is_fresh ? STATUS_OK : system_refresh(me);
@@ -186,14 +190,4 @@ Status system_step_once(Composite *me, double time, double step, bool no_return)
     }
     me->is_fresh = goes_on(status);
     return goes_on(status) && me->terminated ? STATUS_TERMINATED : status;
-}
-
-Status system_do_step(const Library *library, void *component, double time, double step,
-                      bool no_return) {
-    Composite *me = component;
-
-    (void)library;
-    me->kept.stepped = true;
-    return me->system->control.tolerance > 0.0 ? system_step_controlled(me, time, step)
-                                               : system_step_once(me, time, step, no_return);
 }

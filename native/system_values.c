@@ -178,8 +178,7 @@ static Status get_one(Composite *me, uint32_t reference, double *value) {
     if (end == NULL) {
         return STATUS_ERROR;
     }
-    const bool is_own = end->output >= (int64_t)me->system->first_statistic;
-    if (end->output >= 0 && (me->is_fresh || is_own)) {
+    if (end->output >= 0 && me->is_fresh) {
         *value = me->outputs[end->output];
     } else if (end->input >= 0) {
         *value = me->inputs[end->input];

@@ -70,8 +70,6 @@ def make_system(rng, fmus):
     names, faults = NAMES[: len(versions)], rng.random() < 0.4
     parts = {n: component(rng, fmus[v], faults) for n, v in zip(names, versions, strict=True)}
     options = {"master": rng.choice(("jacobi", "gauss_seidel"))}
-    if rng.random() < 0.4:
-        options |= {"error_tolerance": 10 ** rng.uniform(-4, 0), "min_step_size": 0.01}
     options["loops"] = rng.choice(("newton", "fixed_point"))
     return FMUSystem(parts, connections(rng, names), **options), versions
 

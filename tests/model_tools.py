@@ -15,7 +15,7 @@ GAIN_VARIABLES = (
     ("y", "output", ""),
     ("gain", "parameter", 'start="1"'),
 )
-"""Those of ``demanding.c`` and ``tires.c``."""
+"""Those of ``demanding.c``."""
 
 
 def model_fmu(path, model, version, token, variables, definitions=(), add=None, **description):

@@ -361,7 +361,6 @@ def systems():
     for methods in (("restore", "instance", "restore"), ("reset", "restore", "reset")):
         own = {"component_resets": tuple(map(ResetMethod, methods))}
         yield FMUSystem(paths, links), names, ["a.m_cart"], own
-    yield FMUSystem(paths, links, error_tolerance=1e-3), names, ["a.m_cart"], {}
 
 
 def recipes(folder, with_python):

@@ -109,7 +109,7 @@ def write(made, path):
     for one in made.connections:
         own = {} if one.convert_units else {"suppressUnitConversion": "true"}
         wires.append(connection(one.source, one.target, linear(one.gain, one.offset), **own))
-    names = ("master", "step_size", "error_tolerance")
+    names = ("master", "step_size")
     given = {name: value for name, value in made.arguments().items() if name in names}
     more = note(**{name: value for name, value in given.items() if value is not None})
     with zipfile.ZipFile(path, "w") as archive:

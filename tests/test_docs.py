@@ -206,7 +206,7 @@ def test_table_of_vector_arguments_has_every_argument():
     own = inspect.signature(fmugym.FMUVectorEnv.__init__).parameters
     pool = inspect.signature(make_pool).parameters
     pool_options = {name for name, p in pool.items() if p.kind is p.KEYWORD_ONLY} | {"backend"}
-    pool_options -= {"starts", "rehearse", "spare"}  # of the environment itself
+    pool_options -= {"starts", "spare"}  # of the environment itself
     assert documented == set(own) - {"self", "make_env", "pool_options"} | pool_options
 
 

@@ -200,8 +200,8 @@ class TestComponents:
             Component(HOUSE, interface="cosimulation")
 
     def test_unknown_arguments_are_refused_with_the_nearest_name(self):
-        with pytest.raises(ArgumentError, match=r"FMUSystem.*'error_tolerence'.*'error_tolerance'"):
-            FMUSystem({"h": HOUSE}, error_tolerence=1e-3)
+        with pytest.raises(ArgumentError, match=r"FMUSystem.*'loop_tolerence'.*'loop_tolerance'"):
+            FMUSystem({"h": HOUSE}, loop_tolerence=1e-3)
 
     def test_a_pickled_system_is_the_same(self):
         system = houses("a.Q_em -> b.Q_int", "T -> a.T_out", units={"T": "degC"}, step_size=60)

@@ -352,15 +352,6 @@ class TestCommandLine:
             drawn = picture.read_text()
             assert all(f">{name}<" in drawn for name in ("east", "west", "outside", "Q_int"))
 
-    def test_info_describes_what_cannot_run(self, tmp_path, capsys):
-        given = FMUSystem({"cart": bundled_fmu("CartPole", "1.0")}, error_tolerance=1e-3)
-        path = ssp_tools.write(given, tmp_path / "cart.ssp")
-        assert main(["info", str(path)]) == 0
-        text = capsys.readouterr().out
-        assert "does NOT run here: error_tolerance" in text
-        assert "component 'cart' cannot save its FMU state" in text
-        assert "cart.theta_dot" in text
-
     @pytest.mark.parametrize("declared", [True, False])
     def test_the_master_can_be_chosen(self, archive, task, tmp_path, capsys, declared):
         path = task()

@@ -25,7 +25,6 @@ from fmugym import (
     FMI2CSEnv,
     FMI3CSEnv,
     FMULoadError,
-    FMUSystem,
     FMUVectorEnv,
     SimulationError,
     Uniform,
@@ -208,7 +207,6 @@ def test_arguments_of_constructors_survive_copies():
     [
         (lambda true: EnvConfig.from_dict(probe_config(time_step=true)), "time_step"),
         (lambda true: EnvConfig.from_dict(probe_config(start_time=true)), "start_time"),
-        (lambda true: FMUSystem({"a": bundled_fmu("CartPole")}, error_tolerance=true), "error_tol"),
         (lambda true: Connection("a.y", "b.u", gain=true), "gain"),
         (lambda true: Component("a.fmu", steps=true), "steps"),
         (lambda true: Uniform(true, 2), "low"),

@@ -26,7 +26,6 @@ __all__ = ["describe", "fmu_of", "system_of"]
 _KEYS: Final = (
     *("components", "connections", "name", "description", "units", "master", "loops"),
     *("loop_tolerance", "loop_iterations", "step_size", "tolerance"),
-    *("error_tolerance", "min_step_size"),
 )
 _COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough", "isolate")
 _CONNECTION_KEYS: Final = ("source", "target", "gain", "offset", "convert_units")
@@ -35,8 +34,6 @@ _CHECKS: Final[dict[str, Callable[..., Any]]] = {
     "loop_iterations": check_count,
     "step_size": duration,
     "tolerance": check_number,
-    "error_tolerance": check_number,
-    "min_step_size": duration,
     "steps": check_count,
     "feedthrough": check_flag,
     "isolate": check_flag,

@@ -14,7 +14,6 @@ from fmugym.errors import SimulationError, printable
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
-from fmugym.pool.tape import Judge
 
 __all__ = [
     "DEFAULT_CALL_TIMEOUT",
@@ -309,18 +308,6 @@ class Pool(ABC):
             SimulationError: If the pool does not support it; see ``can_play``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
-
-    def rehearse_with(self, judge: Judge) -> None:
-        """Record episodes now and then, and let them be judged; see ``fmugym.pool.tape``."""
-        return
-
-    def begin_by(self, method: ResetMethod) -> bool:
-        """Let later episodes begin in another way.
-
-        Returns:
-            Whether the pool can do that.
-        """
-        return False
 
     def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes outside of a step; see ``NativePool``.

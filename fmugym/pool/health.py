@@ -8,11 +8,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.variable import Variable
-from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.fmi.status import Status
+from fmugym.pool.base import Pool
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.pool.tape import Effort, Judge, Recorder, Rehearsals, Tape
 
 __all__ = [
     "HEALTH",
@@ -82,8 +80,6 @@ class CountedPool(Pool):
 
     _spec: PoolSpec
     _counts: HealthArray
-    _rehearsals: Rehearsals | None = None
-    _recorder: Recorder | None = None
 
     @property
     def reset_method(self) -> ResetMethod:
@@ -102,81 +98,7 @@ class CountedPool(Pool):
         self._count_steps()
         columns = {name: self._counts[:, index].copy() for index, name in enumerate(HEALTH)}
         growth = np.full(len(self._counts), self._memory_growth(), np.int64)
-        count = 0 if self._rehearsals is None else self._rehearsals.count
-        rehearsals = np.full(len(self._counts), count, np.int64)
-        return columns | {"memory_growth": growth, "rehearsals": rehearsals}
-
-    # Recordings of episodes; the native pool makes its own.
-
-    def rehearse_with(self, judge: Judge) -> None:
-        """See ``Pool.rehearse_with``."""
-        self._rehearsals = Rehearsals(self, judge)
-        self.record(*self._rehearsals.next())
-
-    def record(self, resets: int, steps: int) -> None:
-        """Record an episode after so many more resets of the first instance.
-
-        Args:
-            resets: Of the first instance.
-            steps: How many steps it has to do in all before.
-        """
-        self._recorder = Recorder() if self._recorder is None else self._recorder
-        self._recorder.wait(resets, steps)
-
-    def effort(self) -> Effort:
-        """How much time the pool's calls take; only once ``rehearse_with`` was called."""
-        self._count_steps()
-        assert self._recorder is not None
-        return self._recorder.effort(self._counts[:, Column.STEPS], self._one_by_one)
-
-    @property
-    def _one_by_one(self) -> int:
-        """How many instances a call resets and steps one after the other."""
-        return self.num_instances
-
-    def _note_reset(
-        self,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray | None,
-        seconds: float,
-    ) -> None:
-        """Tell the recorder of a reset, after it."""
-        recorder = self._recorder
-        if recorder is None:
-            return
-        recorder.note_reset(seconds)
-        if not (mask is None or mask[0]):
-            return
-        tape = recorder.finish()
-        if tape is not None:
-            self._hand_over(tape)
-        elif recorder.turn(int(self._counts[0, Column.STEPS])):
-            if self.statuses[0] <= WARNING_CODE:
-                recorder.begin(variables, values[:, 0], self.outputs[:, 0])
-            else:
-                recorder.drop()
-
-    def _note_step(self, skip: MaskArray | None, seconds: float) -> None:
-        """Tell the recorder of a step, after it; only while it records."""
-        if self._recorder is None or (skip is not None and skip[0]):
-            return
-        self._recorder.note_step(seconds)
-        tape = self._recorder.add(self.inputs[:, 0], self.outputs[:, 0], int(self.statuses[0]))
-        if tape is not None:
-            self._hand_over(tape)
-
-    @property
-    def _is_recording(self) -> bool:
-        return self._recorder is not None and self._recorder.is_on
-
-    def _drop_recording(self) -> None:
-        if self._recorder is not None:
-            self._recorder.drop()
-
-    def _hand_over(self, tape: Tape) -> None:
-        if self._rehearsals is not None:
-            self._rehearsals.receive(tape)
+        return columns | {"memory_growth": growth}
 
     def forget_health(self) -> None:
         """See ``Pool.forget_health``."""

@@ -38,9 +38,9 @@ from fmugym.pool.base import (
     names_of,
 )
 from fmugym.pool.bundle import Bundle, IndexArray, Record
-from fmugym.pool.callbacks import Listener, Receiver
+from fmugym.pool.callbacks import Receiver
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import Column, HealthArray, no_counts
+from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.mark import Mark
 from fmugym.pool.private_libraries import copy_libraries
@@ -58,9 +58,8 @@ from fmugym.pool.settings import (
     table_of,
     variable_settings,
 )
-from fmugym.pool.spec import ResetMethod, start_variables
+from fmugym.pool.spec import start_variables
 from fmugym.pool.systems import system_settings
-from fmugym.pool.tape import TAPE_ROWS, Effort, Judge
 from fmugym.signals import ordinary
 from fmugym.systems.description import SystemDescription
 from fmugym.systems.layout import Layout
@@ -135,7 +134,6 @@ class NativePool(SavingPool):
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
         self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
-        self._listener = Listener(fmu.description, spec)
         try:
             self._pool = self._open(log, private_libraries)
         except BaseException:
@@ -192,7 +190,6 @@ class NativePool(SavingPool):
                 count=self.num_instances,
                 threads=self.threads,
                 callback=Receiver(log, description, self._first_index),
-                listener=self._listener,
             )
         except ordinary(OSError) as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
@@ -369,25 +366,6 @@ class NativePool(SavingPool):
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
 
-    def rehearse_with(self, judge: Judge) -> None:
-        """See ``Pool.rehearse_with``."""
-        super().rehearse_with(judge)
-        self._listener.rehearsals = self._rehearsals
-
-    def record(self, resets: int, steps: int) -> None:
-        """See ``CountedPool.record``."""
-        self._open_pool().record(resets, steps)
-
-    def begin_by(self, method: ResetMethod) -> bool:
-        """See ``Pool.begin_by``; libraries that instances share cannot be loaded anew."""
-        if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
-            return False
-        self._open_pool().begin_by(False, method == ResetMethod.INSTANCE)
-        self._pool.keep_records()
-        self._mistrust_states()
-        self._spec = self._spec.beginning_by(method)
-        return True
-
     def recycle(self) -> None:
         """Let each instance be replaced by a new one at its next reset."""
         self._open_pool().recycle()
@@ -499,21 +477,8 @@ class NativePool(SavingPool):
     @property
     def costs(self) -> dict[str, float]:
         """The measured time of one instance in ns by method; 0 if it is not known yet."""
-        names = ("step", "reset", "step_or_reset", "play", "first_reset")
+        names = ("step", "reset", "step_or_reset", "play")
         return dict(zip(names, self._pool.costs(), strict=True))
-
-    def effort(self) -> Effort:
-        """See ``CountedPool.effort``."""
-        self._count_steps()
-        costs = {name: 1e-9 * cost for name, cost in self.costs.items()}
-        steps = [costs[name] for name in ("step", "step_or_reset", "play") if costs[name]] or [0.0]
-        of_steps = self._counts[:, Column.STEPS]
-        of_resets = float(self._counts[:, Column.RESETS].sum()) * costs["reset"]
-        return Effort(
-            total=float(of_steps.sum()) * min(steps) + of_resets,
-            episode=costs["first_reset"] + TAPE_ROWS * max(steps),
-            steps=int(of_steps[0]),
-        )
 
     def prepare_play(
         self,

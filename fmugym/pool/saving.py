@@ -100,7 +100,6 @@ class SavingPool(AttendedPool):
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> npt.NDArray[np.int8]:
         """See ``Pool.restore_instances``."""
-        self._drop_recording()
         if bundle.records is not None:
             self._restore_or_replay(bundle, sources, indices)
         elif self.save_method is not SaveMethod.STATE:
@@ -227,7 +226,3 @@ class SavingPool(AttendedPool):
                 logger.warning(
                     "instance %d: played again, its episode has led to other outputs", index
                 )
-
-    def _mistrust_states(self) -> None:
-        """States have turned out to be wrong; from now on episodes are played again."""
-        self._offered = SaveMethod.REPLAY

@@ -41,7 +41,6 @@ __all__ = [
     "solving_settings",
     "table_of",
     "variable_settings",
-    "variables_of",
 ]
 
 _TYPES: Final = (
@@ -269,7 +268,7 @@ def _type_number(variable: Variable, version: int) -> int:
     return _TYPES.index(_OLD_NAMES.get(variable.type, variable.type))
 
 
-def variables_of(
+def _variables_of(
     description: ModelDescription,
     types: Sequence[int],
     references: Sequence[int],
@@ -317,7 +316,7 @@ def record_from(
     columns = zip(*starts, strict=True) if starts else ((), (), (), ())
     types, references, places, values = columns
     return Record.of(
-        variables_of(description, types, references, places, values),
+        _variables_of(description, types, references, places, values),
         np.array(values, np.float64),
         np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
     )

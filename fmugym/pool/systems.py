@@ -56,7 +56,6 @@ def system_settings(
         _groups(layout),
         _transfers(layout),
         layout.plan.master == "jacobi",
-        _control(layout),
     )
 
 
@@ -96,19 +95,6 @@ def _part(
     )
 
 
-def _control(layout: Layout) -> tuple[Any, ...] | None:
-    """How the step sizes follow from an estimate of the error."""
-    control = layout.plan.control
-    if control is None:
-        return None
-    return (
-        control.tolerance,
-        control.min_step_size or 0.0,
-        _numbers(place for place, _ in layout.compared),
-        _doubles(nominal for _, nominal in layout.compared),
-    )
-
-
 def _routes(layout: Layout) -> tuple[bytes, ...]:
     routes = layout.routes
     return (
@@ -143,7 +129,7 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
     numbers = {key: number for number, key in enumerate(layout.arrays)}
     return (
         firsts.astype(np.uint32).tobytes(),
-        _numbers(max(0, end.part) for end in ends),
+        _numbers(end.part for end in ends),
         b"".join(_type(layout, end) for end in ends),
         _numbers(end.variable.value_reference for end in ends),
         np.array([layout.input_slot(end) for end in ends], np.int32).tobytes(),

@@ -13,17 +13,13 @@ import numpy as np
 from fmugym.archive.description import Capabilities, ModelDescription, Unit
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
-from fmugym.systems.plan import STATISTICS, Connector, End, SystemPlan
+from fmugym.systems.plan import Connector, End, SystemPlan
 
-__all__ = ["MASTER", "PartVariable", "SystemDescription", "compared", "describe_system"]
+__all__ = ["PartVariable", "SystemDescription", "describe_system"]
 
 
 _NO_PLAN: Final = SystemPlan("", ())
 """Dataclasses want a default here, for there are others before."""
-
-
-MASTER: Final = -1
-"""Stands for the index of a component."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +27,7 @@ class PartVariable:
     """A scalar or element of a component behind one of the system.
 
     Attributes:
-        part: The index of the component; ``MASTER`` for what the master itself tells.
+        part: The index of the component.
         variable: As its FMU describes it.
         gain, offset: See ``fmugym.systems.plan.End``.
         is_target: Whether the system's variable is the source of this one: an input or a parameter.
@@ -130,11 +126,6 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         ConfigError: If a name of the plan is unknown to a component.
     """
     variables, ends = _variables(plan, parts)
-    for own in _statistics(plan, parts):
-        if own.name in variables:
-            raise ConfigError(f"{own.name!r} is the name of two variables of {plan.name}")
-        variables[own.name] = replace(own, value_reference=len(ends))
-        ends = (*ends, (PartVariable(MASTER, own),))
     newest = max(parts, key=lambda part: part.fmi_major_version)
     return SystemDescription(
         fmi_version=newest.fmi_version,
@@ -176,57 +167,6 @@ def _step_size(plan: SystemPlan, parts: Sequence[ModelDescription]) -> float | N
     pairs = zip(plan.components, parts, strict=True)
     steps = [part.step_size * one.steps for one, part in pairs if part.step_size is not None]
     return min(steps, default=None)
-
-
-def compared(
-    plan: SystemPlan, parts: Sequence[ModelDescription]
-) -> dict[tuple[int, int, int], tuple[str, Variable]]:
-    """The values of which the master estimates errors: what connections carry, if it is real.
-
-    Args:
-        plan: The system.
-        parts: The descriptions of its components.
-
-    Returns:
-        By component, value reference and place in an array: the name of the component, and the
-        variable.
-    """
-    found: dict[tuple[int, int, int], tuple[str, Variable]] = {}
-    numbers = {component.name: index for index, component in enumerate(plan.components)}
-    for link in plan.links if plan.control is not None else ():
-        part = numbers[link.source]
-        for one in parts[part].variable(link.output).elements:
-            if one.kind == "real":
-                found.setdefault((part, one.value_reference, one.place), (link.source, one))
-    return found
-
-
-def _statistics(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Iterator[Variable]:
-    """What the master tells if it estimates errors.
-
-    Raises:
-        ConfigError: If a component has its name.
-    """
-    if plan.control is None:
-        return
-    if "master" in {component.name for component in plan.components}:
-        raise ConfigError(
-            "with error_tolerance no component can be named 'master': master.steps, master.error "
-            "and others are variables of the master"
-        )
-    for reference, (name, text) in enumerate(STATISTICS.items()):
-        unit = "s" if name == "step_size" else None
-        yield _statistic(f"master.{name}", reference, text, unit)
-    sources = compared(plan, parts).values()
-    for reference, (component, one) in enumerate(sources, len(STATISTICS)):
-        text = "largest estimated error in the last step"
-        yield _statistic(f"master.error({component}.{one.name})", reference, text, one.unit)
-
-
-def _statistic(name: str, reference: int, text: str, unit: str | None) -> Variable:
-    return Variable(
-        name, "Real", reference, "local", "discrete", "calculated", unit=unit, description=text
-    )
 
 
 def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:

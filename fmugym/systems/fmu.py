@@ -124,26 +124,11 @@ class SystemFMU(FMU):
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
         """What keeps the components from being loaded; see ``FMU.obstacles``."""
-        found = [
+        return tuple(
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
             for text in fmu.obstacles
-        ]
-        return (*self._unable(), *found)
-
-    def _unable(self) -> Iterator[str]:
-        """What components lack that the estimate of errors needs."""
-        for component, fmu in self._pairs() if self.plan.control is not None else ():
-            able = fmu.description.capabilities
-            for flag, what in (
-                (able.can_get_and_set_fmu_state, "save its FMU state"),
-                (able.can_handle_variable_communication_step_size, "vary its step size"),
-            ):
-                if not flag:
-                    yield (
-                        "error_tolerance needs components that can repeat steps as smaller ones, "
-                        f"and component {component.name!r} cannot {what}"
-                    )
+        )
 
     @cached_property
     def missing_libraries(self) -> tuple[str, ...]:
@@ -158,13 +143,10 @@ class SystemFMU(FMU):
         """Extract each FMU into a folder of its own; see ``FMU.extract``.
 
         Raises:
-            ConfigError: If a component cannot repeat steps, and ``error_tolerance`` needs it.
             FMULoadError: If one of them cannot run here, or its archive is damaged.
         """
         if self._folder is not None:
             return self._folder
-        for text in self._unable():
-            raise ConfigError(text)
         for component, fmu in self._pairs():
             with _naming(component):
                 _require_runnable(fmu)

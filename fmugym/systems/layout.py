@@ -13,8 +13,8 @@ from typing import TypeAlias
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
-from fmugym.systems.description import MASTER, PartVariable, SystemDescription, compared
-from fmugym.systems.plan import STATISTICS, Component, Evaluation, Group, Link
+from fmugym.systems.description import PartVariable, SystemDescription
+from fmugym.systems.plan import Component, Evaluation, Group, Link
 
 __all__ = ["Layout", "PartLayout", "Route", "array_key"]
 
@@ -117,9 +117,6 @@ class Layout:
         parts: One for each component.
         routes: In the order of their targets.
         number_of_inputs, number_of_outputs: Slots in all.
-        first_statistic: The first slot of what the master tells, after those of the components.
-        compared: The slots of the values of which the master estimates errors, and their nominal
-            values.
 
     Raises:
         ConfigError: If a name of the plan is unknown, or a variable cannot be used in its role.
@@ -158,18 +155,6 @@ class Layout:
                 self._output_slots[index, *_key(variable)] = place
             self.number_of_inputs += len(part.inputs)
             self.number_of_outputs += len(part.outputs)
-        self._append_statistics()
-
-    def _append_statistics(self) -> None:
-        """Give slots to what the master tells, if it estimates errors."""
-        found = compared(self.plan, [part.description for part in self.parts])
-        self.first_statistic = self.number_of_outputs
-        self.compared = [
-            (self._output_slots[part, *_key(variable)], abs(variable.nominal or 1.0))
-            for (part, *_), (_, variable) in found.items()
-        ]
-        if self.plan.control is not None:
-            self.number_of_outputs += len(STATISTICS) + len(found)
 
     def _source(self, link: Link) -> tuple[int, Variable]:
         part = self._numbers[link.source]
@@ -202,8 +187,6 @@ class Layout:
 
     def output_slot(self, end: PartVariable) -> int:
         """The slot that this variable is read into; -1 if there is none."""
-        if end.part == MASTER:
-            return self.first_statistic + end.variable.value_reference
         return self._output_slots.get((end.part, *_key(end.variable)), -1)
 
     @cached_property

@@ -29,10 +29,8 @@ from fmugym.archive.safe_zip import ArchiveLimits
 __all__ = [
     "LOOP_METHODS",
     "MASTERS",
-    "STATISTICS",
     "Component",
     "Connector",
-    "Control",
     "End",
     "Evaluation",
     "Group",
@@ -43,14 +41,6 @@ __all__ = [
 
 MASTERS: Final = ("gauss_seidel", "jacobi")
 """The orders in which values are exchanged and components step, the preferred one first."""
-
-STATISTICS: Final = {
-    "steps": "communication steps since the start of the episode",
-    "rejected_steps": "communication steps that were repeated as smaller ones, since then",
-    "step_size": "communication step size that is tried next",
-    "error": "largest estimated error in the last step, as a part of the tolerance",
-}
-"""What the master tells if it estimates errors; ``native/system.h`` has the same order."""
 
 LOOP_METHODS: Final = ("newton", "fixed_point")
 """How algebraic loops are solved, the preferred method first."""
@@ -117,21 +107,6 @@ class Loop:
     method: str = LOOP_METHODS[0]
     tolerance: float = 1e-9
     max_iterations: int = 50
-
-
-@dataclass(frozen=True)
-class Control:
-    """How the sizes of communication steps follow from an estimate of the error.
-
-    Attributes:
-        tolerance: The error that a step may add to the value of a connection, as a part of the
-            larger of its magnitude and its nominal value (1 if the FMU gives none).
-        min_step_size: Smaller steps are not tried, in seconds; None for 1/1024 of a step of the
-            system.
-    """
-
-    tolerance: float
-    min_step_size: float | None = None
 
 
 @dataclass(frozen=True)
@@ -214,7 +189,6 @@ class SystemPlan:
         tolerance: Of the default experiment.
         description: For people.
         findings: What is doubtful in the system, as texts.
-        control: How the step sizes follow from an estimate of the error; None if they do not.
         file: Where the system was read from; None if it was made in Python.
         units: Definitions by name of units that the FMUs do not define.
     """
@@ -232,6 +206,5 @@ class SystemPlan:
     tolerance: float | None = None
     description: str = ""
     findings: tuple[str, ...] = ()
-    control: Control | None = None
     file: Path | None = None
     units: tuple[tuple[str, Unit], ...] = ()

@@ -39,12 +39,6 @@ class FMUSystem(WiredSystem):
             default step size of the components.
         start_time, stop_time: Of the default experiment, in seconds.
         tolerance: For the solvers of the components; None for their own defaults.
-        error_tolerance: Lets the master estimate the error of the coupling, and choose the size of
-            each communication step by it: a step may add this part of the larger of the
-            magnitude and the nominal value to what a connection carries. None for steps of one
-            size.
-        min_step_size: Smaller steps than this are not tried, in seconds; by default 1/1024 of a
-            step of the system.
         description: For people.
         own_names: Names of the system itself that contain a dot.
         unit_definitions: Units that ``units`` use and that neither an FMU nor pint knows.
@@ -56,7 +50,6 @@ class FMUSystem(WiredSystem):
         components: The components by name, their FMUs read.
         connections: As given, as ``Connection`` objects.
         loop: How algebraic loops are solved.
-        control: How the step sizes follow from an estimate of the error; None if they do not.
         times: ``step_size``, ``start_time``, ``stop_time`` and ``tolerance`` as given.
 
     Raises:
@@ -105,7 +98,6 @@ class FMUSystem(WiredSystem):
             probe_timeout: See ``FMU``.
 
         Raises:
-            ConfigError: If with ``error_tolerance``, a component is named ``master``.
             FMULoadError: If an FMU of a component cannot be read any more.
         """
         return SystemFMU(self.plan, probe_timeout=probe_timeout)
@@ -154,8 +146,6 @@ class FMUSystem(WiredSystem):
             "loop_tolerance": self.loop.tolerance,
             "loop_iterations": self.loop.max_iterations,
             **self.times,
-            "error_tolerance": None if self.control is None else self.control.tolerance,
-            "min_step_size": None if self.control is None else self.control.min_step_size,
             "description": self.description,
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,

@@ -15,7 +15,7 @@ from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import Connection
 from fmugym.systems.order import Order, order_of
-from fmugym.systems.plan import LOOP_METHODS, MASTERS, Connector, Control, Link, Loop, SystemPlan
+from fmugym.systems.plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
 __all__ = ["LOOPS", "WiredSystem"]
@@ -45,8 +45,6 @@ class WiredSystem:
         start_time: float = 0.0,
         stop_time: float | None = None,
         tolerance: float | None = None,
-        error_tolerance: float | None = None,
-        min_step_size: float | None = None,
         description: str = "",
         own_names: Sequence[str] = (),
         unit_definitions: Mapping[str, Unit] | None = None,
@@ -68,7 +66,6 @@ class WiredSystem:
         self.loops = check_option("way of solving loops", loops, LOOPS)
         self.loop = _loop(self.loops, loop_tolerance, loop_iterations)
         self.times = _times(step_size, start_time, stop_time, tolerance)
-        self.control = _control(error_tolerance, min_step_size)
         self._given_findings, self.file = tuple(findings), file
         self.connections = tuple(map(Connection.of, _listed(connections)))
         self.components = {n: OpenComponent(n, Component.of(c)) for n, c in given.items()}
@@ -156,7 +153,6 @@ class WiredSystem:
             self.connectors,
             description=self.description,
             findings=self.findings,
-            control=self.control,
             file=self.file,
             units=tuple(self.unit_definitions.items()),
             **times,
@@ -191,16 +187,6 @@ def _loop(method: str, tolerance: Any, iterations: Any) -> Loop:
         check_number("loop_tolerance", tolerance, positive=True),
         check_count("loop_iterations", iterations),
     )
-
-
-def _control(tolerance: Any, smallest: Any) -> Control | None:
-    if smallest is not None:
-        smallest = check_number("min_step_size", smallest, positive=True)
-    if tolerance is not None:
-        return Control(check_number("error_tolerance", tolerance, positive=True), smallest)
-    if smallest is not None:
-        raise ConfigError("min_step_size needs an error_tolerance: all steps have one size")
-    return None
 
 
 def _times(step_size: Any, start_time: Any, stop_time: Any, tolerance: Any) -> dict[str, Any]:

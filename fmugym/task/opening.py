@@ -174,7 +174,6 @@ class PoolOpening:
             "call_timeout": self.config.call_timeout,
             "reset_method": self.config.reset_method,
             "starts": self.plan.starts(),
-            "rehearse": self.config.rehearsals and self._has_spare(num_instances),
             "spare": self._has_spare(num_instances),
         }
         options = own | options

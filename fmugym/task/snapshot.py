@@ -36,7 +36,7 @@ _VERSION: Final = 3
 """Of pickles; it changes with their content."""
 
 _OPERATION: Final = {
-    *("on_fault", "fault_retries", "fault_reward", "leak_limit", "reset_method", "rehearsals"),
+    *("on_fault", "fault_retries", "fault_reward", "leak_limit", "reset_method"),
     *("archive_limits", "preload", "probe_timeout", "isolation", "call_timeout", "max_instances"),
     "licence_wait",
 }

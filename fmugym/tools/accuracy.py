@@ -119,7 +119,7 @@ class Replay:
         opening = replace(self.opening, fmu=_untried(self.opening.fmu), spec=spec, log=_silent)
         isolation = None if opening.fmu.bundled else "process"
         try:
-            pool = opening.open(1, rehearse=False, isolation=isolation)
+            pool = opening.open(1, isolation=isolation)
         except FMUGymError:
             opening.fmu.close()
             return None

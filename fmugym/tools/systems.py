@@ -85,7 +85,6 @@ def overview_of_system(
         "connections": [asdict(link) for link in system.links],
         "connectors": [asdict(connector) for connector in system.connectors],
         "master": system.master,
-        "error_tolerance": None if system.control is None else system.control.tolerance,
         "order": groups,
         "loops": [[asdict(link) for link in loop] for loop in system.order.loops],
     }
@@ -129,17 +128,11 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
         "file": facts["path"],
         "this machine": f"does NOT run here: {obstacles}" if obstacles else "runs here",
         "step": "not given" if step is None else f"{step:g} s",
-        "master": _master(facts["system"]),
+        "master": facts["system"]["master"],
         "order": " -> ".join(map(_group, facts["system"]["order"])),
     }
     for name, value in rows.items():
         yield f"  {name:<20}{plain(value)}"
-
-
-def _master(system: Mapping[str, Any]) -> str:
-    tolerance = system["error_tolerance"]
-    sizes = "" if tolerance is None else f", step sizes by an error tolerance of {tolerance:g}"
-    return f"{system['master']}{sizes}"
 
 
 def _group(group: Mapping[str, Any]) -> str:

@@ -21,7 +21,6 @@ __all__ = [
     "marks_of",
     "note_harm",
     "note_resuming",
-    "revise",
     "state_files",
     "with_harm",
 ]

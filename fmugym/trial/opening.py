@@ -40,12 +40,10 @@ from fmugym.trial.known import (
     known_resuming,
     marks_of,
     note_harm,
-    revise,
 )
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.plan import Plan, is_alone
 from fmugym.trial.rehearsal import Starts
-from fmugym.trial.repetition import Repetition
 from fmugym.trial.resuming import method_that_works
 from fmugym.trial.seats import take, taking
 from fmugym.trial.trial import examine
@@ -76,7 +74,6 @@ def make_pool(
     isolation: str | None = None,
     workers: int | None = None,
     call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
-    rehearse: bool = False,
     spare: bool = True,
 ) -> Pool:
     """Make the fastest pool that gives correct values.
@@ -101,8 +98,6 @@ def make_pool(
             instances disturb each other and private libraries do not help.
         workers: See ``ProcessPool``; by default one for each instance if they disturb each other.
         call_timeout: See ``ProcessPool``; calls in this process have no time limit.
-        rehearse: Whether a spare instance plays episodes again now and then, to see whether they
-            begin anew. It takes one more seat of a licence.
         spare: Whether there may be one more instance, in a trial of saved states.
 
     Raises:
@@ -139,8 +134,6 @@ def make_pool(
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
             pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
         pool.save_by(trust.method_that_works)
-        if rehearse and reset_method is None:
-            _rehearse(pool, fmu, actual, starts, verdict, completed, log)
         return pool
 
     return Patience(spec.licence_wait, log).call(attempt)
@@ -217,29 +210,6 @@ def _note_crash(
         log.info("%s: %s, so later environments run in worker processes", fmu.path.name, how)
         with Ignoring(OSError):  # the file of the FMU may be gone by now
             note_harm(candidate, _tried(spec), starts, verdict, f"in training, {how}")
-
-
-def _rehearse(
-    pool: Pool,
-    fmu: FMU,
-    spec: PoolSpec,
-    starts: Starts | None,
-    verdict: Verdict,
-    plan: Plan,
-    log: logging.Logger,
-) -> None:
-    """Let the trial of resets be repeated in training, if it was made and can be repeated."""
-    candidate = Candidate.of(fmu)
-    always_fresh = plan.method is ResetMethod.PROCESS
-    if candidate.exempt or not verdict.deterministic or not verdict.resets or always_fresh:
-        return
-    tried = _tried(spec)
-    spec = replace(spec, reset_method=plan.method, component_resets=plan.component_resets)
-
-    def keep(found: Verdict) -> None:
-        revise(candidate, tried, starts, found)
-
-    pool.rehearse_with(Repetition(candidate, spec, verdict, keep, log))
 
 
 @dataclass(frozen=True)

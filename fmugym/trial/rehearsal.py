@@ -28,7 +28,7 @@ from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.verdict import Grade
 
-__all__ = ["Rehearsal", "Starts", "difference", "tolerance_of"]
+__all__ = ["Rehearsal", "Starts"]
 
 _SHORT: Final = 3
 """The steps of a short episode."""
@@ -134,7 +134,7 @@ class Rehearsal:
         self.is_frugal = spec.licence_wait > 0.0
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
         self._references: list[_Run] = []
-        self._tolerances, self._knows_noise = np.full(len(spec.outputs), tolerance_of(spec)), False
+        self._tolerances, self._knows_noise = np.full(len(spec.outputs), _tolerance_of(spec)), False
         self._find_reference()
 
     @property
@@ -167,7 +167,7 @@ class Rehearsal:
         self._knows_noise = True
         again = self._play_fresh(0)
         if not _same(again, self._references[0]):
-            noise = difference(again.rows, self._references[0].rows)
+            noise = _difference(again.rows, self._references[0].rows)
             names = [variable.name for variable in self._spec.outputs]
             found = [name for name, own in zip(names, noise, strict=True) if own > 0.0]
             self.noisy = tuple(found or names)
@@ -270,7 +270,7 @@ class Rehearsal:
         if not self._knows_noise:
             self._compare_fresh_instances()
         close = len(run.rows) == len(reference.rows) and run.status == reference.status
-        if close and np.all(difference(run.rows, reference.rows) <= self._tolerances):
+        if close and np.all(_difference(run.rows, reference.rows) <= self._tolerances):
             return Grade.TOLERANCE
         return Grade.WRONG
 
@@ -279,12 +279,12 @@ def _same(one: _Run, other: _Run) -> bool:
     return one.rows.tobytes() == other.rows.tobytes() and one.status == other.status
 
 
-def tolerance_of(spec: PoolSpec) -> float:
+def _tolerance_of(spec: PoolSpec) -> float:
     """By how much two runs of a solver may differ, as a fraction of the largest magnitude."""
     return _SLACK * (spec.tolerance or _RELATIVE_TOLERANCE)
 
 
-def difference(one: FloatArray, other: FloatArray) -> FloatArray:
+def _difference(one: FloatArray, other: FloatArray) -> FloatArray:
     """The largest difference of each output, as a fraction of its largest magnitude.
 
     Args:

@@ -227,7 +227,7 @@ def _by_directional_derivatives(
     """Play the trajectory with an instance of its own, and ask that for derivatives."""
     env = envs._maker.make()
     try:
-        env._use(env._opening.open(1, rehearse=False))
+        env._use(env._opening.open(1))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)

@@ -58,50 +58,8 @@ static bool drain(PyPool *self) {
     return good;
 }
 
-/* The recording of an episode goes to Python likewise. */
-
-static void do_take_tape(PyPool *self, bool alone, void *context) {
-    Tape *taken = context;
-    (void)alone;
-    *taken = self->pool.tape;
-    memset(&self->pool.tape, 0, sizeof self->pool.tape);
-}
-
-static PyObject *tape_as_tuple(const Tape *t) {
-    const Py_ssize_t starts = (Py_ssize_t)t->number_of_starts, rows = (Py_ssize_t)t->rows;
-    const Py_ssize_t in = (Py_ssize_t)t->width_in, out = (Py_ssize_t)t->width_out;
-    const Py_ssize_t number = sizeof(double);
-
-    return Py_BuildValue("y#y#y#y#y#y#y#", (const char *)t->start_types, starts,
-                         (const char *)t->start_variables, starts * (Py_ssize_t)sizeof(Element),
-                         (const char *)t->starts, starts * number, (const char *)t->first_outputs,
-                         out * number, (const char *)t->inputs, rows * in * number,
-                         (const char *)t->outputs, rows * out * number, (const char *)t->statuses,
-                         rows);
-}
-
-static bool hand_over_tape(PyPool *self) {
-    Tape taken = {0};
-
-    if (!perform(self, ALWAYS_SHORT, do_take_tape, &taken)) {
-        return false;
-    }
-    PyObject *tuple = taken.state == TAPE_READY ? tape_as_tuple(&taken) : Py_NewRef(Py_None);
-    PyObject *result = NULL;
-    tape_free(&taken);
-    if (tuple != NULL && tuple != Py_None) {
-        result = PyObject_CallFunctionObjArgs(self->listener, tuple, NULL);
-    } else if (tuple == Py_None) {
-        result = Py_NewRef(Py_None);
-    }
-    Py_XDECREF(tuple);
-    Py_XDECREF(result);
-    return result != NULL;
-}
-
 bool report_messages(PyPool *self) {
-    const bool reported = !atomic_get(&self->pool.log.pending) || drain(self);
-    return reported && (!atomic_get(&self->pool.tape.ready) || hand_over_tape(self));
+    return !atomic_get(&self->pool.log.pending) || drain(self);
 }
 
 /* Entering */

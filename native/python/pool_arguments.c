@@ -69,13 +69,13 @@ static bool parse_arrays(PyPool *self, PyObject *group) {
 
 static bool parse(PyPool *self, PyObject *args, PyObject *kwargs, Arguments *a) {
     static char *names[] = {"library", "experiment", "variables", "arrays",
-                            "count",   "threads",    "callback",  "listener", NULL};
+                            "count",   "threads",    "callback",  NULL};
     PyObject *library, *experiment, *variables, *arrays;
 
-    return PyArg_ParseTupleAndKeywords(args, kwargs, "$O!O!O!O!nnOO:Pool", names, &PyDict_Type,
+    return PyArg_ParseTupleAndKeywords(args, kwargs, "$O!O!O!O!nnO:Pool", names, &PyDict_Type,
                                        &library, &PyDict_Type, &experiment, &PyDict_Type,
                                        &variables, &PyDict_Type, &arrays, &a->count, &a->threads,
-                                       &self->callback, &self->listener) &&
+                                       &self->callback) &&
            parse_library(self, library, a) && parse_experiment(self, experiment, a) &&
            parse_variables(variables, a) && parse_arrays(self, arrays);
 }

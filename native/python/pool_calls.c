@@ -348,42 +348,6 @@ PyObject *py_recycle(PyObject *object, PyObject *unused) {
     Py_RETURN_NONE;
 }
 
-/* Both take two integers. */
-static PyObject *perform_with_two(PyObject *object, PyObject *const *args, Py_ssize_t nargs,
-                                  Work *work) {
-    long long numbers[2] = {0};
-
-    if (!has_arguments(nargs, 2)) {
-        return NULL;
-    }
-    numbers[0] = PyLong_AsLongLong(args[0]);
-    numbers[1] = PyErr_Occurred() ? 0 : PyLong_AsLongLong(args[1]);
-    if (PyErr_Occurred() || !perform((PyPool *)object, NEVER_SHORT, work, numbers)) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
-}
-
-static void do_record(PyPool *self, bool alone, void *context) {
-    const long long *numbers = context;
-    (void)alone;
-    tape_wait(&self->pool.tape, numbers[0], numbers[1]);
-}
-
-PyObject *py_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return perform_with_two(object, args, nargs, do_record);
-}
-
-static void do_begin_by(PyPool *self, bool alone, void *context) {
-    const long long *numbers = context;
-    (void)alone;
-    pool_begin_by(&self->pool, numbers[0] != 0, numbers[1] != 0);
-}
-
-PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return perform_with_two(object, args, nargs, do_begin_by);
-}
-
 static void do_copy_costs(PyPool *self, bool alone, void *context) {
     (void)alone;
     memcpy(context, self->pool.costs, sizeof self->pool.costs);
@@ -396,8 +360,8 @@ PyObject *py_costs(PyObject *object, PyObject *unused) {
     if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, costs)) {
         return NULL;
     }
-    return Py_BuildValue("(ddddd)", costs[STEP].low, costs[RESET].low, costs[MIXED].low,
-                         costs[PLAY].low, costs[RESET].first);
+    return Py_BuildValue("(dddd)", costs[STEP].low, costs[RESET].low, costs[MIXED].low,
+                         costs[PLAY].low);
 }
 
 PyObject *py_uses_states(PyObject *object, PyObject *unused) {

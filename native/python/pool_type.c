@@ -135,8 +135,6 @@ static PyMethodDef methods[] = {
     {"replace_record", (PyCFunction)(void (*)(void))py_replace_record, METH_FASTCALL, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"recycle", py_recycle, METH_NOARGS, NULL},
-    FAST("record", py_record),
-    FAST("begin_by", py_begin_by),
     {"close", py_close, METH_NOARGS, NULL},
     {"costs", py_costs, METH_NOARGS, NULL},
     {"uses_states", py_uses_states, METH_NOARGS, NULL},

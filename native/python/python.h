@@ -39,7 +39,6 @@ typedef struct {
     bool opened;         /* whether the pool may need closing */
     PyObject *arguments; /* keeps the targets of the settings alive */
     PyObject *callback;  /* borrowed from arguments, as are the arrays */
-    PyObject *listener;  /* gets the recordings of episodes */
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
     const char **paths, **categories;
@@ -108,8 +107,6 @@ PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t n
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_recycle(PyObject *object, PyObject *unused);
-PyObject *py_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_begin_by(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

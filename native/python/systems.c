@@ -462,30 +462,8 @@ static bool take_transfers(PyObject *tuple, System *s) {
     return s->transfers != NULL;
 }
 
-/* The outputs of the master itself follow those of the parts. */
-static bool take_control(PyObject *tuple, System *s) {
-    StepControl *control = &s->control;
-    Bytes sources, nominals;
-
-    s->first_statistic = s->outputs;
-    if (tuple == Py_None) {
-        return true;
-    }
-    if (!PyTuple_Check(tuple) ||
-        !PyArg_ParseTuple(tuple, "ddy#y#", &control->tolerance, &control->smallest, BYTES(sources),
-                          BYTES(nominals)) ||
-        nominals.size != 2 * sources.size || !all_below(sources, s->outputs)) {
-        return refuse("estimates of errors");
-    }
-    control->sources = numbers_of(sources);
-    control->nominals = doubles_of(nominals);
-    control->count = count_of(sources, sizeof(uint32_t));
-    s->outputs += ERROR_OF_FIRST + control->count;
-    return true;
-}
-
 bool take_system(PyObject *object, System **system) {
-    PyObject *parts, *routes, *ends, *groups, *transfers, *control;
+    PyObject *parts, *routes, *ends, *groups, *transfers;
     int jacobi;
 
     if (object == Py_None) {
@@ -496,12 +474,12 @@ bool take_system(PyObject *object, System **system) {
         PyErr_NoMemory();
         return false;
     }
-    if (!PyTuple_Check(object) || !PyArg_ParseTuple(object, "OOOOOpO", &parts, &routes, &ends,
-                                                    &groups, &transfers, &jacobi, &control)) {
+    if (!PyTuple_Check(object) || !PyArg_ParseTuple(object, "OOOOOp", &parts, &routes, &ends,
+                                                    &groups, &transfers, &jacobi)) {
         return refuse("groups");
     }
     s->jacobi = jacobi;
-    return take_parts(parts, s) && take_control(control, s) && take_routes(routes, s) && take_ends(ends, s) &&
+    return take_parts(parts, s) && take_routes(routes, s) && take_ends(ends, s) &&
            take_groups(groups, s) && take_transfers(transfers, s);
 }
 

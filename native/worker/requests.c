@@ -21,7 +21,6 @@ enum { FIRST_RESETS = 4 }; /* of each instance; what they take is no leak */
 /* In the order of fmugym/pool/process/windows.py */
 enum {
     REQUEST_RESET,
-    REQUEST_BEGIN_BY,
     REQUEST_SAVE,
     REQUEST_RESTORE,
     REQUEST_WRITE,
@@ -130,20 +129,6 @@ static void answer_reset(Worker *w, Reader *reader) {
     write_integer(&writer, growth_after(w, mask));
     write_integer(&writer, (int64_t)number_of_initializations());
     send_result(&writer);
-}
-
-static void answer_begin_by(Worker *w, Reader *reader) {
-    const bool rebuilds = read_flag(reader);
-
-    pool_enter(&w->pool);
-    pool_begin_by(&w->pool, false, rebuilds);
-    const bool kept = w->pool.records != NULL || records_open(&w->pool);
-    pool_leave(&w->pool);
-    if (kept) {
-        send_done();
-    } else {
-        send_error("out of memory");
-    }
 }
 
 /* Variables */
@@ -270,7 +255,6 @@ static void answer_close(Worker *w, Reader *reader) {
 bool worker_answer(Worker *w, Reader *reader) {
     static void (*const answers[REQUESTS])(Worker *, Reader *) = {
         [REQUEST_RESET] = answer_reset,
-        [REQUEST_BEGIN_BY] = answer_begin_by,
         [REQUEST_SAVE] = answer_save,
         [REQUEST_RESTORE] = answer_restore,
         [REQUEST_WRITE] = answer_write,

@@ -79,7 +79,6 @@ class PlayAround:
             count=setup.num_instances,
             threads=available_processors(),
             callback=_ignore,
-            listener=None,
         )
 
     @staticmethod

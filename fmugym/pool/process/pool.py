@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
@@ -132,7 +131,6 @@ class ProcessPool(SavingPool):
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
-            began = time.perf_counter()
             concerned = self._crew.of_any(mask)
             if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
@@ -140,7 +138,6 @@ class ProcessPool(SavingPool):
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
             self._crew.note_lost()
-            self._note_reset(variables, values, mask, time.perf_counter() - began)
 
     def _as_mask(self, mask: MaskArray | None) -> MaskArray:
         if mask is None:
@@ -231,22 +228,13 @@ class ProcessPool(SavingPool):
         if skip is not None or self._crew.any_lost:
             code = Code.STEP_SOME
             np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
-        began = time.perf_counter() if self._is_recording else 0.0
         replies = self._crew.run(
             "a step", self._crew.able, lambda supervisor: supervisor.step(code)
         )
-        if self._is_recording:
-            self._record_step(skip, time.perf_counter() - began)
         if not self._crew.any_lost and Code.TROUBLE not in replies.values():
             return 0
         self._crew.note_lost()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
-
-    def _record_step(self, skip: MaskArray | None, seconds: float) -> None:
-        if self._crew.lost[0]:  # something else may have ended the process
-            self._drop_recording()
-        else:
-            self._note_step(skip, seconds)
 
     # Compiled hooks
 
@@ -277,7 +265,6 @@ class ProcessPool(SavingPool):
             supervisor.roll_out(self._plays, play.play, play.counts[block], departure)
 
         with self._lock:
-            self._drop_recording()
             replies = self._crew.run(ROLLOUT, self._crew.able, tell)
             self._crew.note_lost()
         own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
@@ -311,26 +298,6 @@ class ProcessPool(SavingPool):
                 self.reset(variables, values, starting)
             self._step(skip)
 
-    @property
-    def _one_by_one(self) -> int:
-        return -(-self.num_instances // self.workers)
-
-    def begin_by(self, method: ResetMethod) -> bool:
-        """See ``Pool.begin_by``; the libraries of workers cannot be loaded anew."""
-        if method == ResetMethod.PROCESS and self.workers == self.num_instances:
-            self._spec = self._spec.beginning_by(method)
-            return True
-        if method not in (ResetMethod.RESET, ResetMethod.INSTANCE):
-            return False
-        with self._lock:
-            self._spec = self._spec.beginning_by(method)
-            for supervisor in self._crew.supervisors:
-                supervisor.begin_by(method)
-            self._mistrust_states()
-            able = self._crew.able
-            self._crew.run("a change", able, lambda s: s.tell("begin_by", str(method)))
-        return True
-
     def save(self) -> SnapshotOfWorkers:
         """See ``Pool.save``."""
         with self._lock:
@@ -346,7 +313,6 @@ class ProcessPool(SavingPool):
         mask = self._as_mask(mask)
         self._states.require_own(snapshot)
         with self._lock:
-            self._drop_recording()
             self._require_present(mask)
             self._states.restore(snapshot, mask)
         return self.outputs, self.statuses

@@ -9,7 +9,6 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +21,7 @@ from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
 from fmugym.pool.process.transport import transport_for
 from fmugym.pool.process.worker import Setup
-from fmugym.pool.spec import INITIALIZATION_FACTOR, ResetMethod
+from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
 __all__ = ["INSTANTIATION", "ROLLOUT", "LostError", "Supervisor", "patience_with"]
@@ -192,11 +191,6 @@ class Supervisor:
         self.begin_closing()
         self.close(deadline)
         self._deaths, self.reason = deaths, printable(f"{self._setup.path.name}: {reason}")
-
-    def begin_by(self, method: ResetMethod) -> None:
-        """Let the episodes of later processes begin in another way."""
-        spec = self._setup.spec.beginning_by(method)
-        self._setup = replace(self._setup, spec=spec)
 
     def note_success(self) -> None:
         """Remember that a reset has succeeded."""

@@ -35,14 +35,13 @@ from fmugym.pool.settings import (
     solving_settings,
     variable_settings,
 )
-from fmugym.pool.spec import ResetMethod, start_variables
+from fmugym.pool.spec import start_variables
 from fmugym.wine.loader import windows_path
 
 __all__ = ["REQUESTS", "ProgramCoding"]
 
 REQUESTS: Final = (
     "reset",
-    "begin_by",
     "save",
     "restore",
     "write",
@@ -272,9 +271,6 @@ class ProgramCoding:
         self._initializations = count
         return growth
 
-    def _ask_begin_by(self, writer: _Writer, method: str) -> None:
-        writer.flags(method == ResetMethod.INSTANCE)
-
     def _answer_save(self, reader: _Reader) -> int:
         return reader.integer()
 
@@ -380,14 +376,13 @@ def _write_library(writer: _Writer, library: Mapping[str, Any], log_level: int) 
 def _write_solving(writer: _Writer, solving: tuple[Any, ...] | None) -> None:
     writer.flags(solving is not None)
     if solving is not None:
-        name, tolerance, max_step, states, indicators, completes, *blocks, duration = solving
+        name, tolerance, max_step, states, indicators, completes, *blocks = solving
         writer.text(name)
         writer.numbers(tolerance, max_step)
         writer.integers(states, indicators)
         writer.flags(completes)
         for block in blocks:
             writer.block(block or b"")
-        writer.numbers(duration)
 
 
 def _write_texts(writer: _Writer, texts: Sequence[bytes]) -> None:

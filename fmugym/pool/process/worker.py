@@ -278,10 +278,6 @@ class BlockWorker:
         self._publish()
         return self._growth.after(int(np.count_nonzero(mask)))
 
-    def begin_by(self, method: str) -> None:
-        """See ``Pool.begin_by``."""
-        self._pool.begin_by(ResetMethod(method))
-
     def save(self) -> int:
         """See ``Pool.save``; the snapshot stays here, and its number is returned."""
         number = next(self._numbers)

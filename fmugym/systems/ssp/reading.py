@@ -193,7 +193,10 @@ def _master(own: Mapping[str, str]) -> dict[str, Any]:
     return {name: _own_value(own, name, kind) for name, kind in _OWN.items() if name in own}
 
 
-_NUMBERS: Final = ("step_size", "tolerance", "loop_tolerance", "error_tolerance", "min_step_size")
+_RETIRED: Final = ("error_tolerance", "min_step_size")
+"""Which warn."""
+
+_NUMBERS: Final = ("step_size", "tolerance", "loop_tolerance", *_RETIRED)
 
 _OWN: Final[dict[str, type]] = {
     **dict.fromkeys(("master", "loops"), str),
