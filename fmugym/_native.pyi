@@ -121,12 +121,15 @@ class Draws:
             place and the number of its numbers.
         numbers: The numbers of all, as float64.
         standard_normal: The address of numpy's ``random_standard_normal``, or 0.
+        exponential: The address of the function ``exp`` behind ``math.exp``, or 0.
 
     Raises:
         ValueError: If a kind is unknown or does not have the numbers that it needs.
     """
 
-    def __new__(cls, table: bytes, numbers: bytes, standard_normal: int, /) -> Draws: ...
+    def __new__(
+        cls, table: bytes, numbers: bytes, standard_normal: int, exponential: int = ..., /
+    ) -> Draws: ...
     def take(self, states: Array, indices: Array, values: Array, /) -> None:
         """Draw an episode from each of M streams; ``given`` values stay.
 

@@ -32,7 +32,7 @@ static bool is_normal(const Draws *draws, const double *numbers) {
 static bool is_sound(const Draws *draws, const Draw *draw, int64_t end) {
     return draw->kind >= 0 && draw->kind < NUMBER_OF_KINDS && has_enough_numbers(draw) &&
            draw->first >= 0 && draw->count <= end && draw->first <= end - draw->count &&
-           draw->row >= -1 &&
+           draw->row >= -1 && (draw->kind != KIND_LOG_UNIFORM || draws->exponential != NULL) &&
            (draw->kind != KIND_NORMAL || is_normal(draws, draws->numbers + draw->first));
 }
 
@@ -123,7 +123,7 @@ static double take(const Draws *draws, const Draw *draw, Stream *stream) {
     case KIND_UNIFORM:
         return uniform(stream, numbers);
     case KIND_LOG_UNIFORM:
-        return exp(uniform(stream, numbers));
+        return draws->exponential(uniform(stream, numbers));
     case KIND_NORMAL:
         return normal(draws, stream, numbers);
     case KIND_CHOICE:

@@ -35,6 +35,9 @@ typedef struct {
 /* numpy's function random_standard_normal. */
 typedef double StandardNormal(BitGenerator *bits);
 
+/* The function exp behind Python's math.exp. A compiler may bring another, which rounds otherwise. */
+typedef double Exponential(double x);
+
 typedef struct {
     int64_t kind;
     int64_t row;          /* the row of the start value that it sets, or -1 */
@@ -47,6 +50,7 @@ typedef struct {
     const Draw *draws;
     const double *numbers;
     StandardNormal *standard_normal; /* NULL if there is no normal distribution */
+    Exponential *exponential;        /* NULL if there is no log-uniform distribution */
 } Draws;
 
 /* Whether the kinds are known and have the numbers that they need. */

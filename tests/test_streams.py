@@ -270,6 +270,7 @@ class TestGuards:
             (("weighted", 0, 0, 3), [0.5, 1.0, 2.0]),
             (("normal", 0, 0, 4), [3.0, 1.0, 0.0, 2.0]),
             (("normal", 0, 0, 4), [math.nan, 1.0, 0.0, 2.0]),
+            (("log_uniform", 0, 0, 2), [0.0, 1.0]),  # without the function exp
         ],
         ids=str,
     )

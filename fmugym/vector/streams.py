@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import secrets
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
@@ -160,7 +162,8 @@ def _native_draws(plan: EpisodePlan) -> Draws | None:
     recipes = plan.recipes if has_native_pool() else None
     if recipes is None:
         return None
-    if not _standard_normal() and any(recipe.kind == "normal" for recipe in recipes):
+    needed = {"normal": _standard_normal, "log_uniform": _exponential}
+    if any(recipe.kind in needed and not needed[recipe.kind]() for recipe in recipes):
         return None
     return _draws(recipes, plan.drawn_rows)
 
@@ -174,7 +177,7 @@ def _draws(recipes: Sequence[Recipe], rows: Sequence[int]) -> Draws:
     columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts
     table = np.array(columns, np.int64).reshape(4, -1).T
     numbers = np.array([number for recipe in recipes for number in recipe.numbers])
-    return _native.Draws(table.tobytes(), numbers.tobytes(), _standard_normal())
+    return _native.Draws(table.tobytes(), numbers.tobytes(), _standard_normal(), _exponential())
 
 
 @functools.cache
@@ -184,9 +187,20 @@ def _standard_normal() -> int:
     numpy's documentation, "Extending via CFFI", finds the functions of its ``distributions.h`` in
     the same way. It keeps the values those of the numpy at hand.
     """
+    return _address(np.random._generator.__file__, "random_standard_normal")
+
+
+@functools.cache
+def _exponential() -> int:
+    """The address of the C library's ``exp``, which ``math.exp`` calls; 0 if it cannot be found."""
+    if sys.platform == "win32":
+        return _address("ucrtbase", "exp")
+    return _address(getattr(math, "__file__", None), "exp")  # or it is a part of Python itself
+
+
+def _address(library: str | None, name: str) -> int:
     try:
-        library = ctypes.CDLL(np.random._generator.__file__)
-        function = library.random_standard_normal
+        function = getattr(ctypes.CDLL(library), name)
     except ordinary(AttributeError, OSError):  # the system does not export it
         return 0
     return ctypes.cast(function, ctypes.c_void_p).value or 0

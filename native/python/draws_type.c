@@ -22,10 +22,10 @@ static bool take_memory(PyDraws *self, PyObject *table, PyObject *numbers) {
 
 static PyObject *draws_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
     PyObject *table, *numbers;
-    unsigned long long address;
+    unsigned long long normal, exponential = 0;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "SSK", &table, &numbers, &address)) {
+    if (!PyArg_ParseTuple(args, "SSK|K", &table, &numbers, &normal, &exponential)) {
         return NULL;
     }
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
@@ -33,7 +33,8 @@ static PyObject *draws_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     if (self == NULL) {
         return NULL;
     }
-    self->draws.standard_normal = (StandardNormal *)(uintptr_t)address;
+    self->draws.standard_normal = (StandardNormal *)(uintptr_t)normal;
+    self->draws.exponential = (Exponential *)(uintptr_t)exponential;
     if (!take_memory(self, table, numbers)) {
         Py_DECREF(self);
         return NULL;

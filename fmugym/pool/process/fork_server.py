@@ -179,6 +179,7 @@ class _Server:
             os.setpgid(0, 0)  # not a session: Linux schedules each by itself
             if _end_with_parent(server):
                 status = run_worker(socket.socket(fileno=channel), memory)
+                ctypes.CDLL(None).fflush(None)  # a line without an end
         finally:
             os._exit(status)
 
