@@ -140,24 +140,6 @@ class Draws:
         """
 
 @final
-class Mark:
-    """A mapped page of a file, in which a crash inside an FMU leaves its signal and the call.
-
-    Args:
-        file: The descriptor of a file of at least 4096 bytes; not needed afterwards.
-
-    Raises:
-        OSError: If the system cannot do so.
-    """
-
-    def __new__(cls, file: int, /) -> Mark: ...
-    def begin(self, call: int, /) -> None:
-        """Note that this thread is inside an FMU that Python calls; see ``enum FmuCall``."""
-
-    def end(self) -> None:
-        """End that."""
-
-@final
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
@@ -174,7 +156,6 @@ class Library(TypedDict):
     logging: bool
     states: bool
     categories: tuple[bytes, ...]
-    mark: Mark | None
     solving: tuple[Any, ...] | None
     system: tuple[Any, ...] | None
     structural_references: bytes

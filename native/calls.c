@@ -7,7 +7,6 @@
 
 #include "failures.h"
 #include "initial_states.h"
-#include "inside.h"
 #include "instances.h"
 #include "records.h"
 #include "snapshots.h"
@@ -126,10 +125,8 @@ static Status read_instance(Pool *pool, Instance *me, const Access *access, doub
     if (me->phase != PHASE_STEPPING && me->phase != PHASE_ENDED) {
         return instance_refuse(me, "the instance needs a reset before anything can be read");
     }
-    begin_call(CALL_READ);
     const Status status = access_get(access, me->library, me->component, memory,
                                      memory + access->count, &pool->floats);
-    end_call();
     if (status > STATUS_WARNING) {
         return instance_fail(pool, me, "reading variables", status);
     }

@@ -29,9 +29,6 @@ Entry pool_enter(Pool *pool) {
 void pool_leave(Pool *pool) {
     pool_drop_abandoned(pool);
     floats_restore(&pool->floats);
-    if (mark_struck) {
-        mark_forgive(pool->settings.mark);
-    }
     end_inside();
     mutex_unlock(&pool->lock);
 }

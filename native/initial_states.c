@@ -3,7 +3,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "inside.h"
 #include "instances.h"
 #include "records.h"
 
@@ -76,11 +75,9 @@ static Status initialize_once(Pool *pool, Instance *me, const Access *start, Scr
     }
     instance_begin_turn(pool);
     atomic_add(&initializations, 1);
-    begin_call(CALL_INITIALIZE);
     experiment.start_time = me->start_time;
     status = s->fmi->initialize(me->library, me->component, &experiment,
                                 (StartValues){.set = set_start_values, .context = &context}, &doing);
-    end_call();
     instance_end_turn(pool);
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {

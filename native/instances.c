@@ -2,7 +2,6 @@
 
 #include "failures.h"
 #include "floats.h"
-#include "inside.h"
 #include "loading.h"
 
 static const char *name_of(const Pool *pool, size_t index) {
@@ -32,9 +31,7 @@ static bool build(Pool *pool, Instance *me, bool logging) {
         return false;
     }
     mutex_lock(pool->making);
-    begin_call(CALL_INSTANTIATE);
     me->component = s->fmi->instantiate(me->library, &identity);
-    end_call();
     mutex_unlock(pool->making);
     floats_restore_if_seen(&pool->floats);
     me->phase = me->component == NULL ? PHASE_DEAD : PHASE_INSTANTIATED;
@@ -142,7 +139,6 @@ static void free_states(Pool *pool, Instance *me) {
 void instance_discard(Pool *pool, Instance *me) {
     const Fmi *fmi = pool->settings.fmi;
 
-    begin_call(CALL_FREE);
     free_states(pool, me);
     if (me->phase == PHASE_STEPPING || me->phase == PHASE_ENDED) {
         instance_judge(me, fmi->terminate(me->library, me->component));
@@ -156,7 +152,6 @@ void instance_discard(Pool *pool, Instance *me) {
         fmi->drop(me->library, me->component);
         mutex_unlock(pool->making);
     }
-    end_call();
     floats_restore_if_seen(&pool->floats);
     me->component = NULL;
     me->phase = PHASE_DEAD;
@@ -173,14 +168,12 @@ static void reload_private_library(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
     char unused[256];
 
-    begin_call(CALL_LOAD);
     if (s->private_libraries) {
         pool_unload(pool, index_of(pool, me));
         if (!pool_load(pool, index_of(pool, me), unused, sizeof unused)) {
             pool_unload(pool, index_of(pool, me));
         }
     }
-    end_call();
     floats_restore(&pool->floats); /* loading a library runs code, too */
 }
 
@@ -239,9 +232,7 @@ static Status reset(Pool *pool, Instance *me) {
     } else {
         instance_begin_turn(pool);
     }
-    begin_call(CALL_RESET);
     const Status status = pool->settings.fmi->reset(me->library, me->component);
-    end_call();
     if (renews) {
         mutex_unlock(pool->making);
     } else {
@@ -268,9 +259,7 @@ Status instance_return_to_start(Pool *pool, Instance *me) {
 
 Status instance_save(Pool *pool, Instance *me, void **state) {
     *state = NULL;
-    begin_call(CALL_SAVE);
     const Status status = pool->settings.fmi->get_state(me->library, me->component, state);
-    end_call();
     floats_restore_if_seen(&pool->floats);
     return status > STATUS_WARNING ? instance_fail(pool, me, "saving the FMU state", status)
                                    : status;
@@ -280,9 +269,7 @@ Status instance_restore(Pool *pool, Instance *me, void *state) {
     if (me->phase == PHASE_DEAD) {
         return instance_refuse(me, "no restore after a fatal error");
     }
-    begin_call(CALL_RESTORE);
     const Status status = pool->settings.fmi->set_state(me->library, me->component, state);
-    end_call();
     floats_restore_if_seen(&pool->floats);
     if (status > STATUS_WARNING) {
         instance_fail(pool, me, "restoring the FMU state", status);

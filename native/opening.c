@@ -78,11 +78,9 @@ static bool load_libraries(Pool *pool, char *error, size_t size) {
     const Settings *s = &pool->settings;
     bool loaded = true;
 
-    begin_call(CALL_LOAD);
     for (size_t i = 0; i < number_of_libraries(s) && loaded; i++) {
         loaded = pool_load(pool, i, error, size);
     }
-    end_call();
     floats_restore(&pool->floats);
     return loaded;
 }
@@ -152,11 +150,9 @@ static void free_instances(Pool *pool) {
         instance_discard(pool, &pool->instances[i]);
         failure_drop(&pool->instances[i]);
     }
-    begin_call(CALL_FREE);
     for (size_t i = 0; i < number_of_libraries(s) && pool->libraries != NULL; i++) {
         pool_unload(pool, i);
     }
-    end_call();
     floats_restore(&pool->floats);
 }
 

@@ -12,7 +12,6 @@
 #include "floats.h"
 #include "fmi.h"
 #include "log.h"
-#include "mark.h"
 #include "methods.h"
 #include "platform.h"
 #include "play.h"
@@ -58,7 +57,6 @@ typedef struct {
     double *output_values; /* one row of count per output */
     int8_t *status;
     int64_t *health; /* one row of HEALTH_COUNTS per instance */
-    const Mark *mark; /* where a crash is noted, or NULL */
     Solving solving;    /* the method is NULL in co-simulation */
     const char *start_outputs; /* doubles in the place of outputs that the FMU does not tell before
                                 * the first step, or NULL */

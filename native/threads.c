@@ -16,7 +16,6 @@
 #include <string.h>
 
 #include "floats.h"
-#include "mark.h"
 #include "platform.h"
 
 #if !defined _WIN32
@@ -263,7 +262,6 @@ static bool start_helper(size_t number) {
 #else
 
 static void *helper_entry(void *number) {
-    mark_prepare_thread();
     helper_main((size_t)(uintptr_t)number);
     return NULL;
 }

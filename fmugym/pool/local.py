@@ -7,7 +7,6 @@ import logging
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.health import HealthArray
-from fmugym.pool.mark import Mark
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.saving import SavingPool
@@ -28,7 +27,6 @@ def local_pool(
     first_index: int = 0,
     counts: HealthArray | None = None,
     attended: bool = True,
-    mark: Mark | None = None,
 ) -> SavingPool:
     """Make a pool that loads the FMU into this process.
 
@@ -42,7 +40,6 @@ def local_pool(
         first_index: See ``NativePool``.
         counts: See ``NativePool``.
         attended: Whether an ``Attendant`` goes with resets where one is needed.
-        mark: Where a crash inside the FMU is noted.
 
     Raises:
         LicenceError: If the FMU gets no licence.
@@ -60,7 +57,6 @@ def local_pool(
         private_libraries=private_libraries,
         first_index=first_index,
         counts=counts,
-        mark=mark,
     )
     pool.attend(Attendant.of(fmu.path.name, spec, log) if attended else None)
     announce(STEP)

@@ -42,7 +42,6 @@ from fmugym.pool.callbacks import Receiver
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
-from fmugym.pool.mark import Mark
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
@@ -92,7 +91,6 @@ class NativePool(SavingPool):
             instantiated only once per process. See ``fmugym.trial.shared_globals``.
         first_index: The number of the first instance in messages.
         counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
-        mark: Where a crash inside the FMU is noted.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -116,7 +114,6 @@ class NativePool(SavingPool):
         private_libraries: bool | None = None,
         first_index: int = 0,
         counts: HealthArray | None = None,
-        mark: Mark | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         spec = spec.fitting(fmu.description)
@@ -132,7 +129,6 @@ class NativePool(SavingPool):
         self._counts = no_counts(num_instances) if counts is None else counts
         self._result = self.outputs, self.statuses
         self._fmu, self._spec, self._first_index = fmu, spec, first_index
-        self._mark = mark
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         try:
             self._pool = self._open(log, private_libraries)
@@ -164,7 +160,6 @@ class NativePool(SavingPool):
                     | {
                         "private": private_libraries,
                         "logging": log.isEnabledFor(logging.INFO),
-                        "mark": None if self._mark is None else self._mark.page,
                         "solving": solving_settings(description, spec),
                         "system": system_settings(
                             fmu, spec, folder, self._hosts(private_libraries)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from fmugym.archive.fmu import FMU
@@ -15,11 +14,8 @@ from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.verdict import Verdict
 
 __all__ = [
-    "is_known_to_harm",
     "known_resuming",
     "known_verdict",
-    "marks_of",
-    "note_harm",
     "note_resuming",
     "state_files",
     "with_harm",
@@ -37,21 +33,6 @@ def state_files(fmu: FMU) -> str:
         return str(cache_folder("states") / content_key(Candidate.of(fmu)))
     except ordinary(OSError):  # there is no folder for caches
         return ""
-
-
-def marks_of(candidate: Candidate) -> tuple[Path, str]:
-    """The folder and the key of an FMU's marks; see ``fmugym.pool.mark``.
-
-    Raises:
-        OSError: If there is no folder for caches.
-    """
-    return cache_folder("marks"), content_key(candidate)
-
-
-def is_known_to_harm(candidate: Candidate) -> bool:
-    """Whether the cache says that an FMU harms its process."""
-    known = Verdict.from_text(recall(content_key(candidate)))
-    return known is not None and known.isolate
 
 
 def with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
@@ -78,36 +59,3 @@ def note_resuming(candidate: Candidate, spec: Any, starts: Any, method: SaveMeth
 
 def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:
     return f"{verdict_key(candidate, spec, starts)}-resuming"
-
-
-def revise(candidate: Candidate, spec: Any, starts: Any, verdict: Verdict) -> None:
-    """Replace the verdict that ``examine`` has cached for the same arguments.
-
-    An FMU that is found to harm its process counts as harmful with every other config, too.
-    """
-    verdict = with_harm(verdict, candidate)
-    for key in (verdict_key(candidate, spec, starts), content_key(candidate)):
-        remember(key, verdict.to_text())
-
-
-def note_harm(
-    candidate: Candidate, spec: Any, starts: Any, verdict: Verdict, reason: str
-) -> Verdict:
-    """Add to the cached verdict that an FMU harms its process.
-
-    Args:
-        candidate: As for ``examine``.
-        spec: As for ``examine``.
-        starts: As for ``examine``.
-        verdict: The verdict if nothing is cached.
-        reason: What the FMU has done, in one sentence.
-
-    Returns:
-        The new verdict.
-    """
-    known = Verdict.from_text(recall(verdict_key(candidate, spec, starts))) or verdict
-    if known.isolate:
-        return known
-    harmful = replace(known, isolate=True, reasons=(*known.reasons, reason))
-    revise(candidate, spec, starts, harmful)
-    return harmful

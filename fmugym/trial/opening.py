@@ -27,19 +27,14 @@ from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.local import local_pool
-from fmugym.pool.mark import Mark, Remains, remains_of
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
-from fmugym.signals import Ignoring, ordinary
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
-    is_known_to_harm,
     known_resuming,
-    marks_of,
-    note_harm,
 )
 from fmugym.trial.neighbours import disturb_in_turn
 from fmugym.trial.plan import Plan, is_alone
@@ -125,14 +120,11 @@ def make_pool(
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
 
-        def note_crash(how: str) -> None:
-            _note_crash(fmu, spec, starts, verdict, how, log)
-
         actual = replace(spec, blind_start=verdict.blind_start, call_timeout=timeout)
         _tell_of_reading(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)
-            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout, note_crash)
+            pool = _open(fmu, trust.spec, num_instances, log, completed, call_timeout)
         pool.save_by(trust.method_that_works)
         return pool
 
@@ -147,7 +139,6 @@ def _open(
     log: logging.Logger,
     plan: Plan,
     call_timeout: float | None,
-    note_crash: Callable[[str], None],
 ) -> SavingPool:
     spec = replace(
         spec,
@@ -157,7 +148,7 @@ def _open(
     )
     claim = take(Candidate.of(fmu), spec, num_instances, "an environment")
     try:
-        pool = _open_now(fmu, spec, num_instances, log, plan, call_timeout, note_crash)
+        pool = _open_now(fmu, spec, num_instances, log, plan, call_timeout)
     except BaseException:
         if claim is not None:
             claim.release()
@@ -174,7 +165,6 @@ def _open_now(
     log: logging.Logger,
     plan: Plan,
     call_timeout: float | None,
-    note_crash: Callable[[str], None],
 ) -> SavingPool:
     if plan.isolation == "process":
         pool = ProcessPool(
@@ -186,7 +176,6 @@ def _open_now(
             threads=plan.threads,
             own_files=plan.own_files,
             call_timeout=call_timeout,
-            note_crash=note_crash,
         )
         pool.attend(Attendant.of(fmu.path.name, spec, log))
         return pool
@@ -197,19 +186,7 @@ def _open_now(
         log,
         threads=plan.threads,
         private_libraries=plan.private_libraries,
-        mark=_mark(Candidate.of(fmu)),
     )
-
-
-def _note_crash(
-    fmu: FMU, spec: PoolSpec, starts: Starts | None, verdict: Verdict, how: str, log: logging.Logger
-) -> None:
-    """Let later environments run in worker processes, too, if nobody says otherwise."""
-    candidate = Candidate.of(fmu)
-    if not candidate.exempt and not verdict.isolate:
-        log.info("%s: %s, so later environments run in worker processes", fmu.path.name, how)
-        with Ignoring(OSError):  # the file of the FMU may be gone by now
-            note_harm(candidate, _tried(spec), starts, verdict, f"in training, {how}")
 
 
 @dataclass(frozen=True)
@@ -285,46 +262,11 @@ def _verdict(
     several = several and not is_alone(fmu)
     isolated = plan.isolation == "process"
     if not candidate.exempt:
-        remains = _remains(candidate)
-        verdict = examine(candidate, spec, starts, several=several, must_survive=not isolated)
-        return _judge_remains(remains, verdict, candidate, spec, starts)
+        return examine(candidate, spec, starts, several=several, must_survive=not isolated)
     if several and (isolated or _disturb_here(candidate, spec)):
         verdict = examine(candidate, spec, several=True, alone=not isolated, must_survive=False)
         return Verdict(neighbours=verdict.neighbours or Neighbours.PROCESSES)
     return Verdict()
-
-
-def _remains(candidate: Candidate) -> Remains:
-    try:
-        return remains_of(*marks_of(candidate))
-    except ordinary(OSError):  # there is no folder for caches
-        return Remains([], [])
-
-
-def _judge_remains(
-    remains: Remains, verdict: Verdict, candidate: Candidate, spec: PoolSpec, starts: Starts | None
-) -> Verdict:
-    """Let an FMU that has crashed an earlier process harm no other one.
-
-    The marks are removed after the verdict is cached, so that an environment that is opened
-    meanwhile finds one or the other. If nothing can be cached, they stay.
-    """
-    if remains.crashes:
-        verdict = note_harm(candidate, spec, starts, verdict, remains.crashes[-1])
-    if not remains.crashes or is_known_to_harm(candidate):
-        remains.remove()
-    return verdict
-
-
-def _mark(candidate: Candidate) -> Mark | None:
-    """Where a crash of this process is noted; nowhere if verdicts are not kept."""
-    if candidate.exempt:
-        return None
-    try:
-        return Mark.attempt(*marks_of(candidate))
-    except ordinary(OSError) as error:
-        logger.debug("a crash would not be noted: %s", error)
-        return None
 
 
 def _disturb_here(candidate: Candidate, spec: PoolSpec) -> bool:

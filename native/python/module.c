@@ -137,7 +137,6 @@ PyMODINIT_FUNC PyInit__native(void) {
     pool_prepare_process();
     if (!find_error() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
-        !add_type(module, &mark_type, &mark_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
         PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {

@@ -5,7 +5,7 @@
 #include "python.h"
 
 typedef struct {
-    PyObject *paths, *categories, *mark, *solving, *system, *stop_time, *tolerance;
+    PyObject *paths, *categories, *solving, *system, *stop_time, *tolerance;
     PyAccess *inputs, *outputs;
     Py_ssize_t size_of_places;
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
@@ -31,12 +31,12 @@ bool parse_group(PyObject *group, const char *format, char **names, ...) {
 
 static bool parse_library(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"version", "manner",  "model",  "token",      "resources", "paths",
-                            "private", "logging", "states", "categories", "mark", "solving", "system",
+                            "private", "logging", "states", "categories", "solving", "system",
                             "structural_references", "structural_values", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$iiyyyO!pppO!OOOy#y#:library", names, &a->version, &a->manner, &s->model,
+    return parse_group(group, "$iiyyyO!pppO!OOy#y#:library", names, &a->version, &a->manner, &s->model,
                        &s->token, &s->resources, &PyTuple_Type, &a->paths, &a->private_libraries, &a->logging,
-                       &a->can_save, &PyTuple_Type, &a->categories, &a->mark, &a->solving, &a->system,
+                       &a->can_save, &PyTuple_Type, &a->categories, &a->solving, &a->system,
                        &s->experiment.structural_references, &a->size_of_references,
                        &s->experiment.structural_values, &a->size_of_values);
 }
@@ -196,7 +196,7 @@ static bool settle(PyPool *self, const Arguments *a) {
         self->system->private_libraries = s->private_libraries;
         self->system->largest_state = STATES_LIMIT / s->count;
     }
-    return take_mark(a->mark, &s->mark) && take_solving(a->solving, &s->solving) &&
+    return take_solving(a->solving, &s->solving) &&
            take_optional(a->stop_time, &s->experiment.has_stop_time, &s->experiment.stop_time) &&
            take_optional(a->tolerance, &s->experiment.has_tolerance, &s->experiment.tolerance);
 }

@@ -26,10 +26,6 @@ typedef struct {
 } PyDraws;
 
 typedef struct {
-    PyObject_HEAD Mark mark;
-} PyMark;
-
-typedef struct {
     PyObject_HEAD Snapshot *snapshot;
     PyObject *pool; /* keeps the memory of the pool alive, but not its instances */
 } PySnapshot;
@@ -48,18 +44,16 @@ typedef struct {
     PyObject *actions[2]; /* of a single environment, in the last step and in the one before */
 } PyPool;
 
-extern PyTypeObject *access_type, *draws_type, *mark_type, *snapshot_type;
+extern PyTypeObject *access_type, *draws_type, *snapshot_type;
 extern PyObject *closed_error; /* raised by calls of a closed pool */
 
-extern PyType_Spec access_spec, draws_spec, mark_spec, snapshot_spec, pool_spec;
+extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
 
 /* The table of an FMI version; NULL with an exception if there is none. */
 const Fmi *fmi_of(int version, int manner);
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 
-/* Takes the Mark of an object, which may be None. Returns false with an exception for others. */
-bool take_mark(PyObject *object, const Mark **mark);
 
 PyObject *decode(const char *text);
 /* The texts of a tuple of bytes, to be freed; NULL with an exception if it holds others. */

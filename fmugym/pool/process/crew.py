@@ -38,7 +38,6 @@ class Crew:
         arrays: Those of all instances, in this memory.
         log: Gets the FMU's messages.
         call_timeout: How long a call may take, in seconds; infinite for ever.
-        note_crash: Is told how a worker has crashed.
 
     Attributes:
         supervisors: One for each worker, in the order of the instances.
@@ -59,9 +58,8 @@ class Crew:
         arrays: Arrays,
         log: logging.Logger,
         call_timeout: float,
-        note_crash: Callable[[str], None] | None = None,
     ) -> None:
-        self.supervisors = [Supervisor(setup, memory, log, note_crash) for setup in setups]
+        self.supervisors = [Supervisor(setup, memory, log) for setup in setups]
         self.lost: MaskArray = np.zeros(len(arrays.statuses), np.bool_)
         self.refusal = ""
         self._arrays, self._call_timeout = arrays, call_timeout

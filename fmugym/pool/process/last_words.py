@@ -9,10 +9,7 @@ from typing import BinaryIO, Final
 
 from fmugym.errors import printable
 
-__all__ = ["OutputTail", "describe_exit", "is_crash", "lines_of_echo"]
-
-_CRASHES: Final = ("SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL", "SIGABRT")
-"""The signals by which a process ends if its code goes wrong."""
+__all__ = ["OutputTail", "describe_exit", "lines_of_echo"]
 
 _LINES: Final = 10
 _LINE_LENGTH: Final = 300
@@ -36,16 +33,6 @@ def describe_exit(return_code: int) -> str:
         return f"signal {signal.Signals(-return_code).name}"
     except ValueError:
         return f"signal {-return_code}"
-
-
-def is_crash(return_code: int) -> bool:
-    """Whether a process has ended by its own code, and not because another one has ended it.
-
-    Args:
-        return_code: As for ``describe_exit``.
-    """
-    by_signal = -64 <= return_code < 0
-    return not by_signal or any(describe_exit(return_code).endswith(name) for name in _CRASHES)
 
 
 def lines_of_echo(memory: bytes) -> list[str]:

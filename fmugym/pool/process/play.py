@@ -38,7 +38,6 @@ _NO_LIBRARY: _native.Library = {
     "logging": False,
     "states": False,
     "categories": (),
-    "mark": None,
     "solving": None,
     "system": None,
     "structural_references": b"",

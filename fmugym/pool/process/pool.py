@@ -69,7 +69,6 @@ class ProcessPool(SavingPool):
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
-        note_crash: Is told how a worker has crashed, in a part of a sentence.
 
     Attributes:
         workers: How many processes there are.
@@ -91,7 +90,6 @@ class ProcessPool(SavingPool):
         threads: int | None = None,
         own_files: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
-        note_crash: Callable[[str], None] | None = None,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -119,7 +117,7 @@ class ProcessPool(SavingPool):
         self._plays, self._play = 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
-        self._crew = Crew(fmu, setups, memory, arrays, log, timeout, note_crash)
+        self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
         self._states = StatesOfWorkers(self._crew)
 
     # The contract of Pool.

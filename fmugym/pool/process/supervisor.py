@@ -8,14 +8,13 @@ import math
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.errors import printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.process.channel import Channel, Code
-from fmugym.pool.process.last_words import describe_exit, is_crash, lines_of_echo
+from fmugym.pool.process.last_words import describe_exit, lines_of_echo
 from fmugym.pool.process.launcher import Process
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
@@ -63,7 +62,6 @@ class Supervisor:
         setup: What the worker needs to know.
         memory: Shared with the worker.
         log: Gets the FMU's messages.
-        note_crash: Is told how the worker has crashed.
 
     Attributes:
         block: The indices of the worker's instances.
@@ -80,7 +78,6 @@ class Supervisor:
         setup: Setup,
         memory: Memory,
         log: logging.Logger,
-        note_crash: Callable[[str], None] | None = None,
     ) -> None:
         self.block = setup.block
         self.generation = 0
@@ -91,7 +88,6 @@ class Supervisor:
         self.released: deque[tuple[int, int]] = deque()
         self._setup, self._log = setup, log
         self._transport = transport_for(setup, memory)
-        self._note_crash = note_crash
         self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
         self._progress = make_progress(memory, setup.num_instances)[setup.block]
         self._done = b""
@@ -348,8 +344,6 @@ class Supervisor:
         self._output.drain()
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
-        if self._note_crash is not None and status is not None and is_crash(status):
-            self._note_crash(f"a worker process {how} in {doing}")
         raise LostError(self.reason)
 
     def _extended(self, deadline: float, doing: str) -> float:
