@@ -97,7 +97,10 @@ def linear(factor, offset=0.0):
 
 def write(made, path):
     """Write a system of one level, as another tool might; returns the path."""
-    files = {one.fmu.path: f"resources/{n}.fmu" for n, one in enumerate(made.components.values())}
+    files = {
+        one.fmu.path: f"resources/{n}-{one.fmu.path.name}"
+        for n, one in enumerate(made.components.values())
+    }
     parts = []
     for name, one in made.components.items():
         starts = {key: setting(value) for key, value in one.given.start_values.items()}
