@@ -386,9 +386,6 @@ class Pool:
     def count_steps(self) -> None:
         """Let ``health`` have all steps until now, which it otherwise gets at resets."""
 
-    def recycle(self) -> None:
-        """Let each instance be replaced by a new one at its next reset."""
-
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
 

@@ -618,9 +618,9 @@ class FMUEnv(Constructed):
 
         ``resets``; ``steps`` (communication steps); faults by kind: ``discards``, ``errors``,
         ``fatals``, ``not_finite``, ``deaths`` (of its worker process); ``retries`` of discarded
-        steps; ``replacements`` of the instance, and of these ``recyclings`` because of leaks; and
-        ``memory_growth``, the bytes that resets have taken from this process, or by which its
-        worker process has grown.
+        steps; ``replacements`` of the instance, and of these ``recyclings`` of a worker process
+        that had grown; and ``memory_growth``, the bytes that resets have taken from this process,
+        or by which its worker process has grown.
 
         Raises:
             SimulationError: If the environment is closed.

@@ -187,12 +187,6 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     return failed;
 }
 
-void pool_recycle(Pool *pool) {
-    for (size_t i = 0; i < pool->settings.count; i++) {
-        pool->instances[i].due = true;
-    }
-}
-
 size_t pool_unbundle(Pool *pool, const States *states, size_t count) {
     const Call call = {.turn = NULL};
     Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};

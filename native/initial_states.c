@@ -217,7 +217,7 @@ static Status reset_instance(Pool *pool, Instance *me, const Call *call, Scratch
     health_of(pool, me)[RESETS]++;
     health_of(pool, me)[RETRIED] = 0;
     forget_old_messages(pool, me);
-    if (instance_renew_if_due(pool, me) > STATUS_WARNING) {
+    if (instance_renew(pool, me) > STATUS_WARNING) {
         return STATUS_FATAL;
     }
     matrix_gather(values, index_of(pool, me), start->count, scratch.values);

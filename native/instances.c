@@ -203,16 +203,9 @@ static Status replace(Pool *pool, Instance *me) {
     return rebuild(pool, me);
 }
 
-Status instance_renew_if_due(Pool *pool, Instance *me) {
-    const bool due = me->due;
-
-    me->due = false;
+Status instance_renew(Pool *pool, Instance *me) {
     if (me->phase == PHASE_DEAD || me->phase == PHASE_INSTANTIATED) {
         return STATUS_OK;
-    }
-    if (due) {
-        health_of(pool, me)[RECYCLINGS]++;
-        return replace(pool, me);
     }
     if (me->phase != PHASE_STEPPING && instance_rebuild_to_hear(pool, me)) {
         return STATUS_OK;

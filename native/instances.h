@@ -22,9 +22,8 @@ void instance_discard(Pool *pool, Instance *me);
 /* Returns an instance to the state just after instantiation. Replaces the instance if it refuses
  * a reset or can no longer be reset. */
 Status instance_return_to_start(Pool *pool, Instance *me);
-/* Replaces an instance that must be recycled because of leaks, or that a reset does not fully
- * restore. */
-Status instance_renew_if_due(Pool *pool, Instance *me);
+/* Replaces an instance that a reset does not fully restore. */
+Status instance_renew(Pool *pool, Instance *me);
 
 Status instance_save(Pool *pool, Instance *me, void **state);
 Status instance_restore(Pool *pool, Instance *me, void *state);

@@ -119,7 +119,6 @@ typedef struct {
     uint32_t generation; /* increases whenever the instance is replaced */
     uint8_t phase;
     bool unsavable; /* the FMU once refused to save its state */
-    bool due;       /* whether the next reset replaces it */
     uint8_t hearing;
 } Instance;
 
@@ -253,9 +252,6 @@ bool pool_failure(Pool *pool, size_t index, Failure *copy);
 
 /* Adds all steps so far to the health counters. */
 void pool_count_steps(Pool *pool);
-
-/* Marks each instance for replacement by a new one at its next reset. */
-void pool_recycle(Pool *pool);
 
 /* What became of the episodes in a step that plays. */
 typedef struct {

@@ -198,11 +198,7 @@ def read(rng, pools, spec, starts):
         require(np.hstack(alone).tolist() == together.tolist(), f"read: {alone} and {together}")
 
 
-def recycle(rng, pools, spec, starts):
-    pools.all("recycle", lambda pool, _: pool.recycle())
-
-
-ACTIONS = (*(step,) * 8, *(reset,) * 3, save, restore, restore, bundle, write, read, recycle)
+ACTIONS = (*(step,) * 8, *(reset,) * 3, save, restore, restore, bundle, write, read)
 
 
 def play(rng, system, versions):

@@ -288,9 +288,6 @@ class Subject:
     def health(self):
         self.pool.health()
 
-    def recycle(self):
-        self.pool.recycle()
-
     def costs(self):
         return self.pool.costs, self.pool.uses_states
 
@@ -314,7 +311,7 @@ ACTIONS = (
         "read",
         "health",
     ),
-    *("recycle", "costs", "close"),
+    *("costs", "close"),
     *("bundle", "unbundle", "unbundle", "record", "write", "roll_out", "roll_out"),
 )
 

@@ -276,11 +276,6 @@ class PoolMachine(Machine):
         with self.faults():
             self.subject.failure(0)
 
-    @rule()
-    def recycle(self):
-        with self.faults():
-            self.subject.recycle()
-
 
 @pytest.fixture(name="record")
 def fixture_record(tmp_path, monkeypatch):

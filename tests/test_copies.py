@@ -170,20 +170,6 @@ def test_after_a_fault_it_is_played_again(copying, caplog):
         assert play(env) == expected
 
 
-def test_a_replaced_instance_plays_it_again(copying):
-    """Copies are no reason to keep an instance that leaks."""
-    with copying(leak_limit=1000) as env:
-        snapshot = begin(env).save_state()
-        expected = play(env)
-        pool = env._open_pool("a test")
-        assert not pool._watch.has_snapshots
-        pool.recycle()
-        env.reset(seed=0)
-        env.restore_state(snapshot)
-        assert env.health["recyclings"] == 1
-        assert play(env) == expected
-
-
 def test_of_an_episode_that_has_ended(copying):
     with copying(max_episode_steps=3) as env:
         begin(env, 3)

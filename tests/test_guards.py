@@ -16,8 +16,7 @@ import fmugym
 from fmugym import FMU, ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.memory import grown_bytes, heap_is_known
-from fmugym.pool.spec import DEFAULT_LEAK_LIMIT
+from fmugym.pool.memory import grown_bytes
 from fmugym.trial.opening import make_pool
 from fmugym.vector import FMUVectorEnv
 
@@ -300,25 +299,12 @@ class TestLeaks:
         return grown_bytes() - before
 
     @pytest.mark.parametrize("version", [1, 2])
-    def test_instances_are_recycled(self, make, version, caplog):
+    @pytest.mark.parametrize("leak", [LEAK, -LEAK], ids=["until the end", "for ever"])
+    def test_the_log_says_so_once(self, make, version, leak, caplog):
         pool = make(version, 1, leak_limit=self.LIMIT)
-        growth = self.play(pool, leak=self.LEAK)
-        assert growth < 4 * self.LIMIT < self.RESETS * self.LEAK / 4
-        assert 0 < pool.health()["recyclings"][0] < 60  # few where there is much free memory
-        assert caplog.text == ""
-
-    def test_small_leaks_at_the_default_limit(self, make, caplog):
-        pool = make(2, 1, leak_limit=DEFAULT_LEAK_LIMIT)
-        assert self.play(pool, 30_000, leak=3600) < 1.25 * DEFAULT_LEAK_LIMIT
-        assert pool.health()["recyclings"][0] == 1
-        assert caplog.text == ""
-
-    def test_leaks_in_steps(self, make, caplog):
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        growth = self.play(pool, 300, steps=16, step_leak=self.LEAK / 4)
-        assert growth < 4 * self.LIMIT < 300 * 4 * self.LEAK / 4
-        assert pool.health()["recyclings"][0] < 60
-        assert caplog.text == ""
+        assert self.play(pool, leak=leak) > self.RESETS * self.LEAK / 2
+        assert caplog.text.count("isolation='process'") == 1
+        assert pool.health()["recyclings"][0] == 0
 
     def test_all_growth_is_counted(self, make, tmp_path):
         """Also where others have left free memory, which the FMU takes, and the other way round."""
@@ -334,10 +320,9 @@ class TestLeaks:
         assert growth > 20 * MB
         assert pool.health()["memory_growth"][0] == pytest.approx(growth, rel=0.1)
 
-    @pytest.mark.parametrize("leak", [0, LEAK])
     @pytest.mark.parametrize("keeps", [False, True])
-    def test_the_caller_may_take_memory(self, make, caplog, leak, keeps):
-        """Much for a while, or more and more; the FMU's leaks are found all the same."""
+    def test_the_caller_may_take_memory(self, make, caplog, keeps):
+        """Much for a while, or more and more."""
         pool = make(2, 1, leak_limit=self.LIMIT)
         kept, counter = [], itertools.count()
 
@@ -347,35 +332,8 @@ class TestLeaks:
             else:
                 kept[:] = [np.ones(2 * MB)] if next(counter) % 100 < 50 else []
 
-        growth = self.play(pool, between=allocate, leak=leak)
-        growth -= sum(array.nbytes for array in kept)
-        recyclings = pool.health()["recyclings"][0]
-        assert growth < 5 * self.LIMIT
-        assert (10 if leak else 0) <= recyclings < (60 if leak else 8)
+        self.play(pool, between=allocate)
         assert caplog.text == ""
-
-    def test_that_it_does_not_help_is_said_once(self, make, caplog):
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        self.play(pool, leak=-self.LEAK)
-        assert caplog.text.count("isolation='process'") == 1
-        assert pool.health()["recyclings"][0] < 10
-
-    def test_snapshots_outlive_what_the_caller_takes(self, make):
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        set_up(pool)
-        step(pool, 1.0)
-        snapshot, kept = pool.save(), []
-        self.play(pool, 200, lambda: kept.append(np.ones(self.LEAK // 8)))
-        assert pool.health()["recyclings"][0] == 0
-        assert pool.restore(snapshot)[0].tolist() == [[0.8]]
-
-    def test_snapshots_do_not_outlive_leaks(self, make):
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        set_up(pool)
-        snapshot = pool.save()
-        assert self.play(pool, leak=self.LEAK) < 5 * self.LIMIT
-        with pytest.raises(SimulationError):
-            pool.restore(snapshot)
 
     @pytest.mark.parametrize("leak", [{"leak": -LEAK}, {"step_leak": -LEAK / 4, "steps": 4}])
     def test_a_worker_that_leaks_is_replaced(self, make, leak):
@@ -387,29 +345,13 @@ class TestLeaks:
         assert health["deaths"].tolist() == [0]
         assert health["memory_growth"][0] < 3 * self.LIMIT
 
-    def test_recycled_instances_are_as_before(self, make):
-        pool = make(2, 2)
-        set_up(pool, k=[1.0, 3.0])
-        expected = step(pool, 1.0, 1.0)[0].copy()
-        pool.recycle()
-        step(pool, 1.0, 1.0)
-        set_up(pool, k=[1.0, 3.0])
-        np.testing.assert_array_equal(step(pool, 1.0, 1.0)[0], expected)
-        assert pool.health()["replacements"].tolist() == [1, 1]
-
-    def test_counts_may_be_forgotten(self, make):
+    def test_counts_may_be_forgotten(self, make, caplog):
         """The watch goes on."""
         pool = make(2, 1, leak_limit=self.LIMIT)
         for _ in range(4):
-            assert self.play(pool, 300, leak=self.LEAK) < 4 * self.LIMIT
+            self.play(pool, 60, leak=self.LEAK)
             pool.forget_health()
-
-    @pytest.mark.skipif(not heap_is_known(), reason="needs glibc 2.33")
-    def test_without_knowledge_of_the_heap(self, make, monkeypatch, caplog):
-        monkeypatch.setattr("fmugym.pool.memory._mallinfo", lambda: None)
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        assert self.play(pool, leak=self.LEAK) < 4 * self.LIMIT
-        assert caplog.text == ""
+        assert caplog.text.count("isolation='process'") == 1
 
 
 def test_bundled_fmus_are_not_watched():

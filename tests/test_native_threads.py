@@ -63,7 +63,7 @@ def test_a_call_that_waits_while_another_closes(busy):
     for thread in threads:
         thread.join()
     assert set(refused) <= {"the pool is closed"}
-    for call in (pool.step_own, pool.save, pool.recycle, lambda: pool.read(())):
+    for call in (pool.step_own, pool.save, lambda: pool.read(())):
         with pytest.raises(SimulationError, match="closed"):
             call()
 

@@ -1,17 +1,11 @@
-"""The leak watch: FMUs that leak are freed and made anew now and then.
+"""The leak watch: it tells once that resets of an FMU take memory for good.
 
 The watch looks at the memory of the process, at some of the calls that reset instances. It cannot
-know who has taken memory, the FMU or the caller. So it finds out: when the process has grown by the
-limit, all instances are replaced by new ones at their next resets, and the watch measures how much
-of the heap that frees.
+know who has taken memory, the FMU or the caller. So once the process has grown by the limit, it
+measures what some of these calls allocate. If that makes up the limit in all resets, the log says
+so. If not, the process may grow twice as much before the next measurement.
 
-* If it frees much, the FMU leaks. From then on the instances are replaced as often as they leak as
-  much as the limit.
-* If it frees little, the growth is the caller's, or the FMU does not give it back. The process may
-  then grow twice as much before the next attempt. The watch also measures what the next resets
-  allocate. If that explains the growth, the log says so once.
-
-Steps cost nothing: what they leak is seen at the next reset.
+Steps cost nothing. Worker processes that grow are replaced; see ``fmugym.pool.process.pool``.
 """
 
 from __future__ import annotations
@@ -26,7 +20,7 @@ from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray
-from fmugym.pool.memory import grown_bytes, heap_bytes, heap_is_known, memory_is_known
+from fmugym.pool.memory import grown_bytes, heap_bytes, memory_is_known
 
 __all__ = ["LeakWatch", "ProcessGrowth", "watch_leaks"]
 
@@ -34,19 +28,10 @@ _FIRST_RESETS: Final = 4
 """Of each instance; what they take is no leak: FMUs allocate, and initial states are kept."""
 
 _LONGEST_INTERVAL: Final = 16
-"""Calls from one look at the memory to the next; fewer while it grows fast."""
+"""Calls from one look at the memory to the next."""
 
-_FAST: Final = 1 / 32
-"""Share of the limit; growth by more from one look to the next is fast."""
-
-_REPLACING_CALLS: Final = 16
-"""Calls that replace instances, for a measurement of what that frees."""
-
-_PLAIN_CALLS: Final = 32
-"""Calls that replace none, for a measurement of what they allocate."""
-
-_TOLERANCE: Final = 1 / 8
-"""Share of what a reset allocates; two measurements of it may differ by that much."""
+_MEASURED_CALLS: Final = 32
+"""Calls of a measurement."""
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -67,103 +52,25 @@ class _Total:
         return self._total
 
 
-class _Measurement:
-    """What some calls allocate.
-
-    Args:
-        resets: The total of all resets.
-        counted: The total of what concerns the measurement; calls without it are left out.
-        calls: It is done after so many calls.
-        count: Or when so much has been counted.
-        most_resets: Or after so many resets of whatever kind.
-        growth: That of the process, for which the measurement is made.
-
-    Attributes:
-        allocated: Bytes.
-        growth: As given.
-    """
-
-    def __init__(
-        self,
-        resets: _Total,
-        counted: _Total,
-        growth: int,
-        calls: int,
-        count: float = math.inf,
-        most_resets: float = math.inf,
-    ) -> None:
-        self.allocated, self.growth = 0, growth
-        self._resets, self._counted, self._begin = resets, counted, counted.read()
-        self._calls_left, self._enough = calls, count
-        self._deadline = resets.read() + most_resets
-
-    @passes_refusals
-    def around(self, call: Callable[[], R]) -> R:
-        """Measure a call, and keep it if it has counted anything."""
-        before, counted = heap_bytes(), self._counted.read()
-        result = call()
-        if self._counted.read() > counted:
-            self.allocated += heap_bytes() - before
-            self._calls_left -= 1
-        return result
-
-    @property
-    def count(self) -> int:
-        """How much has been counted."""
-        return self._counted.read() - self._begin
-
-    @property
-    def is_done(self) -> bool:
-        """Whether it is enough."""
-        if self._calls_left <= 0 or self.count >= self._enough:
-            return True
-        return self._resets.read() >= self._deadline
-
-    @property
-    def each(self) -> float:
-        """Bytes that were allocated for each that was counted."""
-        return self.allocated / max(1, self.count)
-
-
 class LeakWatch:
-    """Finds out whether an FMU leaks, and has its instances recycled if so.
+    """Finds out whether resets of an FMU take memory for good, and says so once.
 
     Args:
-        limit: Bytes that the FMU may leak.
+        limit: Bytes that they may take.
         counts: Those of the pool's instances.
-        recycle: Lets all instances be replaced at their next resets.
-        log: Is told if that does not help.
+        log: Is told.
         name: What to call the FMU then.
-
-    Attributes:
-        has_snapshots: Whether the caller has saved states of instances. They go with their
-            instances. So no instance is replaced then unless resets are known to leak.
     """
 
-    def __init__(
-        self,
-        limit: int,
-        counts: HealthArray,
-        recycle: Callable[[], None],
-        log: logging.Logger,
-        name: str,
-    ) -> None:
-        self.has_snapshots = False
-        self._limit, self._name, self._log, self._recycle = limit, name, log, recycle
+    def __init__(self, limit: int, counts: HealthArray, log: logging.Logger, name: str) -> None:
+        self._limit, self._name, self._log = limit, name, log
         self._num_instances = len(counts)
         self._resets = _Total(counts, Column.RESETS)
-        self._recyclings = _Total(counts, Column.RECYCLINGS)
         self._first: int | None = None  # bytes after the first resets
-        self._base = self._latest = 0  # bytes where growth starts, and at the last look
-        self._allowance = limit  # growth that does not call for an attempt
-        self._mark = 4 * limit  # growth since the first resets that calls for a measurement
-        self._rate = 0.0  # bytes per reset that recycling gives back
-        self._since = self._num_instances  # resets when the present instances had begun
-        self._until = 0  # resets until the last attempt
+        self._allowance: float = limit  # growth that does not call for a measurement
         self._interval = self._calls_left = 1
-        self._replacing: _Measurement | None = None
-        self._plain: _Measurement | None = None
-        self._is_said = False
+        self._to_measure = 0  # calls
+        self._allocated = self._measured = 0  # bytes, and resets
 
     @property
     def growth(self) -> int:
@@ -183,117 +90,45 @@ class LeakWatch:
 
         return watched
 
-    def call(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call a function that resets instances, and watch it."""
-        left = self._calls_left = self._calls_left - 1
-        if left > 0:
-            return function(*args, **kwargs)
-        return self._look_around(function, *args, **kwargs)
-
     @passes_refusals
     def _look_around(self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function, and look at the memory."""
-        measurement = self._replacing or self._plain
-        if measurement is None:
+        if not self._to_measure:
             result = function(*args, **kwargs)
-            self._look(self._resets.read())
-        else:
-            result = measurement.around(functools.partial(function, *args, **kwargs))
-            if measurement.is_done:
-                self._take(measurement)
+            self._look()
+            return result
+        before, resets = heap_bytes(), self._resets.read()
+        result = function(*args, **kwargs)
+        self._measure(heap_bytes() - before, self._resets.read() - resets)
         return result
 
-    def _look(self, resets: int) -> None:
+    def _look(self) -> None:
         """Look at the memory, and not again for some calls."""
-        now = grown_bytes()
+        self._calls_left = self._interval = min(2 * self._interval, _LONGEST_INTERVAL)
         if self._first is None:
-            if resets > _FIRST_RESETS * self._num_instances:
-                self._first = self._base = self._latest = now
+            if self._resets.read() > _FIRST_RESETS * self._num_instances:
+                self._first = grown_bytes()
+        elif self.growth >= self._allowance:
+            self._calls_left, self._to_measure = 0, _MEASURED_CALLS
+            self._allocated = self._measured = 0
+
+    def _measure(self, allocated: int, resets: int) -> None:
+        """Note what a call has allocated; those that reset nothing are left out."""
+        if not resets:
             return
-        is_fast = now - self._latest > _FAST * self._limit
-        self._interval = 1 if is_fast else min(2 * self._interval, _LONGEST_INTERVAL)
-        self._calls_left = self._interval
-        self._latest = now
-        if heap_is_known():
-            self._base = min(self._base, now)
-        growth = now - self._base
-        leaked = self._rate * (resets - self._since)
-        if leaked >= self._limit or (growth >= self._allowance and not self.has_snapshots):
-            self._attempt(growth)
-        elif growth >= self._allowance:
-            self._allowance = 2 * growth
-            self._listen(growth)
+        self._allocated += allocated
+        self._measured += resets
+        self._to_measure -= 1
+        if not self._to_measure:
+            self._judge(self._allocated / self._measured * self._resets.read())
 
-    def _attempt(self, growth: int) -> None:
-        """Recycle the instances and measure what that frees."""
-        self._calls_left, self._until = 0, self._resets.read()
-        self._replacing = _Measurement(
-            *(self._resets, self._recyclings, growth, _REPLACING_CALLS),
-            count=self._num_instances,
-            most_resets=_FIRST_RESETS * self._num_instances,
-        )
-        self._recycle()
-
-    def _listen(self, growth: int) -> None:
-        """Measure what resets allocate."""
-        self._calls_left = 0
-        self._mark = 2 * max(self._mark, self.growth)
-        self._plain = _Measurement(self._resets, self._resets, growth, _PLAIN_CALLS)
-
-    def _take(self, measurement: _Measurement) -> None:
-        """Take over a measurement that is done."""
-        if measurement is self._replacing:
-            self._replacing = None
-            self._judge(measurement.growth, max(0.0, -measurement.each) * self._num_instances)
-        else:
-            self._plain = None
-            self._blame(measurement.each)
-        if self._plain is None:
-            self._latest = grown_bytes()
-            self._begin_anew(measurement.growth)
-
-    def _begin_anew(self, growth: int) -> None:
-        """Count growth from here on.
-
-        Where the heap is not known, memory that was freed and that the process keeps does not show.
-        Growth begins at the highest level so far then.
-        """
-        if heap_is_known():
-            self._base = self._latest
-        elif growth >= self._limit:
-            self._base += growth
-
-    def _judge(self, growth: int, freed: float) -> None:
-        """Learn from an attempt when the next one is worth it.
-
-        Args:
-            growth: That of the process until the attempt, in bytes.
-            freed: What recycling all instances frees, in bytes.
-        """
-        is_due = growth >= self._allowance
-        if not heap_is_known() and not (is_due and self._rate):  # then it is taken to help
-            freed = self._rate * (self._until - self._since) or float(self._limit)
-        self._rate = freed / max(1, self._until - self._since)
-        self._since = self._resets.read()
-        if is_due:
-            helped = freed >= growth / 2
-            self._allowance = self._limit if helped else 2 * growth
-            if not helped or self.growth >= self._mark:
-                self._listen(growth)
-
-    def _blame(self, allocated: float) -> None:
-        """Recycle now and then, or say that it does not help, if each reset allocates so much."""
-        kept = allocated - self._rate
-        lost = kept * self._resets.read()
-        if kept < _TOLERANCE * allocated or lost < self._limit:
-            return
-        if self.has_snapshots and not self._rate:
-            self._rate = allocated
-        elif not self._is_said:
-            self._is_said = True
+    def _judge(self, lost: float) -> None:
+        """Say it, if resets have taken so many bytes."""
+        self._allowance = 2 * self.growth
+        if lost >= self._limit:
+            self._allowance = math.inf
             self._log.warning(
-                "resets of %s have taken %.0f MB of memory, and freeing its instances does not "
-                "give it back; isolation='process' does",
+                "resets of %s have taken %.0f MB of memory; isolation='process' gives it back",
                 self._name,
                 lost / 2**20,
             )
@@ -324,7 +159,6 @@ def watch_leaks(
     fmu: LoadableFMU,
     spec: PoolSpec,
     counts: HealthArray,
-    recycle: Callable[[], None],
     log: logging.Logger,
 ) -> LeakWatch | None:
     """Make the watch of a pool, or None where nothing is watched: bundled FMUs do not leak.
@@ -333,9 +167,8 @@ def watch_leaks(
         fmu: The FMU.
         spec: Has the limit.
         counts: See ``LeakWatch``.
-        recycle: See ``LeakWatch``.
         log: See ``LeakWatch``.
     """
     if spec.leak_limit is None or not memory_is_known() or fmu.bundled:
         return None
-    return LeakWatch(spec.leak_limit, counts, recycle, log, fmu.path.name)
+    return LeakWatch(spec.leak_limit, counts, log, fmu.path.name)

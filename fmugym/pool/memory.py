@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, Final
 
-__all__ = ["grown_bytes", "heap_bytes", "heap_is_known", "memory_is_known"]
+__all__ = ["grown_bytes", "heap_bytes", "memory_is_known"]
 
 _PAGE_SIZE: Final = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 0
 
@@ -54,11 +54,6 @@ def _mallinfo() -> Callable[[], Any] | None:
     if function is not None:
         function.restype = _MallInfo
     return function
-
-
-def heap_is_known() -> bool:
-    """Whether ``heap_bytes`` falls when memory is freed."""
-    return _mallinfo() is not None
 
 
 def heap_bytes() -> int:

@@ -139,7 +139,7 @@ class NativePool(SavingPool):
         if self._prepare_saving(fmu.description, spec):
             self._pool.keep_records()
         self.step_own = self._pool.step_own
-        self._watch = watch_leaks(fmu, spec, self._counts, self._pool.recycle, log)
+        self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self.watched(self._pool.reset)
         self._step_or_reset = self.watched(self._pool.step_or_reset)
         self._start_of_play = self.watched(self._pool.start)
@@ -237,8 +237,6 @@ class NativePool(SavingPool):
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
-        if self._watch is not None:
-            self._watch.has_snapshots = True
         return self._copy_all()
 
     def _copy_all(self) -> _native.Snapshot:
@@ -360,10 +358,6 @@ class NativePool(SavingPool):
 
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
-
-    def recycle(self) -> None:
-        """Let each instance be replaced by a new one at its next reset."""
-        self._open_pool().recycle()
 
     def watched(self, function: Callable[P, R]) -> Callable[P, R]:
         """Add the memory that a reset function allocates to the growth counter."""

@@ -126,7 +126,8 @@ class PoolSpec:
             first output is read.
         fault_retries: How often a communication step that an FMU discards is repeated, as 2, 4,
             8 ... smaller ones, from the FMU state before it.
-        leak_limit: How many bytes resets may leak before instances are recycled; None for no limit.
+        leak_limit: How many bytes resets may leak before that is told, and by how many a worker
+            process may grow before it is replaced; None for no limit.
         reset_method: How instances start a new episode.
         component_resets: For each component of a system, how it starts a new episode; empty if all
             do by ``reset_method``.

@@ -334,20 +334,6 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused) {
     Py_RETURN_NONE;
 }
 
-static void do_recycle(PyPool *self, bool alone, void *context) {
-    (void)alone;
-    (void)context;
-    pool_recycle(&self->pool);
-}
-
-PyObject *py_recycle(PyObject *object, PyObject *unused) {
-    (void)unused;
-    if (!perform((PyPool *)object, NEVER_SHORT, do_recycle, NULL)) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
-}
-
 static void do_copy_costs(PyPool *self, bool alone, void *context) {
     (void)alone;
     memcpy(context, self->pool.costs, sizeof self->pool.costs);

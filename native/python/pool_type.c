@@ -134,7 +134,6 @@ static PyMethodDef methods[] = {
     {"record_of", py_record_of, METH_O, NULL},
     {"replace_record", (PyCFunction)(void (*)(void))py_replace_record, METH_FASTCALL, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
-    {"recycle", py_recycle, METH_NOARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},
     {"costs", py_costs, METH_NOARGS, NULL},
     {"uses_states", py_uses_states, METH_NOARGS, NULL},

@@ -100,7 +100,6 @@ PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
-PyObject *py_recycle(PyObject *object, PyObject *unused);
 PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

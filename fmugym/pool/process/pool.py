@@ -175,12 +175,12 @@ class ProcessPool(SavingPool):
                 self._crew.retire(supervisor, "each episode has a new process")
 
     def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
-        """Replace workers that leak, though their instances were recycled.
+        """Replace workers that leak.
 
         The best moment is when all instances of a worker start anew. At any other moment the others
         lose their episodes, so the worker may first leak twice as much.
         """
-        limit = math.inf if self._spec.leak_limit is None else 2 * self._spec.leak_limit
+        limit = math.inf if self._spec.leak_limit is None else self._spec.leak_limit
         for supervisor in supervisors:
             if supervisor.growth > (limit if mask[supervisor.block].all() else 2 * limit):
                 grown = f"by {supervisor.growth / 2**20:.0f} MB"

@@ -377,7 +377,7 @@ def _extracted(setup: Setup) -> ExtractedFMU:
 def _make_pool(setup: Setup, log: logging.Logger, counts: HealthArray) -> SavingPool:
     return local_pool(
         _extracted(setup),
-        setup.spec,
+        replace(setup.spec, leak_limit=None),  # the parent replaces this process
         setup.block.stop - setup.block.start,
         log,
         threads=setup.threads,
