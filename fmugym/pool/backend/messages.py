@@ -19,18 +19,10 @@ from fmpy.fmi1 import fmi1CallbackFunctions
 from fmpy.fmi2 import fmi2CallbackFunctions
 from fmpy.logging import addLoggerProxy
 
-from fmugym.errors import printable
 from fmugym.fmi.words import Message, quoted
+from fmugym.pool.reports import as_record
 
 __all__ = ["Messages", "fmi1_callbacks", "fmi2_callbacks"]
-
-_LEVELS: Final = (
-    logging.INFO,
-    logging.WARNING,
-    logging.WARNING,
-    logging.ERROR,
-    logging.CRITICAL,
-)
 
 _ids = itertools.count(1)
 _by_name: WeakValueDictionary[bytes, Messages] = WeakValueDictionary()
@@ -71,8 +63,8 @@ class Messages:
             status, category, text = self._noted.popleft()
             line = _readable(text)
             self._recent.append((status, line))
-            level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
-            self._log.log(level, "%s: [%s] %s", self.name, _readable(category), line)
+            level, told = as_record(self.name, status, _readable(category), line)
+            self._log.log(level, "%s", told)
 
     def forget(self) -> None:
         """Forget the messages of the episode before; they would not explain a failure."""
@@ -85,7 +77,7 @@ class Messages:
 
 
 def _readable(text: bytes) -> str:
-    return printable(text.decode(errors="replace").rstrip())
+    return text.decode(errors="replace").rstrip()
 
 
 def _receive(instance: Any, name: bytes, status: int, category: bytes, text: bytes) -> None:
