@@ -43,7 +43,7 @@ def sound_systems(fmus):
         plan = system.plan
         is_sound = not any("limit" in dict(component.starts) for component in plan.components)
         is_sound &= not any(one.loop for one in (*plan.groups, *plan.initialization))
-        if is_sound and plan.control is None and 1 not in versions:
+        if is_sound and 1 not in versions:
             yield system
 
 
