@@ -63,13 +63,29 @@ WIDE static void count_places(const double *restrict x, size_t count, Points p,
     }
 }
 
-static bool is_sorted(Points p) {
-    bool is = true;
+/* Whether this is the place of x, if coordinates never fall. */
+static bool is_place(double x, Points p, size_t place) {
+    return (p.xs[place] <= x || place == 0) && (place + 1 == p.count || !(p.xs[place + 1] <= x));
+}
 
-    for (size_t i = 1; i < p.count; i++) {
-        is &= p.xs[i - 1] <= p.xs[i];
+/* The same for coordinates that never fall. Most tables have points at equal distances, or two
+ * points at each, so that the place is near to where it would be then. */
+static void guess_places(const double *x, size_t count, Points p, int64_t *places) {
+    const size_t last = p.count - 1;
+    const double density = (double)last / (p.xs[last] - p.xs[0]);
+
+    for (size_t j = 0; j < count; j++) {
+        const double guess = (x[j] - p.xs[0]) * density;
+        size_t place = guess > 0.0 ? guess < (double)last ? (size_t)guess : last : 0;
+        for (int i = 0; i < 2; i++) {
+            place -= place > 0 && p.xs[place] > x[j];
+            place += place < last && p.xs[place + 1] <= x[j];
+        }
+        places[j] = (int64_t)place;
+        if (!is_place(x[j], p, place)) {
+            search_places(&x[j], 1, p, &places[j]);
+        }
     }
-    return is;
 }
 
 /* The arithmetic of numpy.interp, except where the result is NaN. */
@@ -125,8 +141,10 @@ void operation_interpolate(const Table *table, const double *x, size_t count, do
     const Points p = points_of(table);
     int64_t places[PROGRAM_WIDTH];
 
-    if (p.count <= FEW_POINTS && is_sorted(p)) {
+    if (table->rising && p.count <= FEW_POINTS) {
         count_places(x, count, p, places);
+    } else if (table->rising) {
+        guess_places(x, count, p, places);
     } else {
         search_places(x, count, p, places);
     }

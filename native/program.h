@@ -162,6 +162,7 @@ typedef struct {
 typedef struct {
     const char *data;
     size_t length, size;
+    bool rising; /* whether coordinates to interpolate between never fall */
 } Table;
 
 /* The owner provides the memory that the pointers refer to. */

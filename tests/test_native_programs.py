@@ -125,16 +125,33 @@ def points(count, rng):
     return xs, rng.normal(size=count)
 
 
+def long_points(kind, rng):
+    """Many points: at equal distances, two at each place, or mostly near one another."""
+    even = np.linspace(-3.0, 3.0, 301)
+    xs = {
+        "even": even,
+        "steps": np.sort(np.concatenate([even[:-1], np.nextafter(even[1:], -9.0)])),
+        "pairs": np.repeat(even, 2),
+        "uneven": np.concatenate([-np.logspace(-9, 0.4, 200)[::-1], [0.0, 1e-300, 3.0]]),
+        "alone": np.full(40, 1.0),
+    }[kind]
+    return xs, rng.normal(size=len(xs))
+
+
 @pytest.mark.parametrize(
     ("xs", "ys"),
     [
+        *(
+            long_points(kind, np.random.default_rng(1))
+            for kind in ("even", "steps", "pairs", "uneven", "alone")
+        ),
         *(points(count, np.random.default_rng(count)) for count in (1, 2, 3, 6, 16, 17, 40)),
         ([0.0, 1.0, 2.0], [0.0, np.inf, 1.0]),
         ([0.0, 1.0, 2.0], [np.nan, 3.0, 3.0]),
         ([-np.inf, 0.0, np.inf], [1.0, 2.0, 2.0]),
         ([0.0, 1.0, 1.0, 1.0, 2.0], [-np.inf, 1.0, 2.0, np.inf, np.inf]),
     ],
-    ids=str,
+    ids=lambda values: str(values)[:60],
 )
 def test_interpolation_is_that_of_numpy(xs, ys):
     rng = np.random.default_rng(0)

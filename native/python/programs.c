@@ -88,6 +88,17 @@ static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
     return true;
 }
 
+static bool is_rising(const Table *table) {
+    const double *xs = (const double *)(const void *)table->data;
+    const size_t count = table->size == sizeof *xs && table->length >= 4 ? table->length / 2 - 1 : 0;
+    bool is = true;
+
+    for (size_t i = 1; i < count; i++) {
+        is &= xs[i - 1] <= xs[i];
+    }
+    return is;
+}
+
 static bool take_tables(PyProgram *p, PyObject *tables) {
     for (Py_ssize_t i = 0; i < PyTuple_Size(tables); i++) {
         PyObject *table = PyTuple_GetItem(tables, i);
@@ -96,7 +107,10 @@ static bool take_tables(PyProgram *p, PyObject *tables) {
         if (length < 0 || !take_numbers(table, buffer, false, "a table of a program", length)) {
             return false;
         }
-        p->tables[i] = (Table){buffer->buf, (size_t)length, (size_t)buffer->itemsize};
+        p->tables[i] = (Table){.data = buffer->buf,
+                               .length = (size_t)length,
+                               .size = (size_t)buffer->itemsize};
+        p->tables[i].rising = is_rising(&p->tables[i]);
     }
     return true;
 }
