@@ -627,6 +627,24 @@ def test_a_history_enters_when_a_correction_gains_nothing_without_it():
     assert search.rounds < 300
 
 
+def test_what_the_search_has_come_to_may_win_without_an_earlier_gain():
+    class Late(Field):
+        """Only the last validation shows what lies beyond the limit."""
+
+        def play(self, make, numbers, seeds, watch=None):
+            self.most = 1e9 if min(seeds) > VALIDATION else 1.0
+            own = numbers if numbers.size else make(numbers).weights[None]
+            return super().play(make, own, seeds, watch)
+
+    fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
+    search, field = Search((2, 1), fixed, {}, []), Late(1.0)
+    while search.rounds < 60:
+        search.advance(field)
+    leader = max(search._contenders, key=lambda one: one.cma.mean.sum())
+    assert leader.best.sum() < leader.cma.mean.sum()
+    assert np.array_equal(search.winner(field).weights, leader.cma.mean)
+
+
 def test_who_is_worse_than_the_baseline_has_no_more_than_its_share():
     class Uneven(Field):
         def play(self, make, numbers, seeds, watch=None):

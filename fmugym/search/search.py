@@ -307,11 +307,15 @@ class Search:
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in new episodes of validation, the baseline among them.
 
+        The searches' present means take part, too: they may be better than the best ones before,
+        without having shown it in the fewer episodes of earlier validations.
+
         Returns:
             The agent; None if the search has been too short to find one.
         """
         ready = self._fixed if self.baseline is None else []
         agents = [*ready, *(agent for agent, _ in self.known())]
+        agents += [one.make.agent(one.cma.mean) for one in self._contenders if one.gained]
         if not agents:
             return None
         seeds = range(_FINAL, _FINAL + (_LAST if self._episodes > 1 else 1))
