@@ -130,6 +130,7 @@ class Arena:
         totals: FloatArray = np.zeros((1 + len(self._costs), len(seeds)))
         watched: FloatArray = np.empty((0, len(seeds)))
         running = np.ones(len(seeds), dtype=bool)
+        counted: Any = True  # whose numbers count; True for all, which takes less time
         for _ in range(self._most_steps):
             if self.steps + len(seeds) > self.ceiling:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
@@ -137,13 +138,16 @@ class Arena:
             observations, rewards, terminated, truncated, infos = envs.step(actions)
             costs = (infos["costs"][name] for name in self._costs)
             for total, values in zip(totals, (rewards, *costs), strict=True):
-                np.add(total, values, out=total, where=running)
+                np.add(total, values, out=total, where=counted)
             if watch is not None:
                 seen = watch(controller)
                 watched = watched if len(watched) else np.zeros(seen.shape)
-                np.add(watched, seen, out=watched, where=running)
+                np.add(watched, seen, out=watched, where=counted)
             self.steps += len(seeds)
-            running &= ~(terminated | truncated)
-            if not running.any():
-                break
+            ended = terminated | truncated
+            if ended.any():
+                running &= ~ended
+                counted = running
+                if not running.any():
+                    break
         return np.concatenate([totals, watched])

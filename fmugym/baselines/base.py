@@ -173,12 +173,17 @@ class Controller(KnownArguments, ABC):
             return np.clip(np.rint(values.ravel()), least, largest).astype(space.dtype)
         values = values.reshape(len(values), *space.shape or ())
         if isinstance(space, spaces.Box):
-            values = np.clip(values, space.low, space.high)
+            values = limited(values, space.low, space.high)
         return values.astype(space.dtype)
 
     def _shape(self) -> str:
         width = len(self.names)
         return f"shape ({self.count}, {width})" if self._is_vector else f"shape ({width},)"
+
+
+def limited(values: Any, low: Any, high: Any) -> Any:
+    """Do what ``numpy.clip`` does, in less time if there are only some hundred numbers."""
+    return np.minimum(np.maximum(values, low), high)
 
 
 def check_numbers(what: str, value: Any, **limits: Any) -> Numbers:

@@ -9,7 +9,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.base import Controller, FloatArray, Numbers, Signal, check_numbers
+from fmugym.baselines.base import (
+    Controller,
+    FloatArray,
+    Numbers,
+    Signal,
+    check_numbers,
+    limited,
+)
 from fmugym.errors import ConfigError
 from fmugym.lazy import scipy_module
 from fmugym.linearization import LinearModel
@@ -154,7 +161,7 @@ class PID(Law):
             return rest, (integral, value)
         growth = self.kp * error * self.time_step / self.ti
         wanted = rest + integral + growth
-        beyond = wanted - np.clip(wanted, self._low, self._high)
+        beyond = wanted - limited(wanted, self._low, self._high)
         integral = np.where(beyond * growth > 0, integral, integral + growth)
         return rest + integral, (integral, value)
 

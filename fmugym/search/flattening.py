@@ -22,7 +22,8 @@ def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArr
         observations: A batch of N, or one observation if N is 1.
         count: N.
     """
-    return np.concatenate(list(_columns(space, observations, count)), axis=1)
+    first, *rest = _columns(space, observations, count)
+    return np.concatenate([first, *rest], axis=1) if rest else first
 
 
 def _columns(space: Any, values: Any, count: int) -> Iterator[FloatArray]:

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.base import Controller, FloatArray, attribute_of
+from fmugym.baselines.base import Controller, FloatArray, attribute_of, limited
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
@@ -335,7 +335,7 @@ class Policy(Controller):
         """
         self._shown, (mean, divisor) = features, self.scale
         rows = np.ascontiguousarray(features)
-        values = np.clip((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
+        values = limited((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
         *hidden, last = self._layers
         for layer in hidden:
             values = np.tanh(values @ layer[:, :-1] + layer[:, -1:])
@@ -351,4 +351,4 @@ class Policy(Controller):
 def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:
     """An element of the action: that of the controller, and the change in halves of the range."""
     low, high = limits
-    return np.clip(np.clip(base, low, high) + (high - low) / 2 * change, low, high)
+    return limited(limited(base, low, high) + (high - low) / 2 * change, low, high)
