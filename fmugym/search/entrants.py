@@ -21,7 +21,7 @@ Merit = tuple[float, float]
 NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
 
 MOST_EPISODES: Final = 64
-_AGREEMENT: Final = 0.3
+_AGREEMENT: Final = 0.15
 """If the orders by two halves of the episodes correlate less, a round has too few of them."""
 
 _FADE: Final = 0.3
