@@ -298,43 +298,11 @@ class Pool:
         errors are those of ``play``.
         """
 
-    def prepare_single(
-        self,
-        *,
-        inputs: tuple[Any, ...],
-        judgement: tuple[Any, ...],
-        actions: dict[str, Any],
-        rows: tuple[tuple[Array, Array], ...],
-        wanted: Array,
-        kept: Array,
-        episode: Array,
-        limit: int,
-        seen: tuple[Array, ...],
-        copies: tuple[Callable[[], Any], ...],
-        names: tuple[str, ...] | None,
-        observed: bool,
-        watched: tuple[tuple[str, Any, Any], ...],
-    ) -> None:
-        """Take over what surrounds the steps of a single environment; see ``NativePool``."""
+    def prepare_one(self, *parts: Any) -> None:
+        """Take over the parts of ``NativePool.prepare_one``."""
 
-    def step_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> Any:
-        """Do a step, with all that was taken over; see ``SingleCalls.step``."""
-
-    def before_single(self, action: Any, attributes: dict[str, Any], count: int, /) -> bool | None:
-        """Do what comes before the FMU's part of ``step_single``; None if nothing was done."""
-
-    def after_single(self, troubled: int, /) -> Any:
-        """Do what comes after the FMU's part of ``step_single``.
-
-        The output values are those that the pool's array has. The argument tells how many instances
-        had trouble; the result is that of ``step_single``.
-        """
-
-    def begin_single(self, action: Any, /) -> None:
-        """Take what counts as the action of the step before."""
-
-    def actions_of_single(self) -> tuple[Any, Any]:
-        """The actions of the last step and of the one before."""
+    def step_one(self, action: Any, attributes: dict[str, Any], /) -> Any:
+        """Do a step of a single environment; see ``NativePool.prepare_one``."""
 
     def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
         """Start the episodes in the mask; see ``NativePool.start_of_play``."""

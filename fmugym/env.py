@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from importlib import import_module
 from math import hypot, isfinite
 from typing import Any, ClassVar, Final, Never
 
@@ -33,11 +34,10 @@ from fmugym.task.actions import has_nan, is_element, is_misfit
 from fmugym.task.construction import Constructed
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import readable_named
-from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
+from fmugym.task.results import FLOAT32_LIMIT, as_flag, as_info, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.step import conclude
-from fmugym.task.waiting import Waiting
 from fmugym.task.warm_up import WarmUps, rows_of_one
 
 __all__ = [
@@ -61,6 +61,9 @@ IN_POOL: Final = object()
 """Stands for the default observation of a step, which the pool has; see ``FMUEnv._conclude``."""
 
 _WAYS: Final = ("auto", "compiled", "python")
+
+_PLAYERS: Final = "fmugym.vector.one"
+"""The module of players is imported late: it needs this one, and takes a while."""
 
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated and info."""
@@ -94,10 +97,9 @@ class FMUEnv(Constructed):
             with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
             it. Or the name of a way to step the FMU, see ``fmugym.trial.opening.make_pool``.
         isolation: Where the FMU runs; by default where the config says.
-        hooks: The way of calling hooks. ``"auto"`` compiles them after 1,000 steps if that gives
-            the same results, so that the native pool runs them in its step; one or two may stay in
-            Python. ``"compiled"`` does so in the first step, and it is an error if a hook cannot be
-            compiled. ``"python"`` never does.
+        hooks: The way of calling hooks. ``"auto"`` compiles them at the first reset if that is
+            possible, so that the native pool runs them in its step; one may stay in Python.
+            ``"compiled"`` makes it an error if a hook cannot be compiled. ``"python"`` never does.
 
     Attributes:
         fmu: The FMU; ``fmu.description`` is its model description.
@@ -140,12 +142,6 @@ class FMUEnv(Constructed):
     """The keys of a task for which observations or actions are not in its units."""
 
     _way = "auto"
-    _player: Any = None
-    """Steps the environment if its hooks are compiled, see ``fmugym.single``; or None."""
-
-    _play: Callable[..., Any] | None = None
-    _width = 0
-    _tells = False
 
     def __init__(
         self,
@@ -207,7 +203,6 @@ class FMUEnv(Constructed):
         pool = self._open_pool("reset")
         if not self._was_reset:
             self._prepare_hooks()  # the constructor of the class may have set some as attributes
-            self._prepare_player(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
         generator = self._np_random
@@ -220,6 +215,8 @@ class FMUEnv(Constructed):
             else:
                 self._begin_with_warm_up(self._warm_ups, pool, plan, episode)
             observation, info = self._observation_and_info()
+            if not self._has_chosen:
+                self._choose_player(pool)
         except BaseException:
             self._ended = True
             self._halt()
@@ -251,37 +248,38 @@ class FMUEnv(Constructed):
         else:
             written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
             variables = {name: row[..., 0] for name, row in written.items()}
-        self.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
-        self.inputs = tuple(self._input_row.tolist())
-        self._values = tuple(self._output_row.tolist())
-        self.state = self.previous_state = self._values[: self._output_count]
+        read = self._readings
+        read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
+        read.inputs = tuple(self._input_row.tolist())
+        read.values = tuple(self._output_row.tolist())
+        read.state = read.previous_state = read.values[: self._output_count]
 
-    def _prepare_player(self, pool: Pool) -> None:
-        """Prepare to compile the hooks, where that may be possible."""
+    def _choose_player(self, pool: Pool) -> None:
+        """Compile the hooks, where that is possible and asked for."""
+        self._has_chosen = True
         obstacle = None
         if self._own.step or self._own.reset:
             obstacle = f"{'step' if self._own.step else 'reset'} is overridden"
-        elif not pool.can_play or pool.num_instances > 1:
+        elif not pool.plays_alone or pool.num_instances > 1:
             obstacle = "the pool is not a native one of its own"
         if obstacle is None and self._way != "python":
-            self._play, self._width, self._tells = None, 0, False
-            self._player = Waiting(required=self._way == "compiled")
-        if obstacle is not None and self._way == "compiled":
+            self._player = import_module(_PLAYERS).player_of(self, self._way == "compiled")
+        elif obstacle is not None and self._way == "compiled":
             name = type(self).__name__
             raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
 
     def _begin_episode(self, episode: Episode) -> None:
-        if self._play is not None:
-            self._player.begin(self)
-        self.parameters = episode.parameters
-        self.variables.update(episode.variables)
-        self.step_count = 0
-        self.action = self.previous_action = self._no_action
-        given = self.parameters.get
-        self.inputs = tuple([given(name, start) for name, start in self._start_inputs])
-        self.done = self.after_end = False
-        self._values = tuple(self._output_row.tolist())
-        self.state = self.previous_state = self._values[: self._output_count]
+        self._keep_readings()
+        read = self._readings
+        read.parameters = episode.parameters
+        read.variables.update(episode.variables)
+        read.step_count = 0
+        read.action = read.previous_action = self._no_action
+        given = episode.parameters.get
+        read.inputs = tuple([given(name, start) for name, start in self._start_inputs])
+        read.done = read.after_end = False
+        read.values = tuple(self._output_row.tolist())
+        read.state = read.previous_state = read.values[: self._output_count]
         self._last_reward, self._return = None, 0.0
         self._was_reset, self._ended = True, False
 
@@ -317,6 +315,7 @@ class FMUEnv(Constructed):
             result = self._step_compiled(action)
             if result is not None:
                 return result
+        read = self._readings
         pool = self._pool
         if pool is None or self._ended:
             pool = self._checked_before_step()
@@ -325,7 +324,7 @@ class FMUEnv(Constructed):
             self._take_action(action)
             try:
                 troubled = self._step_pool()
-                self.step_count += 1
+                read.step_count += 1
                 result = self._conclude(pool, pool.statuses.item(0) if troubled else 0)
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
                 self._ended = True
@@ -341,38 +340,59 @@ class FMUEnv(Constructed):
 
     def _step_compiled(self, action: Any) -> Result | None:
         """Let the pool do the whole step; None if Python must do it."""
-        play = self._play or self._player.ready(self, action)
-        if play is None:
+        player = self._player
+        if self._readings is not player.readings and not player.take_over(self):
             return None
         try:
-            result = play(action, self.__dict__, self._width)
-            if result:
-                return self._completed(result)
-            if result is not None:
-                return self._judged_again()
+            result = player.step(action, self.__dict__)
+            if result is None and player.renew(self) and player.take_over(self):
+                result = player.step(action, self.__dict__)
         except BaseException:  # as in ``step``
-            self._ended = self._player.may_have_moved
+            self._ended = True
             self._halt()
             raise
-        self._player.doubt(self)
-        return None
+        if result is None:
+            player.keep(self)
+            return None
+        return self._completed(result) if result else self._judged_again()
 
     def _completed(self, result: Result) -> Result:
         """Add what the pool does not do to the result of a step."""
-        if self._play is None:
-            self._player.forget(self)
+        if self._player.left:
+            completed = self._with_hooks_left(*result)
+            if completed is None:
+                return self._judged_again()
+            result = completed
         if result[2] or result[3]:
             self._ended = True
-            self._player.note_end(result[2])
-        if self._has_info:
-            self._in_hooks = self._tells = True
-            try:
-                result = (*result[:4], self._info())
-            finally:
-                self._in_hooks = self._tells = False
         if self.render_mode is not None:
             self._note_for_picture(result[1])
         return result
+
+    def _with_hooks_left(
+        self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: dict[str, Any]
+    ) -> Result | None:
+        """Call the hooks that are not compiled; None if they make what is not finite."""
+        left = self._player.left
+        self._in_hooks = True
+        try:
+            if "_is_truncated" in left:
+                truncated = as_flag("_is_truncated", self._is_truncated()) | truncated
+            if "_reward_policy" in left:
+                reward = as_reward(self._reward_policy())
+            if "_get_observation" in left:
+                observation = self._get_observation()
+            if not (isfinite(reward) and self._is_finite(observation)):
+                return None
+            if "_get_info" in left:
+                info = self._info()
+        except BaseException:  # as in ``step``
+            self._ended = True
+            self._halt()
+            raise
+        finally:
+            self._in_hooks = False
+        return observation, reward, terminated, truncated, info
 
     def _judged_again(self) -> Result:
         """Judge a step in Python: its status or a number is not good, or a hook raises."""
@@ -381,6 +401,10 @@ class FMUEnv(Constructed):
         try:
             pool = self._open_pool("step")
             result = self._conclude(pool, pool.statuses.item(0))
+        except BaseException:  # as in ``step``
+            self._ended = True
+            self._halt()
+            raise
         finally:
             self._in_hooks = False
         if self.render_mode is not None:
@@ -403,14 +427,15 @@ class FMUEnv(Constructed):
         if elements is None or type(action) not in _INTEGERS or action not in elements:
             self._require_usable(action)
         self._take_usable(action)
-        self._input_writer.write(self.inputs, self._input_row)
+        self._input_writer.write(self._readings.inputs, self._input_row)
 
     def _take_usable(self, action: Any) -> None:
         """Make the inputs for an action that was checked already."""
-        before = self.action, self.previous_action, self.previous_state, self.inputs
-        self.previous_action, self.previous_state, self.action = self.action, self.state, action
+        read = self._readings
+        before = read.action, read.previous_action, read.previous_state, read.inputs
+        read.previous_action, read.previous_state, read.action = read.action, read.state, action
         try:
-            self.inputs = self._input_writer.checked(self._get_inputs(), action)
+            read.inputs = self._input_writer.checked(self._get_inputs(), action)
         except BaseException as error:  # the FMU was not touched: a better action may follow
             self._give_up(before)
             blaming = self._blame(action, error)
@@ -424,7 +449,8 @@ class FMUEnv(Constructed):
         Args:
             before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
         """
-        self.action, self.previous_action, self.previous_state, self.inputs = before
+        read = self._readings
+        read.action, read.previous_action, read.previous_state, read.inputs = before
 
     def _require_usable(self, action: Any) -> None:
         elements = self._elements
@@ -459,15 +485,16 @@ class FMUEnv(Constructed):
             stopped = status == _TERMINATED
             if status > _WARNING and not stopped:
                 return self._fault(pool.failure(0))
-        variables = self.variables.copy() if self._own.update else None
-        before = self._values
+        read = self._readings
+        variables = read.variables.copy() if self._own.update else None
+        before = read.values
         if values is None:
             values = tuple(self._output_row.tolist())  # Python's floats are faster
-        self._values = values
-        self.state = values if self._no_monitors else values[: self._output_count]
+        read.values = values
+        read.state = values if self._no_monitors else values[: self._output_count]
         if observed is None and self._pool_observes:
             observed = self._observation_row.copy()
-        cut_off = self.step_count >= self._step_limit
+        cut_off = read.step_count >= self._step_limit
         result = conclude(self, self._form, stopped, cut_off, observed)
         observation, reward, terminated, truncated = result
         # One call for all numbers, which is enough for nearly all steps.
@@ -511,9 +538,10 @@ class FMUEnv(Constructed):
     ) -> Result:
         """End the episode because of a number that is not finite, in the state before the step."""
         reason = self._not_finite(reward, observation)
-        self._values, variables = before
-        self.state = self.previous_state
-        self.variables.update(variables or {})
+        read = self._readings
+        read.values, variables = before
+        read.state = read.previous_state
+        read.variables.update(variables or {})
         self._open_pool("step").note_fault(0)
         self._halt()
         return self._fault(reason)
@@ -586,7 +614,6 @@ class FMUEnv(Constructed):
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
         if not self._was_reset:
             self._prepare_hooks()  # as in ``reset``
-            self._prepare_player(pool)
         require_saving(pool)
         self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails
@@ -594,12 +621,14 @@ class FMUEnv(Constructed):
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
-        return self._observation_and_info()[0]
+        observation = self._observation_and_info()[0]
+        if not self._has_chosen:
+            self._choose_player(pool)
+        return observation
 
     def _keep_readings(self) -> None:
-        """Keep what hooks read in the environment itself until the next step."""
-        if self._play is not None:
-            self._player.give_back(self)
+        if self._player is not None:
+            self._player.keep(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
         """Make a new environment in the middle of the same episode, if there is one."""
@@ -683,9 +712,6 @@ class FMUEnv(Constructed):
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
         self._is_closed = True
-        if self._play is not None:
-            self._player.give_back(self)
-        self._player = None
         self._close_pool()
         if self._renderer is not None:
             self._renderer.close()

@@ -90,6 +90,25 @@ void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
 }
 
+bool play_refuses(const Turn *turn, double *inputs) {
+    const Play *play = turn->play;
+    const size_t number = play->number_of_inputs * play->count, bytes = number * sizeof *inputs;
+    Source source = source_of(turn);
+    Notes notes = {.outside = false};
+    PlayScratch scratch;
+
+    source.actions = turn->actions;
+    source.previous_actions = play->actions.current;
+    memcpy(inputs, play->input_rows, bytes);
+    program_prepare(&play->inputs, scratch.memory, &scratch.inputs);
+    program_run(&play->inputs, &source, 0, play->count, &scratch.inputs, &notes);
+    for (size_t i = 0; i < number; i++) {
+        notes.outside |= !(fabs(play->input_rows[i]) <= DBL_MAX);
+    }
+    memcpy(play->input_rows, inputs, bytes);
+    return notes.outside;
+}
+
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
     const Actions *a = &turn->play->actions;
     const size_t size = a->elements * a->size, offset = begin * size;

@@ -99,6 +99,10 @@ typedef struct {
 /* Whether an action is out of range or NaN. */
 bool play_has_bad_action(const Turn *turn);
 
+/* Whether the actions lead to inputs that are not finite. The inputs stay as they are; there is memory
+ * for a copy of them. */
+bool play_refuses(const Turn *turn, double *inputs);
+
 /* Scratch memory of one thread. */
 typedef struct {
     Register memory[PROGRAM_REGISTERS]; /* of one program at a time */

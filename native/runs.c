@@ -285,7 +285,7 @@ static void foresee_reset(const Task *task, size_t index) {
     }
 }
 
-Status run_status(Pool *pool, Instance *me, double time, Outcome outcome) {
+static Status status_of(Pool *pool, Instance *me, double time, Outcome outcome) {
     if (outcome.status <= STATUS_WARNING) {
         return outcome.status;
     }
@@ -304,14 +304,14 @@ static size_t conclude_steps(Task *task, size_t begin, const LineUp *line, Scrat
     for (size_t i = 0; i < line->count; i++) {
         const size_t place = line->places[i], index = begin + place;
         const Status status =
-            run_status(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
+            status_of(pool, &pool->instances[index], line->times[i], line->outcomes[i]);
         double *outputs = scratch_from(pool, scratch, place).outputs;
         troubled += conclude_step(task, index, status, outputs);
     }
     return troubled;
 }
 
-Exchange run_exchange(const Pool *pool, Scratch scratch) {
+static Exchange exchange_of(const Pool *pool, Scratch scratch) {
     const Access *in = pool->settings.inputs, *out = pool->settings.outputs;
 
     return (Exchange){.input_references = in->groups[0].references,
@@ -327,7 +327,7 @@ Exchange run_exchange(const Pool *pool, Scratch scratch) {
 
 static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scratch) {
     const Pool *pool = task->pool;
-    Exchange e = run_exchange(pool, scratch);
+    Exchange e = exchange_of(pool, scratch);
 
     e.count = line->count;
     e.components = line->components;
@@ -435,15 +435,6 @@ static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) 
     const size_t troubled = advance(task, begin, count, scratch, &fits_floats);
 
     keep_outputs(task, begin, count, scratch.outputs);
-    return troubled;
-}
-
-size_t run_conclude(Task *task, Status status, Scratch scratch) {
-    bool fits_floats;
-    const size_t failed = conclude_step(task, 0, status, scratch.outputs);
-    const size_t troubled = failed + hand_out(task, 0, 1, scratch, &fits_floats);
-
-    keep_outputs(task, 0, 1, scratch.outputs);
     return troubled;
 }
 

@@ -30,10 +30,4 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch);
 /* Runs what comes before a step that is done elsewhere. Returns 0. */
 size_t run_before(Task *task, size_t begin, size_t end);
 
-/* For the step of a pool's only instance: what FMI versions need to know of the pool, the status of
- * what they did, and what follows that step. */
-Exchange run_exchange(const Pool *pool, Scratch scratch);
-Status run_status(Pool *pool, Instance *me, double time, Outcome outcome);
-size_t run_conclude(Task *task, Status status, Scratch scratch);
-
 #endif

@@ -4,7 +4,6 @@
 #include <stdlib.h>
 
 #include "inside.h"
-#include "lone.h"
 #include "rollouts.h"
 #include "threads.h"
 
@@ -99,8 +98,7 @@ static size_t work_inside(Task *task, size_t begin, size_t end) {
 static void work(void *context, size_t begin, size_t end) {
     Task *task = context;
     const uint64_t began = task->measured ? clock_now() : 0;
-    const size_t troubled =
-        lone_fits(task) ? lone_step(task) : work_inside(task, begin, end);
+    const size_t troubled = work_inside(task, begin, end);
 
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);

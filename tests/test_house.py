@@ -24,7 +24,7 @@ STOREYS = [
     {"vector", "lab", "identification", "linearization"},
     {"baselines"},
     {"search"},
-    {"registration", "recording", "single", "testing", "sb3", "torchrl", "declared", "series"},
+    {"registration", "recording", "testing", "sb3", "torchrl", "declared", "series"},
     {"export", "logs", "minari"},
     {"envs", "pettingzoo", "rllib", "tools"},
     {"__init__", "__main__", "clock"},

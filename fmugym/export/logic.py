@@ -155,8 +155,6 @@ def _logic_of_ideal(
             f"{env.action_space}"
         )
     try:
-        if env._play is not None:  # compiled steps keep in the pool what hooks read
-            env._player.give_back(env)
         with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
             traced = _ControllerTracer(env, decision).traced()
         return _Assembly(env, traced, all_inputs, external).logic()

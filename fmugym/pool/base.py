@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +23,6 @@ __all__ = [
     "Played",
     "Pool",
     "PoolSpec",
-    "SingleCalls",
     "StatusArray",
     "available_processors",
     "names_of",
@@ -41,23 +40,6 @@ R = TypeVar("R")
 
 _MOST_NAMES: Final = 5
 """The most variables that a message names."""
-
-
-class SingleCalls(NamedTuple):
-    """The functions that ``Pool.prepare_single`` makes.
-
-    Attributes:
-        step: Takes an action, the attributes of the environment, and how many there must be. It
-            returns the result of the step. It returns None if nothing was done: the action is not
-            of the type that was prepared, an attribute has changed, or inputs are not finite. It
-            returns False if the instance has stepped, but its status or a number is not good.
-        begin: Takes what counts as the action of the step before.
-        actions: Returns the actions of the last step and of the one before.
-    """
-
-    step: Callable[[Any, dict[str, Any], int], Any]
-    begin: Callable[[Any], None]
-    actions: Callable[[], tuple[Any, Any]]
 
 
 class Pool(ABC):
@@ -301,11 +283,11 @@ class Pool(ABC):
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
-    def prepare_single(self, **groups: Any) -> SingleCalls:
-        """Make the functions that do whole steps of a single environment; see ``NativePool``.
+    def prepare_one(self, *parts: Any) -> Callable[[Any, dict[str, Any]], Any]:
+        """Make the function that does whole steps of a single environment; see ``NativePool``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
+            SimulationError: If the pool does not support it; see ``plays_alone``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 

@@ -32,7 +32,6 @@ from fmugym.pool.base import (
     MaskArray,
     Played,
     PoolSpec,
-    SingleCalls,
     StatusArray,
     available_processors,
     names_of,
@@ -550,28 +549,25 @@ class NativePool(SavingPool):
         """
         return self._open_pool().exchange_play(other)
 
-    def prepare_single(self, **groups: Any) -> SingleCalls:
+    def prepare_one(self, *parts: Any) -> Callable[[Any, dict[str, Any]], Any]:
         """Prepare a pool of one instance to do whole steps of a single environment.
 
-        This replaces what was prepared before. Every step uses the given arrays in place. A row is
-        an array of one element.
-
         Args:
-            groups: ``inputs`` and ``judgement``, the programs (see ``Program.with_rows``): from
-                the action to the rows of ``wanted``; from the outputs to done, truncated, reward.
-                ``actions``, the class, shape and letter of an action; whether it is an integer,
-                and then its lowest and highest value; and flat arrays for the ``next``, the
-                ``current`` and the ``previous`` one. ``rows``, pairs of episode variables and what
-                they were before the step; ``kept``, for the outputs before the step; ``episode``,
-                the number of its steps; ``limit``, after how many it is truncated. ``seen``, the
-                arrays that the second program stores; ``copies``, functions that make the parts of
-                an observation, and ``names``, their keys, or None for a single part; ``observed``,
-                whether it is the pool's own of float32. ``watched``, names of attributes, their
-                values, and None, an equal copy, or the bytes of an array.
+            parts: After ``prepare_play``, without results: the arrays of a step, with a first axis
+                of length 1: the observation of float32, or the arrays that the second program
+                stores; reward, terminated and truncated. The attributes that the programs were
+                made of: tuples of a name and the address of the object, or of a name alone that
+                must not be among the attributes. A function that makes the observation, and one
+                that makes the info, or None.
+
+        Returns:
+            A function of an action and the attributes of the environment. It returns the result of
+            the step. It returns None if nothing was done: the action is not of the type that was
+            prepared, an attribute has changed, or inputs are not finite. It returns False if the
+            instance has stepped, but its status or a number is not good.
         """
-        self._pool.prepare_single(**groups)
-        own = self._pool
-        return SingleCalls(own.step_single, own.begin_single, own.actions_of_single)
+        self._pool.prepare_one(*parts)
+        return self._pool.step_one
 
     def start_of_play(self) -> Callable[..., tuple[int, bool]]:
         """The function that starts episodes after ``prepare_play``, outside of a step.

@@ -151,7 +151,7 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *(env._values[index] for index in places),
+            *(env._readings.values[index] for index in places),
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )
@@ -175,7 +175,7 @@ def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
         drawn = env.parameters
         return (
             *quantities.read(env),
-            *(env._values[place] for place in places.values()),
+            *(env._readings.values[place] for place in places.values()),
             *(_number(drawn.get(name, np.nan)) for name in given),
         )
 

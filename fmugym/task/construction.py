@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from inspect import getattr_static
 from math import floor, isfinite, nan
 from types import MappingProxyType
 from typing import Any, ClassVar, Final, Self, cast
@@ -26,12 +27,13 @@ from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.hooks import OwnHooks, misspelt_hooks
+from fmugym.task.hooks import Hooks, OwnHooks, misspelt_hooks
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import resolve
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
+from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
 from fmugym.task.step import NUMBERS
 from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues
@@ -53,7 +55,6 @@ class Constructed(Pictured):
     _base: ClassVar[type]
     """``FMUEnv``, with whose methods those of an environment are compared."""
 
-    _values: Any
     _number: int
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
 
@@ -71,6 +72,11 @@ class Constructed(Pictured):
     _warm_ups: WarmUps | None = None
     _pool: Pool | None = None
     _is_closed = False
+    _player: Any = None
+    """Steps the environment if its hooks are compiled, see ``fmugym.vector.one``; or None."""
+
+    _has_chosen = False
+    """Whether it is known if there is a player."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Keep the arguments, because an environment pickles as its class and arguments.
@@ -91,6 +97,7 @@ class Constructed(Pictured):
     ) -> None:
         """Do everything that a constructor does before there is a pool."""
         foreign = set(vars(self))
+        _require_readings(type(self))
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         _set_level(self.logger, log_level)
         self.config = EnvConfig.from_dict(config)
@@ -151,6 +158,8 @@ class Constructed(Pictured):
 
     def _close_pool(self) -> None:
         if self._pool is not None:
+            self._keep_readings()
+            self._player, self._has_chosen = None, False
             self._pool.close()
             self._pool = None
 
@@ -195,23 +204,33 @@ class Constructed(Pictured):
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
         self._output_count = len(interface.outputs)
         self._no_monitors = not interface.monitors
-        self._values = (nan,) * len(names)
-        strings = frozenset(v.name for v in interface.monitors if v.kind == "string")
-        self.out = NamedValues("output", names, lambda: self._values)
-        if strings:
-            self.out = NamedTexts(names, strings, lambda: self._values)
-        self.state = self._values[: self._output_count]
-        self.previous_state = self.state
         self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]
-        self.inputs = tuple(start for _, start in self._start_inputs)
-        self.action = None
-        self.previous_action = None
+        self._readings = self._first_readings(names)
+
+    def _first_readings(self, names: Sequence[str]) -> Readings:
+        values = (nan,) * len(names)
+        state = values[: self._output_count]
+        strings = frozenset(v.name for v in self._interface.monitors if v.kind == "string")
         start = {"start_time": self._spec.start_time} if self.config.draws_start_time else {}
-        self.parameters: Mapping[str, Any] = MappingProxyType(start)
-        self.variables = EpisodeVariables(self.config.episode_variables)
-        self.step_count = 0
-        self.done = False
-        self.after_end = False
+
+        def present() -> Any:
+            return self._readings.values
+
+        out = NamedTexts(names, strings, present) if strings else None
+        return Readings(
+            values=values,
+            out=NamedValues("output", names, present) if out is None else out,
+            state=state,
+            previous_state=state,
+            inputs=tuple(start for _, start in self._start_inputs),
+            action=None,
+            previous_action=None,
+            step_count=0,
+            done=False,
+            after_end=False,
+            parameters=MappingProxyType(start),
+            variables=EpisodeVariables(self.config.episode_variables),
+        )
 
     def _prepare_episodes(self) -> None:
         self._plan = self._plan_episode({})
@@ -306,6 +325,16 @@ def _names_of(base: type) -> frozenset[str]:
     """The attributes that a class has or announces."""
     announced = (name for cls in base.__mro__ for name in vars(cls).get("__annotations__", ()))
     return frozenset(dir(base)).union(announced)
+
+
+def _require_readings(cls: type[Any]) -> None:
+    """Refuse classes with attributes of their own in the places of what hooks read."""
+    for name in READINGS:
+        if getattr_static(cls, name) is not vars(Hooks)[name]:
+            raise ConfigError(
+                f"{cls.__name__} has an attribute {name!r} of its own, but hooks read the "
+                "environment's there; give it another name"
+            )
 
 
 def _set_level(logger: logging.Logger, level: Any) -> None:

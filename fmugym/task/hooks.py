@@ -20,6 +20,7 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.interface import Interface
+from fmugym.task.readings import Readings, read_by
 from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
@@ -111,24 +112,29 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
     """
 
     config: EnvConfig
-    state: Any
-    previous_state: Any
-    out: NamedValues
-    inputs: Any
-    action: Any
-    previous_action: Any
-    step_count: Any
-    done: Any
-    after_end: Any
-    parameters: Mapping[str, Any]
-    variables: dict[str, Any]
 
+    state: Any = read_by("state", lambda env: env._readings.state)
+    previous_state: Any = read_by("previous_state", lambda env: env._readings.previous_state)
+    out: NamedValues = read_by("out", lambda env: env._readings.out)
+    inputs: Any = read_by("inputs", lambda env: env._readings.inputs)
+    action: Any = read_by("action", lambda env: env._readings.action)
+    previous_action: Any = read_by("previous_action", lambda env: env._readings.previous_action)
+    step_count: Any = read_by("step_count", lambda env: env._readings.step_count)
+    done: Any = read_by("done", lambda env: env._readings.done)
+    after_end: Any = read_by("after_end", lambda env: env._readings.after_end)
+    parameters: Mapping[str, Any] = read_by("parameters", lambda env: env._readings.parameters)
+    variables: dict[str, Any] = read_by("variables", lambda env: env._readings.variables)
+
+    _readings: Readings
     _interface: Interface
     _action_values: Sequence[int] | None
     _own: OwnHooks
     _observe: Callable[[Any], Any]
 
     # In the order of a step.
+
+    def _keep_readings(self) -> None:
+        """Keep what hooks read in the environment itself until the next step."""
 
     def _get_inputs(self) -> Any:
         """Turn ``self.action`` into the values of the inputs, in the order of the config.

@@ -40,7 +40,7 @@ def columns_of(env: Constructed) -> Columns:
     attributes = plain_attributes(vars(env), env._own_names)
     streams, seeds = _stream_of(env)
     return {
-        "values": np.array([env._values]),
+        "values": np.array([env._readings.values]),
         "previous_state": np.array([env.previous_state]),
         "inputs": np.array([env.inputs], np.float64),
         "action": [copy.deepcopy(env.action)],
@@ -74,19 +74,19 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
     learn(columns.get("texts", {}))
-    values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
-    env._values = values
-    env.state = values[: env._output_count]
-    env.previous_state = tuple(np.asarray(columns["previous_state"][place], np.float64).tolist())
-    env.inputs = tuple(np.asarray(columns["inputs"][place], np.float64).tolist())
-    env.action = native_value(columns["action"], place)
-    env.previous_action = native_value(columns["previous_action"], place)
-    env.step_count = int(columns["step_count"][place])
-    env.done = bool(columns["done"][place])
-    env.after_end = bool(columns["after_end"][place])
+    read = env._readings
+    read.values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
+    read.state = read.values[: env._output_count]
+    read.previous_state = tuple(np.asarray(columns["previous_state"][place], np.float64).tolist())
+    read.inputs = tuple(np.asarray(columns["inputs"][place], np.float64).tolist())
+    read.action = native_value(columns["action"], place)
+    read.previous_action = native_value(columns["previous_action"], place)
+    read.step_count = int(columns["step_count"][place])
+    read.done = bool(columns["done"][place])
+    read.after_end = bool(columns["after_end"][place])
     parameters = {name: native_value(c, place) for name, c in columns["parameters"].items()}
-    env.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
-    env.variables.update(
+    read.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
+    read.variables.update(
         {name: native_value(column, place) for name, column in columns["variables"].items()}
     )
     pictured, attributes = columns["pictured"], columns["attributes"]

@@ -91,7 +91,7 @@ def conclude(env: Hooks, form: Form, stopped: Any, cut_off: Any, observed: Any) 
         done = form.flags("_is_done", done)
     if stopped is not False:
         done = done | stopped
-    env.done = done
+    env._readings.done = done
     if own.is_truncated:
         cut_off = form.flags("_is_truncated", env._is_truncated()) | cut_off
     if observed is None:

@@ -25,7 +25,6 @@ from fmugym.pool.states import KeptState, StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
-from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.trial.known import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
@@ -134,6 +133,10 @@ Found = dict[int, Warmed]
 """By the index of an environment, the state that its warm-up leads to."""
 
 
+_STEPS_BEFORE: Final = 1000
+"""After so many steps in Python, warm-ups are compiled."""
+
+
 class WarmUps:
     """The warm-ups of one environment, or of N.
 
@@ -152,7 +155,7 @@ class WarmUps:
         self._has_told = False
         self._in_pass: Any = None
         self._prepared_for: Pool | None = None
-        self._left = STEPS_BEFORE
+        self._left = _STEPS_BEFORE
 
     # States that are known
 
@@ -298,8 +301,8 @@ class WarmUps:
         pool.step(None, skip)
         for index in indices[pool.statuses[indices] > _WARNING].tolist():
             raise failed_reset(self._located(pool, index))
-        env._values = pool.outputs[:, indices]
-        env.state = env._values[: env._output_count]
+        env._readings.values = outputs = pool.outputs[:, indices]
+        env.state = outputs[: env._output_count]
 
     def _located(self, pool: Pool, index: int) -> str:
         text = f"the warm-up failed: {pool.failure(index)}"

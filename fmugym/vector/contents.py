@@ -18,13 +18,12 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.signals import Ignoring, ordinary
-from fmugym.task.readings import READINGS
 from fmugym.vector.hooks.tables import functions_of, places_of
 
 __all__ = ["Contents", "borrowed", "differs"]
 
 _NOT_COMPARED: Final = frozenset(
-    {*READINGS, "_in_hooks", "_input_row", "_output_row", "_observation_row"}
+    {"_readings", "_in_hooks", "_input_row", "_output_row", "_observation_row"}
 )
 """Attributes that the caller of hooks and the pool change."""
 

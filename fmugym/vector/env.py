@@ -123,6 +123,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             self._pool = env._opening.open(self.num_envs, **pool_options)
             try:
                 env._use(self._pool)
+                env._has_chosen = True  # to be stepped by an engine
                 self._set_up(hooks, max_episode_steps)
             except BaseException:
                 self._pool.close()

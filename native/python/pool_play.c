@@ -42,17 +42,15 @@ static bool has_letter(const Py_buffer *buffer, int letter) {
     return format[0] != '\0' && format[1] == '\0' && strchr(letters, format[0]) != NULL;
 }
 
-/* Actions of another type or shape come back as an exception; the caller then converts them. */
-static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn *t) {
-    Py_buffer *b = &t->buffers[ACTIONS];
-
+bool take_array_of_actions(const Playing *playing, PyObject *actions, int first, Py_buffer *b) {
     if (PyObject_GetBuffer(actions, b, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT) < 0) {
         return false;
     }
-    bool fits = b->ndim == playing->action_dimensions && has_letter(b, playing->action_letter) &&
+    bool fits = b->ndim == playing->action_dimensions - first &&
+                has_letter(b, playing->action_letter) &&
                 b->itemsize == (Py_ssize_t)playing->play.actions.size;
     for (int i = 0; fits && i < b->ndim; i++) {
-        fits = b->shape[i] == playing->action_shape[i];
+        fits = b->shape[i] == playing->action_shape[first + i];
     }
     if (!fits || (uintptr_t)b->buf % (uintptr_t)b->itemsize != 0) {
         PyErr_SetString(PyExc_TypeError, "the actions have another type or shape");
@@ -63,7 +61,7 @@ static bool take_given_actions(const Playing *playing, PyObject *actions, PyTurn
 
 /* None stands for episodes that start where others end. */
 static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
-    return take_given_actions(playing, args[STEP_ACTIONS], t) &&
+    return take_array_of_actions(playing, args[STEP_ACTIONS], 0, &t->buffers[ACTIONS]) &&
            (args[STEP_DRAWN] == Py_None ||
             take_bytes(args[STEP_DRAWN], &t->buffers[DRAWN], PyBUF_WRITABLE,
                        playing->play.draws->count * self->pool.settings.count * sizeof(double)));

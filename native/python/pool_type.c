@@ -60,9 +60,7 @@ static void pool_dealloc(PyObject *object) {
     free(self->paths);
     free(self->categories);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->single);
-    Py_XDECREF(self->actions[0]);
-    Py_XDECREF(self->actions[1]);
+    Py_XDECREF(self->one);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -112,13 +110,8 @@ static PyMethodDef methods[] = {
     FAST("play_after", py_play_after),
     FAST("rollout", py_rollout),
     {"exchange_play", py_exchange_play, METH_O, NULL},
-    {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
-     METH_VARARGS | METH_KEYWORDS, NULL},
-    FAST("step_single", py_step_single),
-    FAST("before_single", py_before_single),
-    {"after_single", py_after_single, METH_O, NULL},
-    {"begin_single", py_begin_single, METH_O, NULL},
-    {"actions_of_single", py_actions_of_single, METH_NOARGS, NULL},
+    {"prepare_one", py_prepare_one, METH_VARARGS, NULL},
+    FAST("step_one", py_step_one),
     FAST("start", py_start),
     {"reset_by", py_reset_by, METH_O, NULL},
     {"save", py_save, METH_NOARGS, NULL},

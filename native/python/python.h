@@ -40,8 +40,7 @@ typedef struct {
     const char **paths, **categories;
     System *system;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
-    PyObject *single;  /* another one */
-    PyObject *actions[2]; /* of a single environment, in the last step and in the one before */
+    PyObject *one;     /* another one */
 } PyPool;
 
 extern PyTypeObject *access_type, *draws_type, *snapshot_type;
@@ -124,11 +123,7 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
-PyObject *py_prepare_single(PyObject *object, PyObject *args, PyObject *kwargs);
-PyObject *py_step_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_before_single(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_after_single(PyObject *object, PyObject *troubled);
-PyObject *py_begin_single(PyObject *object, PyObject *action);
-PyObject *py_actions_of_single(PyObject *object, PyObject *unused);
+PyObject *py_prepare_one(PyObject *object, PyObject *args);
+PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 #endif

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from fmugym import _native
 from fmugym.archive.variable import Variable
-from fmugym.pool.base import FloatArray, MaskArray, Played, SingleCalls, available_processors
+from fmugym.pool.base import FloatArray, MaskArray, Played, available_processors
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.native import prepare
 from fmugym.pool.process.shared_memory import Arrays
@@ -107,22 +107,6 @@ class PlayAround:
             return after(*arrays)
 
         return play
-
-    def prepare_single(self, step: Callable[[], int], groups: Mapping[str, Any]) -> SingleCalls:
-        """See ``NativePool.prepare_single``.
-
-        Args:
-            step: Lets the worker step; returns how many instances had trouble.
-            groups: The arguments of ``NativePool.prepare_single``.
-        """
-        own = self._pool
-        own.prepare_single(**groups)
-        before, after = own.before_single, own.after_single
-
-        def whole_step(action: Any, attributes: dict[str, Any], count: int) -> Any:
-            return before(action, attributes, count) and after(step())
-
-        return SingleCalls(whole_step, own.begin_single, own.actions_of_single)
 
 
 def _ignore(index: int, status: int, category: str, message: str) -> None:

@@ -30,7 +30,6 @@ from fmugym.pool.base import (
     MaskArray,
     Played,
     PoolSpec,
-    SingleCalls,
     StatusArray,
     available_processors,
 )
@@ -272,10 +271,6 @@ class ProcessPool(SavingPool):
         from fmugym.pool.process.rollouts import PlayOfWorkers
 
         return PlayOfWorkers(self._arrays, self._parts[1:])
-
-    def prepare_single(self, **groups: Any) -> SingleCalls:
-        """See ``Pool.prepare_single``."""
-        return self._around().prepare_single(self.step_own, groups)
 
     def _around(self) -> PlayAround:
         """Make what runs compiled hooks around the workers' steps."""

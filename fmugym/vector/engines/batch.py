@@ -63,7 +63,7 @@ class BatchEngine(Engine):
         self._longest = 0
         self._idle: MaskArray | None = None
         self._foreign = np.zeros(num_envs, np.bool_)
-        batched(env, num_envs, self._pool.outputs, self._pool.inputs).place_in(env)
+        env._readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env._was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}

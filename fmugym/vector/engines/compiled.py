@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import FloatArray, MaskArray
@@ -23,9 +22,9 @@ from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.layout import Layout
+from fmugym.vector.engines.memory import Memory
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import Row
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.infos import (
     not_finite,
@@ -38,9 +37,6 @@ __all__ = ["CompiledEngine"]
 logger = logging.getLogger(__name__)
 
 _BOOL = np.dtype(np.bool_)
-
-_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
-"""The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
 _REFUSALS = (TypeError, ValueError, BufferError)
 """What the pool raises if it does not take the arguments of a step."""
@@ -64,12 +60,7 @@ class CompiledEngine(BatchEngine):
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
-        self._kept, self._done = np.zeros_like(self._pool.outputs), np.zeros(num_envs, _BOOL)
-        shape = (num_envs, *(env.action_space.shape or ()))
-        dtype = env.action_space.dtype
-        self._actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
-        self._rows: dict[str, npt.NDArray[Any]] = {}
-        self._before: dict[str, npt.NDArray[Any]] = {}
+        self._memory = Memory(env, env._readings, self.ended, self._columns)
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
@@ -88,8 +79,10 @@ class CompiledEngine(BatchEngine):
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
         self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
         self._resets_apart = self._resets_apart or not self._pool.plays_alone
-        self._make_rows(task)
-        layout = Layout(task, self.env)
+        memory = self._memory
+        memory.parameters = self._parameters
+        memory.hold(task)
+        layout = Layout(task, self.env, self._n)
         self._new_arrays, self._divided = layout.new_arrays, layout.divided
         self._is_whole = not task.left
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
@@ -98,12 +91,12 @@ class CompiledEngine(BatchEngine):
         told = "drawn", "_drawn", *LateDict.parts(_told, plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
-            (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
-            self._action_group(),
+            memory.programs(task),
+            memory.action_group(),
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            self._surroundings(task) | {"results": (StepResult, *layout.form, arrays, told)},
+            memory.surroundings(task, (StepResult, *layout.form, arrays, told)),
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:
@@ -111,104 +104,6 @@ class CompiledEngine(BatchEngine):
             self._reset_by = self._pool.reset_of_play()
         self._prepared = True
         self._not_drawn = np.empty(self._drawn_shape)
-
-    def _make_rows(self, task: TracedTask) -> None:
-        """Make the arrays that stay in place: variables, and what hooks read of the step before."""
-        self._rows, self._before = {}, {}
-        for name, dtype in task.variables.items():
-            self._rows[name] = np.ascontiguousarray(self._row(name), dtype).copy()
-            self._before[name] = self._rows[name].copy()
-        self._show()
-
-    def _show(self) -> None:
-        """Let hooks on arrays read what the pool keeps."""
-        env = self.env
-        env.action, env.previous_action = (np.moveaxis(a, 0, -1) for a in self._actions)
-        self._kept[: env._output_count] = env.previous_state
-        env.previous_state = self._kept[: env._output_count]
-        self._done[:] = env.done
-        env.done = self._done
-        env.variables.update(self._rows)
-
-    def _take_over(self) -> None:
-        """Take over what a step on arrays has left in arrays of its own."""
-        env = self.env
-        for name, row in self._rows.items():
-            row[...] = env.variables[name]
-        for own, theirs in zip(self._actions, (env.action, env.previous_action), strict=True):
-            own[...] = np.moveaxis(theirs, -1, 0)
-        self._show()
-
-    def _find(self, row: Row) -> Any:
-        """The array of a row that a program loads or stores."""
-        kind, *rest = row
-        index: Any = rest[-1]
-        name: Any = rest[0]
-        match kind:
-            case "output":
-                return self._pool.outputs[index]
-            case "kept":
-                return self._kept[index]
-            case "input":
-                return self._pool.inputs[index]
-            case "parameter":
-                return self._parameters[name]
-            case "step_count":
-                return self.env.step_count
-            case "attribute":
-                return self._columns[name]
-        arrays = self._rows if kind == "variable" else self._before
-        return arrays[name].reshape(-1, self._n)[index]
-
-    def _action_group(self) -> dict[str, Any]:
-        """How the pool checks and keeps actions."""
-        env, dtype = self.env, self._actions[0].dtype
-        space: Any = env.action_space
-        is_discrete = isinstance(space, spaces.Discrete)
-        check = 1 if is_discrete else _FLOAT_CHECKS.get(dtype, 0)
-        low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
-        flat = [actions.reshape(-1) for actions in self._actions]
-        return {
-            "shape": self._actions[0].shape[1:],
-            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
-            "size": dtype.itemsize,
-            "check": check,
-            "lowest": low,
-            "highest": high,
-            "current": flat[0],
-            "previous": flat[1],
-            "none": np.array(env._no_action, dtype).reshape(-1),
-        }
-
-    def _surroundings(self, task: TracedTask) -> dict[str, Any]:
-        """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
-        env, plan = self.env, self.env._plan
-        names = plan.parameter_names
-        flat = {name: row.reshape(-1, self._n) for name, row in self._rows.items()}
-        before = {name: row.reshape(-1, self._n) for name, row in self._before.items()}
-        constants = plan.constant_variables
-        return {
-            "kept": self._kept,
-            "done": self._done,
-            "reads_kept": task.judgement.loads("kept"),
-            "copies": tuple(
-                pair for name in flat for pair in zip(flat[name], before[name], strict=True)
-            ),
-            "input_starts": tuple(
-                (names.index(name), start) if name in names else (-1, start)
-                for name, start in env._start_inputs
-            ),
-            "drawn_variables": tuple(
-                (flat[draw.name][draw.element or 0], number)
-                for number, draw in enumerate(plan.draws)
-                if draw.name in flat
-            ),
-            "variable_starts": tuple(
-                (row, np.array(value, row.dtype).tobytes())
-                for name, start in constants.items()
-                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
-            ),
-        }
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -293,7 +188,7 @@ class CompiledEngine(BatchEngine):
         """See ``Engine.call``."""
         returned = super().call(name, indices, arguments, keywords)
         if self._prepared:
-            self._take_over()
+            self._memory.take_over()
         return returned
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
@@ -461,10 +356,10 @@ class CompiledEngine(BatchEngine):
             result = super().step(actions, resetting)
         except BaseException:
             if self._prepared:
-                self._show()  # a reset follows if the FMUs have stepped
+                self._memory.show()  # a reset follows if the FMUs have stepped
             raise
         if self._prepared:
-            self._take_over()
+            self._memory.take_over()
         return result
 
     def _mend(self, result: StepResult, starting: MaskArray | None) -> None:
@@ -479,7 +374,7 @@ class CompiledEngine(BatchEngine):
             self._require_started(np.flatnonzero(starting), statuses)
             self._require_finite_start(result.observations, starting)
         self._require_possible_inputs(starting)
-        self._outputs_before, self._variables_before = self._kept, self._before
+        self._outputs_before, self._variables_before = self._memory.kept, self._memory.before
         env._in_hooks = True
         try:
             self._handle_faults(result, statuses, True, not_finite(result.observations))

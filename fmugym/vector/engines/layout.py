@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ class Layout:
 
     Args:
         task: The programs.
-        env: The environment, with the arrays of N.
+        env: The environment.
+        count: N.
 
     Attributes:
         shapes: The shape and type of each array.
@@ -31,8 +33,8 @@ class Layout:
             what ``new_arrays`` makes are the observations.
     """
 
-    def __init__(self, task: TracedTask, env: FMUEnv) -> None:
-        self._n = len(env.step_count)
+    def __init__(self, task: TracedTask, env: FMUEnv, count: int) -> None:
+        self._n = count
         self._paths = [array.path for array in task.seen]
         self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
         self.names: tuple[str, ...] | None = ()
@@ -55,6 +57,16 @@ class Layout:
             return arrays[0]
         return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
 
+    def of_one(
+        self, arrays: Sequence[Any]
+    ) -> tuple[Callable[[], Any], Callable[[], dict[str, Any]] | None]:
+        """What makes the observation of a single environment, and its info if there is one."""
+        if self.names is None:
+            return arrays[0][0].copy, None
+        observed, told = self._nested([array[0] for array in arrays])
+        inform = partial(_copied, told) if told else None
+        return partial(_copied, observed), inform
+
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""
         observations, infos = self._nested(arrays)
@@ -70,6 +82,13 @@ class Layout:
                 place = place.setdefault(parent, {})
             place[name] = leaf
         return tree["observation"], tree["info"]
+
+
+def _copied(tree: Any) -> Any:
+    """Copy the arrays of a tree; what has no axis becomes a number of Python."""
+    if isinstance(tree, dict):
+        return {name: _copied(part) for name, part in tree.items()}
+    return tree.copy() if np.ndim(tree) else tree.item()
 
 
 def _pairs(tree: Any) -> Any:

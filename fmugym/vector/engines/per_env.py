@@ -210,12 +210,13 @@ class PerEnvEngine(Engine):
         try:
             for index, inputs, values in zip(indices, in_time(taken.rows.T), told, strict=True):
                 env = envs[index]
+                read = env._readings
                 if actions is not None:
                     env._in_hooks = True
-                    env.previous_action, env.previous_state = env.action, env.state
-                    env.action = actions[index]
-                env.inputs = inputs
-                env.step_count += 1
+                    read.previous_action, read.previous_state = read.action, read.state
+                    read.action = actions[index]
+                read.inputs = inputs
+                read.step_count += 1
                 if status_of[index] or env.render_mode is not None:
                     self._conclude_fully(outcomes, index, status_of[index], values)
                 else:
@@ -230,15 +231,16 @@ class PerEnvEngine(Engine):
         self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
     ) -> None:
         """Do what ``FMUEnv._conclude`` does, but leave numbers unchecked where no info follows."""
-        outcomes.values[index] = env._values
+        read = env._readings
+        outcomes.values[index] = read.values
         if env._own.update:
-            outcomes.variables[index] = env.variables.copy()
-        env._values = values
-        env.state = values if env._no_monitors else values[: env._output_count]
+            outcomes.variables[index] = read.variables.copy()
+        read.values = values
+        read.state = values if env._no_monitors else values[: env._output_count]
         observed = self._observed
         if observed is None and env._pool_observes:
             observed = env._observation_row.copy()
-        steps = env.step_count
+        steps = read.step_count
         observation, reward, ended, cut_off = conclude(
             env, self._form, False, steps >= env._step_limit, observed
         )
@@ -321,9 +323,10 @@ class PerEnvEngine(Engine):
                 env._in_hooks = True
                 if not self._checks_all:
                     env._require_usable(action)
-                state, before = env.state, env.action
-                befores.append((before, env.previous_action, env.previous_state, env.inputs))
-                env.previous_action, env.previous_state, env.action = before, state, action
+                read = env._readings
+                state, before = read.state, read.action
+                befores.append((before, read.previous_action, read.previous_state, read.inputs))
+                read.previous_action, read.previous_state, read.action = before, state, action
                 parts.append(writer.packed(env._get_inputs(), action))
             rows = writer.unpacked(parts)
             finite = np.isfinite(rows)

@@ -24,7 +24,7 @@ from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.views import batched, column, copied
 
-__all__ = ["CURE", "find_difference", "sample_of", "sample_states"]
+__all__ = ["CURE", "find_difference", "sample_of", "sample_states", "states_around"]
 
 CURE = (
     "Write hooks element-wise: & and | for 'and' and 'or', numpy.where for 'if', no reduction over "
@@ -62,11 +62,13 @@ _WILD_SCALES = (300.0, -1e5)
 """Hooks may fail at these. They reach limits that the FMU's own states are far from."""
 
 
-def find_difference(env: FMUEnv) -> str | None:
+def find_difference(env: FMUEnv, states: Sequence[Readings] | None = None) -> str | None:
     """Look for a reason to call hooks one environment at a time.
 
     Args:
-        env: A prototype whose pool has not been used yet.
+        env: A prototype.
+        states: Batches of states in which hooks may fail; None for those that the FMU takes, if its
+            pool has not been used yet, and others.
 
     Returns:
         The hook and how it differs on arrays, or None if all hooks work on arrays.
@@ -81,11 +83,12 @@ def find_difference(env: FMUEnv) -> str | None:
         borrowed(env, outside=True) as contents,
     ):
         warnings.simplefilter("ignore")
-        kinds = [sample_states(env, some) for some in (_SCALES[:1], _SCALES[1:], _WILD_SCALES)]
+        scales = _SCALES[:1], _SCALES[1:], _WILD_SCALES
+        kinds = [sample_states(env, some) for some in scales] if states is None else states
         for name in hooks:
             for index, batch in enumerate(kinds):
                 comparison = _Comparison(env, contents, batch, name)
-                difference = comparison.run(is_natural=index == 0)
+                difference = comparison.run(is_natural=states is None and index == 0)
                 if difference is not None:
                     return f"{name} {difference}"
     return None
@@ -110,18 +113,21 @@ def _makes_arrays(space: spaces.Space[Any]) -> bool:
     return is_array_space(space)
 
 
-def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> Readings:
-    """Make a batch of states that the FMU takes, each in several magnitudes.
+def sample_states(
+    env: FMUEnv, scales: Sequence[float] = _SCALES, visited: Sequence[Visited] | None = None
+) -> Readings:
+    """Make a batch of states, each in several magnitudes.
 
     Args:
-        env: A prototype; the first instance of its pool is used.
+        env: A prototype.
         scales: The factors of the states, each with some noise.
+        visited: The states; by default those that the first instance of its pool takes.
 
     Returns:
         What hooks read in these states.
     """
     rng = np.random.default_rng(0)
-    visited = _visit_states(env, rng)
+    visited = _visit_states(env, rng) if visited is None else visited
     count = len(visited) * len(scales)
     batch = batched(env, count)
     rows: dict[str, list[Any]] = {}
@@ -139,18 +145,18 @@ def sample_states(env: FMUEnv, scales: Sequence[float] = _SCALES) -> Readings:
     return batch
 
 
-_Visited = tuple[FloatArray, FloatArray, FloatArray]
+Visited = tuple[FloatArray, FloatArray, FloatArray]
 """The outputs before a step, those after it, and the inputs."""
 
 
-def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
+def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     """Run short episodes with small inputs; a slow FMU would take long for more."""
     pool, plan = env._open_pool("the hook check"), env._plan
     if pool.is_real:
         return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)
     mask[0] = True
-    visited: list[_Visited] = []
+    visited: list[Visited] = []
     for _ in range(_EPISODES):
         start_values = plan.draw(rng).start_values
         pool.reset(plan.model_variables, np.repeat(start_values, len(mask), axis=1), mask)
@@ -163,7 +169,18 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[_Visited]:
     return visited
 
 
-def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[_Visited]:
+def states_around(env: FMUEnv) -> list[Visited]:
+    """Draw states around the one that a single environment has now."""
+    rng, now = np.random.default_rng(0), env._readings
+    centres = [np.array(values, np.float64) for values in (now.values, now.values, now.inputs)]
+
+    def moved(reach: float) -> Any:
+        return tuple(c + reach * (1 + abs(c)) * rng.normal(size=len(c)) for c in centres)
+
+    return [moved(reach) for reach in (0.01, 0.1, 1.0, 1.0)]
+
+
+def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[Visited]:
     """Draw states: the check must not move anything real."""
     sizes = (len(pool.outputs), len(pool.outputs), len(pool.inputs))
     return [
@@ -176,7 +193,7 @@ def _place_sample(
     env: FMUEnv,
     batch: Readings,
     index: int,
-    visited: _Visited,
+    visited: Visited,
     rng: np.random.Generator,
     rows: dict[str, list[Any]],
 ) -> None:

@@ -67,7 +67,7 @@ class _Comparison:
         name: Any = rest[0]
         match kind:
             case "output":
-                return env._values[index]
+                return env._readings.values[index]
             case "kept":
                 return env.previous_state[index]
             case "input":

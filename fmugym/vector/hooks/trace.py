@@ -171,7 +171,7 @@ class Tracer:
         for name, row in self._attributes.items():
             names = element_names((), "attribute", name)
             vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
-        symbolic_readings(self._env, self._graph, self._variables, judging).place_in(self._env)
+        self._env._readings = symbolic_readings(self._env, self._graph, self._variables, judging)
         self._contents = Contents(self._env, outside=True)
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dis
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from inspect import getattr_static
-from types import BuiltinFunctionType, CodeType, FunctionType, MappingProxyType, ModuleType
+from types import BuiltinFunctionType, FunctionType, MappingProxyType, ModuleType
 from typing import Any, Final
 
 import gymnasium
@@ -19,14 +18,16 @@ from fmugym.vector.contents import differs
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.tables import is_foreign, names_in, places_of, unwrapped
 
-__all__ = ["is_ours", "is_plain", "names_of", "unchanged_globals"]
+__all__ = ["names_in_hooks", "unchanged_globals"]
 
 _LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range, np.generic)
 
 _OURS: Final = ("fmugym", "gymnasium", "logging")
 """Packages whose objects hooks only read."""
 
-_ACTING: Final = frozenset({"print", "open", "input", "exec", "eval", "setattr", "random"})
+_ACTING: Final = frozenset(
+    {"print", "open", "input", "exec", "eval", "setattr", "random", "breakpoint", "set_trace"}
+)
 """Names of functions that act on something, and of modules that draw numbers."""
 
 _MODULES: Final = frozenset(
@@ -36,7 +37,7 @@ _MODULES: Final = frozenset(
 """Modules of Python whose functions act on something, or return something new each time."""
 
 
-def is_ours(value: Any) -> bool:
+def _is_ours(value: Any) -> bool:
     """Whether a value is an object that hooks only read."""
     if isinstance(value, gymnasium.Env):
         return False
@@ -44,13 +45,13 @@ def is_ours(value: Any) -> bool:
     return isinstance(module, str) and module.partition(".")[0] in _OURS
 
 
-def is_plain(value: Any) -> bool:
+def _is_plain(value: Any) -> bool:
     """Whether it is a number or a text, or a container of them."""
     if isinstance(value, _LEAVES):
         return True
     if type(value) is dict:
-        return all(map(is_plain, value)) and all(map(is_plain, value.values()))
-    return type(value) in (list, tuple, set, frozenset) and all(map(is_plain, value))
+        return all(map(_is_plain, value)) and all(map(_is_plain, value.values()))
+    return type(value) in (list, tuple, set, frozenset) and all(map(_is_plain, value))
 
 
 @contextmanager
@@ -100,37 +101,14 @@ def _restore(value: Any, copy: Any) -> None:
         value.update(copy)
 
 
-def names_of(env: FMUEnv, hooks: Iterable[str]) -> set[str]:
-    """The names of the attributes and globals to which hooks refer.
-
-    Raises:
-        UntraceableError: If they assign an attribute or a global variable. A program that runs
-            before them would not know the new value.
-    """
-    names: set[str] = set()
-    for function in _reached(env, hooks):
-        names.update(names_in(function.__code__))
-        _require_no_assignment(function, function.__code__)
-    return names
+def names_in_hooks(env: FMUEnv) -> set[str]:
+    """The names of the attributes and globals to which hooks refer."""
+    return {name for function in _reached(env) for name in names_in(function.__code__)}
 
 
-def _require_no_assignment(function: FunctionType, code: CodeType) -> None:
-    for one in dis.get_instructions(code):
-        if one.opname in _ASSIGNMENTS:
-            raise UntraceableError(f"{function.__name__} assigns {one.argval}, and is not compiled")
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            _require_no_assignment(function, constant)
-
-
-_ASSIGNMENTS: Final = frozenset({"STORE_ATTR", "DELETE_ATTR", "STORE_GLOBAL", "DELETE_GLOBAL"})
-
-
-def _reached(
-    env: FMUEnv, hooks: Iterable[str] = (*ORDER[:-1], "_goal_reward")
-) -> list[FunctionType]:
+def _reached(env: FMUEnv) -> list[FunctionType]:
     """The functions of hooks, and those that they call by name or by an attribute."""
-    waiting = [getattr_static(env, name, None) for name in hooks]
+    waiting = [getattr_static(env, name, None) for name in (*ORDER, "_goal_reward")]
     found: dict[int, FunctionType] = {}
     while waiting:
         function = unwrapped(waiting.pop())
@@ -157,7 +135,7 @@ def _checked_places(function: FunctionType) -> Iterator[tuple[Any, str]]:
         value = place[name]
         if isinstance(value, ModuleType):
             _require_computing(function, value)
-        elif is_plain(value) or type(value) is np.ndarray:
+        elif _is_plain(value) or type(value) is np.ndarray:
             yield place, name
         elif not _is_constant(value):
             raise UntraceableError(
@@ -170,7 +148,7 @@ def _require_plain_attributes(env: FMUEnv, function: FunctionType) -> None:
     """Refuse functions that refer to objects among the attributes, which they could change."""
     for name in set(names_in(function.__code__)):
         value = getattr_static(env, name, None)
-        is_harmless = is_plain(value) or isinstance(value, np.ndarray) or is_ours(value)
+        is_harmless = _is_plain(value) or isinstance(value, np.ndarray) or _is_ours(value)
         if not is_harmless and not isinstance(value, _CODE) and not hasattr(value, "__get__"):
             raise UntraceableError(
                 f"{function.__name__} refers to {name}, a {type(value).__name__} "
@@ -191,7 +169,7 @@ def _is_constant(value: Any) -> bool:
     is_code = isinstance(value, type | FunctionType | BuiltinFunctionType)
     return (
         is_code
-        or is_ours(value)
+        or _is_ours(value)
         or type(value).__module__.partition(".")[0]
         in (
             "numpy",

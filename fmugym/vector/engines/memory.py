@@ -1,0 +1,161 @@
+"""The arrays of compiled steps, and what the pool is told of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.env import FMUEnv
+from fmugym.pool.base import MaskArray
+from fmugym.task.readings import Readings
+from fmugym.vector.hooks import results
+from fmugym.vector.hooks.program import Row
+from fmugym.vector.hooks.trace import TracedTask
+
+__all__ = ["Memory"]
+
+_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
+"""The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
+
+
+class Memory:
+    """The arrays of N environments that compiled steps read and write in place.
+
+    Args:
+        env: An environment, for what all have in common.
+        readings: What the hooks of all read; its arrays become those that steps keep.
+        ended: Which episodes have ended, shape (N,).
+        attributes: Attributes that have one number for each environment, by name.
+
+    Attributes:
+        ended: As given.
+        parameters: The rows of the parameters by name; to be set before steps.
+        kept: The outputs before the step, shape (k, N).
+        actions: Those of this step and of the one before, environments first.
+        variables: The episode variables by name, environments last.
+        before: The same before the step.
+    """
+
+    def __init__(
+        self,
+        env: FMUEnv,
+        readings: Readings,
+        ended: MaskArray,
+        attributes: Mapping[str, npt.NDArray[Any]],
+    ) -> None:
+        self._env, self._readings, self._attributes = env, readings, attributes
+        self._n = len(ended)
+        self.ended, self.parameters = ended, readings.parameters
+        self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
+        shape, dtype = (self._n, *(env.action_space.shape or ())), env.action_space.dtype
+        self.actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
+        self.variables: dict[str, npt.NDArray[Any]] = {}
+        self.before: dict[str, npt.NDArray[Any]] = {}
+
+    def hold(self, task: TracedTask) -> None:
+        """Make the arrays of the episode variables in the types that programs store."""
+        self.variables, self.before = {}, {}
+        for name, dtype in task.variables.items():
+            row = results.variable(name, self._readings.variables[name], self._n)
+            self.variables[name] = np.ascontiguousarray(row, dtype).copy()
+            self.before[name] = self.variables[name].copy()
+        self.show()
+
+    def show(self) -> None:
+        """Let hooks on arrays read what the pool keeps."""
+        read, width = self._readings, self._env._output_count
+        read.action, read.previous_action = (np.moveaxis(a, 0, -1) for a in self.actions)
+        self.kept[:width] = read.previous_state
+        read.previous_state = self.kept[:width]
+        self._done[:] = read.done
+        read.done = self._done
+        read.variables.update(self.variables)
+
+    def take_over(self) -> None:
+        """Take over what a step on arrays has left in arrays of its own."""
+        read = self._readings
+        for name, row in self.variables.items():
+            row[...] = read.variables[name]
+        for own, theirs in zip(self.actions, (read.action, read.previous_action), strict=True):
+            own[...] = np.moveaxis(theirs, -1, 0)
+        self.show()
+
+    def programs(self, task: TracedTask) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """The programs, with the arrays that they load and store."""
+        return task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)
+
+    def _find(self, row: Row) -> Any:
+        """The array of a row that a program loads or stores."""
+        kind, *rest = row
+        index: Any = rest[-1]
+        name: Any = rest[0]
+        match kind:
+            case "output":
+                return self._readings.values[index]
+            case "kept":
+                return self.kept[index]
+            case "input":
+                return self._readings.inputs[index]
+            case "parameter":
+                return self.parameters[name]
+            case "step_count":
+                return self._readings.step_count
+            case "attribute":
+                return self._attributes[name]
+        arrays = self.variables if kind == "variable" else self.before
+        return arrays[name].reshape(-1, self._n)[index]
+
+    def action_group(self) -> dict[str, Any]:
+        """How the pool checks and keeps actions."""
+        env, dtype = self._env, self.actions[0].dtype
+        space: Any = env.action_space
+        is_discrete = isinstance(space, spaces.Discrete)
+        check = 1 if is_discrete else _FLOAT_CHECKS.get(dtype, 0)
+        low, high = (int(space.start), int(space.start + space.n - 1)) if is_discrete else (0, 0)
+        flat = [actions.reshape(-1) for actions in self.actions]
+        return {
+            "shape": self.actions[0].shape[1:],
+            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
+            "size": dtype.itemsize,
+            "check": check,
+            "lowest": low,
+            "highest": high,
+            "current": flat[0],
+            "previous": flat[1],
+            "none": np.array(env._no_action, dtype).reshape(-1),
+        }
+
+    def surroundings(self, task: TracedTask, results: Any) -> dict[str, Any]:
+        """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
+        env, plan = self._env, self._env._plan
+        names = plan.parameter_names
+        flat = {name: row.reshape(-1, self._n) for name, row in self.variables.items()}
+        before = {name: row.reshape(-1, self._n) for name, row in self.before.items()}
+        constants = plan.constant_variables
+        return {
+            "kept": self.kept,
+            "done": self._done,
+            "reads_kept": task.judgement.loads("kept"),
+            "copies": tuple(
+                pair for name in flat for pair in zip(flat[name], before[name], strict=True)
+            ),
+            "input_starts": tuple(
+                (names.index(name), start) if name in names else (-1, start)
+                for name, start in env._start_inputs
+            ),
+            "drawn_variables": tuple(
+                (flat[draw.name][draw.element or 0], number)
+                for number, draw in enumerate(plan.draws)
+                if draw.name in flat
+            ),
+            "variable_starts": tuple(
+                (row, np.array(value, row.dtype).tobytes())
+                for name, start in constants.items()
+                for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
+            ),
+            "results": results,
+        }

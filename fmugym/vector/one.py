@@ -1,0 +1,344 @@
+"""Compiled steps of a single environment, which are those of a batch of one."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import deepcopy
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError
+from fmugym.signals import ordinary
+from fmugym.task.readings import READINGS, Readings
+from fmugym.task.step import ORDER
+from fmugym.vector.contents import differs
+from fmugym.vector.engines.layout import Layout
+from fmugym.vector.engines.memory import Memory
+from fmugym.vector.hooks.check import find_difference, sample_states, states_around
+from fmugym.vector.hooks.compare import require_same
+from fmugym.vector.hooks.program import UntraceableError
+from fmugym.vector.hooks.purity import names_in_hooks, unchanged_globals
+from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.streams import given_draws
+from fmugym.vector.views import batched
+
+__all__ = ["Player", "player_of"]
+
+logger = logging.getLogger(__name__)
+
+_SCALES: Final = (1.0, -0.3)
+"""Magnitudes of the states in which programs are compared with hooks."""
+
+_NUMBERS: Final = (bool, int, float, np.bool_, np.integer, np.floating)
+
+_NOTHING: Final = object()
+
+
+def player_of(env: FMUEnv, required: bool) -> Player | None:
+    """Compile the hooks of an environment in an episode.
+
+    Args:
+        env: The environment, with a native pool of its own.
+        required: Whether hooks that cannot be compiled are an error.
+
+    Returns:
+        None if they cannot.
+
+    Raises:
+        ConfigError: If they cannot, but must.
+    """
+    try:
+        player = Player(env)
+        if required and player.left:
+            raise UntraceableError("; ".join(player.left.values()))
+    except ordinary(Exception) as reason:  # hooks may raise anything
+        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
+        if required:
+            raise ConfigError(text) from None
+        logger.info("%s. They run in Python, which is slower", text)
+        return None
+    for why in player.left.values():
+        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
+        logger.info("%s. It runs in Python, the others are compiled", text)
+    return player
+
+
+class Player:
+    """Steps an environment by programs that its pool runs.
+
+    Between two steps, the environment reads from the pool's arrays. As soon as Python has to do a
+    step, to write what hooks read, or to start an episode, it reads from an object of its own
+    again. The programs hold the values that attributes had when they were made. A number that is
+    assigned later becomes an array of one, as ``set_attr`` of a vector environment makes it.
+
+    Args:
+        env: The environment, in an episode.
+
+    Attributes:
+        readings: What hooks read from the pool's arrays.
+        left: The hooks that stay in Python, and why.
+        step: Takes an action and the attributes of the environment; see ``step_one`` of the C
+            extension.
+
+    Raises:
+        UntraceableError: If the hooks cannot be compiled.
+    """
+
+    step: Callable[[Any, dict[str, Any]], Any]
+
+    def __init__(self, env: FMUEnv) -> None:
+        env._keep_readings()
+        self._own = env._readings
+        self._pool: Any = env._open_pool("step")
+        self._numbers: dict[str, npt.NDArray[Any]] = {}
+        self._compile(env)
+
+    def _compile(self, env: FMUEnv) -> None:
+        self._watched = tuple(_watched_in(env))
+        task = _traced(env, self._numbers)
+        plan, ended = env._plan, np.zeros(1, np.bool_)
+        self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
+        self._starts = plan.constants[:, None].copy()
+        self._memory = memory = Memory(env, self._rows, ended, self._numbers)
+        memory.parameters = dict(zip(plan.parameter_names, self._starts, strict=True))
+        memory.hold(task)
+        self._task, self.left = task, task.left
+        self.readings: Any = PoolReadings(env, self._own, self._rows, memory)
+        self._prepare(env, task, memory)
+
+    def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
+        """Hand the programs and their arrays to the pool."""
+        plan, layout = env._plan, Layout(task, env, 1)
+        self._pool.prepare_play(
+            plan.model_variables,
+            memory.programs(task),
+            memory.action_group(),
+            self._starts,
+            (given_draws(plan), np.zeros((1, 6), np.uint64)),
+            (self._rows.step_count, memory.ended, env._step_limit),
+            memory.surroundings(task, results=None),
+        )
+        arrays = tuple(np.zeros(shape, dtype) for shape, dtype in layout.shapes)
+        flags = np.zeros(1, np.bool_), np.zeros(1, np.bool_)
+        self._observe, inform = layout.of_one(arrays)
+        seen = arrays[0] if arrays and not task.seen else arrays
+        self._arrays = seen, np.zeros(1), *flags, self._observe, inform
+        self._watch()
+
+    def _watch(self) -> None:
+        """Let the pool compare the attributes before each step."""
+        *arrays, observe, inform = self._arrays
+        addresses = tuple(one.address for one in self._watched)
+        self.step = self._pool.prepare_one(*arrays, addresses, observe, inform)
+
+    # From Python to the pool and back.
+
+    def take_over(self, env: FMUEnv) -> bool:
+        """Copy what the environment keeps to the pool's arrays, and let it read from there.
+
+        Returns:
+            False if it keeps what programs cannot hold; Python must do the step.
+        """
+        if any(one.has_changed() for one in self._watched) and not self.renew(env):
+            return False
+        own, memory, task = self._own, self._memory, self._task
+        try:
+            for name, row in memory.variables.items():
+                value = np.asarray(own.variables[name])
+                if value.dtype != row.dtype and not _is_exact(value, row.dtype):
+                    return False
+                row[..., 0] = value
+            for name, number in own.parameters.items():
+                if name in memory.parameters:
+                    memory.parameters[name][0] = np.nan if isinstance(number, str) else number
+            if task.loads("load_previous_action"):
+                memory.actions[0][0], memory.actions[1][0] = own.action, own.previous_action
+        except ordinary(Exception):  # a user may have assigned anything
+            return False
+        self._rows.step_count[0], memory.ended[0] = own.step_count, False
+        self._pool.inputs[:, 0] = own.inputs
+        env._readings = self.readings
+        return True
+
+    def keep(self, env: FMUEnv) -> None:
+        """Let the environment keep again what hooks read, as after the latest step."""
+        own, now = self._own, self.readings
+        if env._readings is not now:
+            return
+        for name in _KEPT:
+            setattr(own, name, getattr(now, name))
+        for name in self._task.updated:
+            own.variables[name] = _number_of(self._memory.variables[name][..., 0])
+        env._readings = own
+
+    def go_back(self, env: FMUEnv) -> None:
+        """Let the environment keep what hooks read when the FMU has stepped, but was not judged."""
+        self.keep(env)
+        own, memory = self._own, self._memory
+        own.values = tuple(memory.kept[:, 0].tolist())
+        own.state = own.previous_state
+        own.done = False
+        for name in self._task.updated:
+            own.variables[name] = _number_of(memory.before[name][..., 0])
+
+    def renew(self, env: FMUEnv) -> bool:
+        """Take over attributes that were assigned or changed.
+
+        Returns:
+            Whether there were any, and compiled steps may go on.
+        """
+        changed = [one for one in self._watched if one.differs_in(env) or one.has_changed()]
+        if not changed:
+            return False
+        self.keep(env)
+        try:
+            if all(self._takes(one.name, vars(env).get(one.name)) for one in changed):
+                self._watched = tuple(_watched_in(env))
+                self._watch()
+            else:
+                self._compile(env)
+        except ordinary(Exception) as reason:  # as in ``player_of``
+            env._player = None
+            text = f"the hooks of {type(env).__name__} cannot be compiled any more: {reason}"
+            logger.info("%s. They run in Python, which is slower", text)
+            return False
+        return True
+
+    def _takes(self, name: str, value: Any) -> bool:
+        """Whether a number goes to an array that the programs read already; otherwise make one."""
+        array = self._numbers.pop(name, None)
+        if not isinstance(value, _NUMBERS):
+            return False
+        self._numbers[name] = row = np.array([value]) if array is None else array
+        if array is None or np.asarray(value).dtype != row.dtype:
+            self._numbers[name] = np.array([value])
+            return False
+        row[0] = value
+        return True
+
+
+_KEPT: Final = ("values", *(name for name in READINGS if name not in {"out", "variables"}))
+
+
+class PoolReadings:
+    """What hooks of a single environment read from the pool's arrays; see ``Readings``.
+
+    Each value is made when it is asked for. Who asks for the variables may write them, so that the
+    environment keeps everything itself again.
+    """
+
+    def __init__(self, env: FMUEnv, own: Readings, rows: Readings, memory: Memory) -> None:
+        self._env, self._own = weakref.ref(env), own
+        self._width, self._count = env._output_count, rows.step_count
+        self._outputs, self._inputs = rows.values[:, 0], rows.inputs[:, 0]
+        self._kept, self._done = memory.kept[:, 0], rows.done
+        self._current, self._previous = memory.actions
+        self.out = own.out
+
+    values = property(lambda self: tuple(self._outputs.tolist()))
+    state = property(lambda self: tuple(self._outputs[: self._width].tolist()))
+    previous_state = property(lambda self: tuple(self._kept[: self._width].tolist()))
+    inputs = property(lambda self: tuple(self._inputs.tolist()))
+    action = property(lambda self: self._current[0].copy())
+    previous_action = property(lambda self: self._previous[0].copy())
+    step_count = property(lambda self: self._count.item())
+    done = property(lambda self: self._done.item())
+    after_end = property(lambda self: self._own.after_end)
+    parameters = property(lambda self: self._own.parameters)
+
+    @property
+    def variables(self) -> Any:
+        env: Any = self._env()
+        env._keep_readings()
+        return self._own.variables
+
+
+class Watched(NamedTuple):
+    """An attribute that programs depend on.
+
+    Attributes:
+        name: Its name.
+        value: The object that it is; ``_NOTHING`` for an attribute of the class only.
+        copy: What a list, dict or array held.
+    """
+
+    name: str
+    value: Any
+    copy: Any
+
+    @property
+    def address(self) -> tuple[Any, ...]:
+        """The name and the address of the object, which stays valid as long as this exists."""
+        return (self.name,) if self.value is _NOTHING else (self.name, id(self.value))
+
+    def differs_in(self, env: FMUEnv) -> bool:
+        """Whether the attribute of an environment is another object."""
+        return vars(env).get(self.name, _NOTHING) is not self.value
+
+    def has_changed(self) -> bool:
+        """Whether the object has changed in place."""
+        return self.copy is not None and differs(self.copy, self.value)
+
+
+def _watched_in(env: FMUEnv) -> Iterator[Watched]:
+    """The attributes to which hooks refer by name, and the hooks themselves."""
+    attributes, names = vars(env), names_in_hooks(env)
+    if "getattr" in names:
+        names |= attributes.keys()
+    for name in sorted((names - env._own_names) | set(ORDER)):
+        value = attributes.get(name, _NOTHING)
+        if value is not _NOTHING or hasattr(type(env), name):
+            can_change = isinstance(value, (list, dict, set, tuple, np.ndarray))
+            yield Watched(name, value, deepcopy(value) if can_change else None)
+
+
+def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
+    """Compile the hooks, and compare the programs with them on states around the present one."""
+    if _is_debugged():
+        raise UntraceableError("a debugger is attached")
+    states = sample_states(env, _SCALES, states_around(env))
+    with unchanged_globals(env):
+        difference = find_difference(env, [states])
+        if difference is not None:
+            raise UntraceableError(difference)
+        task = trace_hooks(env, numbers)
+    with _repeated(env, numbers, len(states.step_count)):
+        require_same(env, states, task)
+    if "_get_inputs" in task.left or len(task.left) > 1:
+        raise UntraceableError("; ".join(task.left.values()))
+    return task
+
+
+def _is_debugged() -> bool:
+    """Whether something follows each line, except for what measures the coverage of tests."""
+    follower = sys.gettrace()
+    return follower is not None and not type(follower).__module__.startswith("coverage")
+
+
+@contextmanager
+def _repeated(env: FMUEnv, numbers: Mapping[str, Any], count: int) -> Iterator[None]:
+    """Let hooks read numbers as those of several environments."""
+    attributes = vars(env)
+    before = {name: attributes[name] for name in numbers}
+    attributes.update({name: np.repeat(number, count) for name, number in numbers.items()})
+    try:
+        yield
+    finally:
+        attributes.update(before)
+
+
+def _is_exact(value: npt.NDArray[Any], dtype: np.dtype[Any]) -> bool:
+    """Whether numbers of another type are the same ones in this type."""
+    return bool(value.dtype.kind in "biuf" and np.all(value.astype(dtype) == value))
+
+
+def _number_of(values: Any) -> Any:
+    """An episode variable as the hooks of a single environment read it."""
+    return values.item() if values.ndim == 0 else values.copy()

@@ -1,0 +1,199 @@
+/* The step of a single environment: a batch of one, with the result that Gymnasium's step has. */
+
+#include "playing.h"
+
+#include <stdint.h>
+#include <stdlib.h>
+
+static const char *const ONE = "fmugym._native.one";
+
+/* The result of prepare_one. The turn is used inside of the pool only. */
+typedef struct {
+    PyObject *playing; /* the capsule that prepare_play has made */
+    PyObject *watched, *observe, *inform;
+    double *inputs; /* memory for those of the pool */
+    PyTurn turn;
+} One;
+
+static void one_free(One *one) {
+    if (one->playing != NULL) {
+        release_turn(playing_of(one->playing), &one->turn);
+    }
+    Py_XDECREF(one->playing);
+    Py_XDECREF(one->watched);
+    Py_XDECREF(one->observe);
+    Py_XDECREF(one->inform);
+    free(one->inputs);
+    free(one);
+}
+
+static void one_dealloc(PyObject *capsule) {
+    one_free(PyCapsule_GetPointer(capsule, ONE));
+}
+
+static bool fill(PyPool *self, One *one, PyObject *args) {
+    const Playing *playing = playing_of(one->playing);
+    Py_buffer *b = one->turn.buffers;
+    PyObject *seen, *rewards, *terminated, *truncated;
+
+    if (!PyArg_ParseTuple(args, "OOOOO!OO:prepare_one", &seen, &rewards, &terminated, &truncated,
+                          &PyTuple_Type, &one->watched, &one->observe, &one->inform)) {
+        return false;
+    }
+    Py_INCREF(one->watched);
+    Py_INCREF(one->observe);
+    Py_INCREF(one->inform);
+    if (self->pool.settings.count != 1) {
+        PyErr_SetString(PyExc_ValueError, "the pool has more than one instance");
+        return false;
+    }
+    one->inputs = calloc(self->pool.settings.inputs->count + 1, sizeof *one->inputs);
+    if (one->inputs == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    if (!take_observations(self, playing, seen, &one->turn) ||
+        !take_bytes(rewards, &b[REWARDS], PyBUF_WRITABLE, sizeof(double)) ||
+        !take_bytes(terminated, &b[TERMINATED], PyBUF_WRITABLE, 1) ||
+        !take_bytes(truncated, &b[TRUNCATED], PyBUF_WRITABLE, 1)) {
+        return false;
+    }
+    settle_turn(self, playing, &one->turn);
+    return true;
+}
+
+/* Takes the arrays of a step, whose first axis has a length of 1: what the programs see, reward,
+ * terminated and truncated. Then the attributes that the programs were made of, tuples of a name and
+ * the address of the value, or of a name that there must not be; what makes the observation; and what makes the info, or
+ * None for an empty one. */
+PyObject *py_prepare_one(PyObject *object, PyObject *args) {
+    PyPool *self = (PyPool *)object;
+    One *one = is_prepared(self) ? calloc(1, sizeof *one) : NULL;
+    PyObject *before = self->one, *capsule = NULL;
+
+    if (one == NULL) {
+        return PyErr_Occurred() ? NULL : PyErr_NoMemory();
+    }
+    one->playing = Py_NewRef(self->playing);
+    if (fill(self, one, args)) {
+        capsule = PyCapsule_New(one, ONE, one_dealloc);
+    }
+    if (capsule == NULL) {
+        one_free(one);
+        return NULL;
+    }
+    self->one = capsule;
+    Py_XDECREF(before);
+    Py_RETURN_NONE;
+}
+
+/* Whether the environment still has the attributes that the programs were made of. */
+static bool is_as_before(PyObject *watched, PyObject *attributes) {
+    bool same = true;
+
+    for (Py_ssize_t i = 0; i < PyTuple_Size(watched) && same; i++) {
+        PyObject *one = PyTuple_GetItem(watched, i);
+        const void *value = PyDict_GetItemWithError(attributes, PyTuple_GetItem(one, 0));
+        same = value == (PyTuple_Size(one) > 1 ? PyLong_AsVoidPtr(PyTuple_GetItem(one, 1)) : NULL);
+    }
+    PyErr_Clear();
+    return same;
+}
+
+typedef struct {
+    One *one;
+    const char *actions;
+    int64_t number; /* an integer action */
+    Py_buffer buffer;
+    bool is_refused, is_troubled;
+} Step;
+
+static bool take_number(PyObject *action, Step *s) {
+    PyObject *integer = PyBool_Check(action) ? NULL : PyNumber_Index(action);
+
+    s->number = integer == NULL ? 0 : PyLong_AsLongLong(integer);
+    s->actions = (const char *)&s->number;
+    Py_XDECREF(integer);
+    return integer != NULL && !PyErr_Occurred();
+}
+
+/* Takes an action of exactly the type and shape that the action space has. */
+static bool take_action(const Playing *playing, PyObject *action, Step *s) {
+    if (playing->play.actions.check == ACTIONS_IN_RANGE) {
+        return take_number(action, s);
+    }
+    if (!take_array_of_actions(playing, action, 1, &s->buffer)) {
+        return false;
+    }
+    s->actions = s->buffer.buf;
+    return true;
+}
+
+static void do_one(PyPool *self, bool alone, void *context) {
+    Step *s = context;
+    PyTurn *t = &s->one->turn;
+
+    t->turn.actions = s->actions;
+    t->call.alone = alone;
+    s->is_refused = play_has_bad_action(&t->turn) || play_refuses(&t->turn, s->one->inputs);
+    if (!s->is_refused) {
+        s->is_troubled = pool_play(&self->pool, &t->call, &t->ends) > 0 || t->ends.outside;
+    }
+}
+
+static PyObject *result_of(const One *one) {
+    const Turn *turn = &one->turn.turn;
+    PyObject *observation = PyObject_CallNoArgs(one->observe), *info = NULL;
+
+    if (observation != NULL) {
+        info = one->inform == Py_None ? PyDict_New() : PyObject_CallNoArgs(one->inform);
+    }
+    return Py_BuildValue("NdNNN", observation, *turn->rewards,
+                         PyBool_FromLong(*turn->terminated), PyBool_FromLong(*turn->truncated),
+                         info);
+}
+
+static PyObject *step_with(PyPool *self, One *one, PyObject *action) {
+    Step s = {.one = one};
+    bool performed = true;
+
+    s.is_refused = !take_action(playing_of(one->playing), action, &s);
+    if (s.is_refused) {
+        PyErr_Clear();
+    } else {
+        performed = perform(self, PLAY, do_one, &s);
+    }
+    release_buffer(&s.buffer);
+    if (!performed || (!s.is_refused && !report_messages(self))) {
+        return NULL;
+    }
+    if (s.is_refused) {
+        Py_RETURN_NONE;
+    }
+    return s.is_troubled ? PyBool_FromLong(0) : result_of(one);
+}
+
+/* Takes an action, and the attributes of the environment. Returns the result of the step; None if
+ * nothing was done, because the action, the inputs that it makes or an attribute are not as they
+ * should be; False if the instance has stepped, but its status or a number is not good. */
+PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
+    PyPool *self = (PyPool *)object;
+    PyObject *result = NULL;
+
+    if (!has_arguments(nargs, 2)) {
+        return NULL;
+    }
+    if (self->one == NULL || !PyDict_Check(args[1])) {
+        PyErr_SetString(PyExc_TypeError, "step_one was not prepared, or gets no dict");
+        return NULL;
+    }
+    PyObject *capsule = Py_NewRef(self->one);
+    One *one = PyCapsule_GetPointer(capsule, ONE);
+    if (is_as_before(one->watched, args[1])) {
+        result = step_with(self, one, args[0]);
+    } else {
+        result = Py_NewRef(Py_None);
+    }
+    Py_DECREF(capsule);
+    return result;
+}
