@@ -148,7 +148,7 @@ class Player:
         """
         if any(one.has_changed() for one in self._watched) and not self.renew(env):
             return False
-        own, memory, task = self._own, self._memory, self._task
+        own, memory = self._own, self._memory
         try:
             for name, row in memory.variables.items():
                 value = np.asarray(own.variables[name])
@@ -158,8 +158,10 @@ class Player:
             for name, number in own.parameters.items():
                 if name in memory.parameters:
                     memory.parameters[name][0] = np.nan if isinstance(number, str) else number
-            if task.loads("load_previous_action"):
-                memory.actions[0][0], memory.actions[1][0] = own.action, own.previous_action
+            for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
+                if np.shape(action) != row.shape[1:] or not _is_exact(np.asarray(action), row.dtype):
+                    return False
+                row[0] = action
         except ordinary(Exception):  # a user may have assigned anything
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False
@@ -172,11 +174,13 @@ class Player:
         own, now = self._own, self.readings
         if env._readings is not now:
             return
+        env._readings = own
+        if now.step_count == own.step_count:
+            return  # nothing has happened
         for name in _KEPT:
             setattr(own, name, getattr(now, name))
         for name in self._task.updated:
             own.variables[name] = _number_of(self._memory.variables[name][..., 0])
-        env._readings = own
 
     def go_back(self, env: FMUEnv) -> None:
         """Let the environment keep what hooks read when the FMU has stepped, but was not judged."""

@@ -26,7 +26,7 @@ __all__ = [
     "which_of",
 ]
 
-_FIRST = ("_values", "previous_state", "inputs", "action", "previous_action", "done", "after_end")
+_FIRST = ("values", "previous_state", "inputs", "action", "previous_action", "done", "after_end")
 """The attributes of a batch with the environments on their last axis."""
 
 
@@ -95,7 +95,7 @@ def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) 
         indices: The environments, shape (M,).
     """
     which = which_of(indices, len(env.step_count))
-    first = {name.lstrip("_"): _rows(getattr(env, name), which) for name in _FIRST}
+    first = {name: _rows(getattr(env._readings, name), which) for name in _FIRST}
     return first | {
         "step_count": _rows(env.step_count, which),
         "parameters": {name: _rows(row, which) for name, row in parameters.items()},
@@ -116,7 +116,7 @@ def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     learn(columns.get("texts", {}))
     for name in (*_FIRST, "step_count"):
-        place_column(getattr(env, name), columns[name.lstrip("_")], sources, which)
+        place_column(getattr(env._readings, name), columns[name], sources, which)
 
 
 def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Which) -> None:
