@@ -311,10 +311,11 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
-        if self._player is not None and not self._ended:
-            result = self._step_compiled(action)
+        if self._player is not None:
+            result = None if self._ended else self._step_compiled(action)
             if result is not None:
                 return result
+            self._keep_readings()
         read = self._readings
         pool = self._pool
         if pool is None or self._ended:
@@ -352,7 +353,6 @@ class FMUEnv(Constructed):
             self._halt()
             raise
         if result is None:
-            player.keep(self)
             return None
         return self._completed(result) if result else self._judged_again()
 
@@ -378,10 +378,13 @@ class FMUEnv(Constructed):
         try:
             if "_is_truncated" in left:
                 truncated = as_flag("_is_truncated", self._is_truncated()) | truncated
-            if "_reward_policy" in left:
-                reward = as_reward(self._reward_policy())
-            if "_get_observation" in left:
+            if "_reward_policy" in left and "_get_observation" in left:
+                reward, observation = self._reward_and_observation()
+            elif "_reward_policy" in left:
+                reward = self._reward_policy()
+            elif "_get_observation" in left:
                 observation = self._get_observation()
+            reward = as_reward(reward)
             if not (isfinite(reward) and self._is_finite(observation)):
                 return None
             if "_get_info" in left:

@@ -225,9 +225,8 @@ def test_a_pool_without_a_library_steps_nothing(make):
     for name in ("play", "play_before", "play_after"):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around._pool, name)(*arrays)
-    for name, arguments in (("before_single", (0, {}, 0)), ("after_single", (0,))):
-        with pytest.raises(TypeError, match="not prepared"):
-            getattr(around._pool, name)(*arguments)
+    with pytest.raises(TypeError, match="not prepared"):
+        around._pool.step_one(0, {})
     before = envs._pool.outputs.copy()
     assert around._pool.step_own() == 3
     nothing = around._access(())

@@ -1,25 +1,19 @@
-"""Compiled hooks of a single environment whose FMU runs in a worker process."""
+"""A single environment whose FMU runs in a worker process."""
 
-import logging
 import os
-import re
 import signal
 
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, probe_config
-from process_tools import FaultyEnv, faulty_fmu
 from test_isolated_hooks import Sampled, TwoPendulums
 from test_single_compiled import (
     TASKS,
     Counting,
-    Failing,
     require_readings,
     require_same,
     require_same_snapshots,
     same,
 )
-from vector_tools import Drawing
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -28,16 +22,15 @@ from fmugym.series import RecordSeries
 from fmugym.vector.making import make_with_pool
 
 
-def isolated(make_env, hooks="compiled"):
+def isolated(make_env):
     """A new environment with a worker process."""
     env = make_with_pool(make_env, isolation="process")
     assert isinstance(env._pool, ProcessPool)
-    env._way = hooks
     return env
 
 
 def here(make_env):
-    """The same without one, with its hooks in Python."""
+    """The same in this process, with its hooks in Python, too."""
     env = make_env()
     env._way = "python"
     return env
@@ -45,11 +38,9 @@ def here(make_env):
 
 @pytest.fixture(name="cart")
 def fixture_cart():
-    """A cart-pole that has compiled its hooks."""
-    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
+    env = fmugym.envs.CartPoleEnv(isolation="process")
     env.reset(seed=0)
     env.step(0)
-    assert env._play is not None
     yield env
     env.close()
 
@@ -64,143 +55,23 @@ BUNDLED = [
 
 @pytest.mark.parametrize("cls", [*BUNDLED, *TASKS, Sampled, TwoPendulums])
 def test_results_are_those_of_one_process(cls):
-    """To the last bit, with everything that hooks read."""
+    """With everything that hooks read."""
 
     def make(hooks):
         return isolated(cls) if hooks == "compiled" else here(cls)
 
-    compiled, ended = require_same(make, steps=120)
-    assert compiled >= 119 - ended
+    require_same(make, steps=120)
 
 
-class Sorted(Counting):
-    """One hook cannot be compiled."""
-
-    def _reward_policy(self):
-        return sorted(self.state)[0] * self.variables["sum"]
-
-
-def test_one_hook_may_stay_in_python():
-    def make(hooks):
-        return isolated(Sorted, "auto") if hooks == "compiled" else here(Sorted)
-
-    compiled, ended = require_same(lambda hooks: _waited(make(hooks)), steps=60)
-    assert compiled >= 59 - ended
-
-
-def _waited(env):
-    """The environment after the steps that come before compiling."""
-    env.reset(seed=1)
-    for _ in range(1010):
-        if any(env.step(env._no_action)[2:4]):
-            env.reset()
-    return env
-
-
-def test_steps_before_compiling():
-    env = fmugym.envs.CartPoleEnv(isolation="process")
-    compiled = []
-    env.reset(seed=0)
-    for _ in range(1100):
-        result = env.step(env.action_space.sample())
-        compiled.append(env._play is not None)
-        if result[2]:
-            env.reset()
-    env.close()
-    assert not any(compiled[:990])
-    assert sum(compiled[1000:]) > 80
-
-
-class Stuck(Drawing):
-    def _is_done(self):
-        return bool(self.state[0] > 0.5)
-
-
-def test_hooks_that_cannot_be_compiled():
-    env = isolated(Stuck)
-    env.reset(seed=0)
-    with pytest.raises(ConfigError, match="_is_done"):
-        env.step(env._no_action)
-    env.close()
-    env = isolated(Stuck, "auto")
-    env.reset(seed=0)
-    env.step(env._no_action)
-    assert env._play is None
-    env.close()
-
-
-class TestFaults:
-    def make(self, path, hooks, cls=FaultyEnv, **options):
-        env = cls(path, **options)
-        env._way = hooks
-        env.logger.setLevel(logging.ERROR)
+def test_hooks_cannot_be_compiled():
+    env = fmugym.envs.CartPoleEnv(hooks="compiled", isolation="process")
+    with pytest.raises(ConfigError, match="not a native one of its own"):
         env.reset(seed=0)
-        return env
-
-    def both(self, path, actions, *args, **options):
-        """The outcomes of the same steps in both ways, without process numbers."""
-        envs = [self.make(path, hooks, *args, **options) for hooks in ("compiled", "python")]
-        outcomes = [[_outcome(env, action) for action in actions] for env in envs]
-        require_readings(*envs)
-        assert [env._player is not None for env in envs] == [True, False]
-        assert envs[0].health == envs[1].health
-        for env in envs:
-            env.close()
-        return outcomes
-
-    @pytest.mark.parametrize("policy", ["truncate", "terminate", "raise"])
-    @pytest.mark.parametrize("fault", ["crash", "exit", "hang"])
-    def test_workers_that_die_or_hang(self, tmp_path, fault, policy):
-        path = faulty_fmu(tmp_path)
-        options = {"fault": fault, "on_fault": policy, "at": 3, "call_timeout": 0.5}
-        one, other = self.both(path, [1.0] * 6, **options)
-        assert all(map(same, one, other))
-        texts = str(one)
-        assert ("call_timeout" if fault == "hang" else "ended with") in texts
-
-    @pytest.mark.parametrize("policy", ["truncate", "raise"])
-    @pytest.mark.parametrize("big", [1e308, 1e300])
-    def test_numbers_that_are_not_finite(self, probe, big, policy):
-        options = {"cls": Probe, "on_fault": policy, "isolation": "process"}
-        one, other = self.both(probe(), [1.0, 2.0, big, big, big], **options)
-        assert all(map(same, one, other))
-
-    def test_exceptions_of_hooks(self, probe):
-        one, other = self.both(probe(), [1.0] * 4, cls=FailingProbe, isolation="process")
-        assert all(map(same, one, other))
-        assert "ZeroDivisionError" in str(one)
-
-    def test_inputs_that_are_not_finite(self, probe):
-        one, other = self.both(probe(), [1.0, np.inf, 2.0], cls=Probe, isolation="process")
-        assert all(map(same, one, other))
-        assert "ConfigError" in str(one)
-
-
-class Probe(PlainEnv):
-    def __init__(self, path, **changes):
-        super().__init__(path, probe_config(**changes))
-
-
-class FailingProbe(Probe):
-    _reward_policy = Failing._reward_policy
-
-
-def _outcome(env, action):
-    """What a step returns or raises; the next one follows a reset after the end of an episode."""
-    try:
-        result = env.step(np.array([action]))
-    except Exception as error:
-        result = type(error).__name__, re.sub(r"\d{2,}|[\d.]+ s", "n", str(error))
-    else:
-        info = {key: re.sub(r"\d{2,}|[\d.]+ s", "n", str(v)) for key, v in result[4].items()}
-        result = *result[:4], info
-    if env._ended:
-        env.reset(seed=1)
-    return result
+    env.close()
 
 
 def test_a_process_that_is_killed(cart):
-    """The episode is cut short; the next ones are compiled again, and as those of Python."""
+    """The episode is cut short; the next ones are as without a worker."""
     other = fmugym.envs.CartPoleEnv(hooks="python")
     other.reset(seed=0)
     before = other.step(0)
@@ -214,17 +85,11 @@ def test_a_process_that_is_killed(cart):
     for action in (1, 0, 0, 1):
         assert same(cart.step(action), other.step(action))
         require_readings(cart, other)
-    assert cart._play is not None
     assert cart.health["deaths"] == 1
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "python"])
-def test_interrupts_in_a_step_end_the_episode(hooks):
-    """A reading tells of the same moment in both ways."""
-    env = fmugym.envs.CartPoleEnv(hooks=hooks, isolation="process")
-    env.reset(seed=0)
-    env.step(0)
-    assert (env._play is not None) == (hooks == "compiled")
+def test_interrupts_in_a_step_end_the_episode(cart):
+    env = cart
 
     def ring(*_):
         raise KeyboardInterrupt
@@ -241,7 +106,6 @@ def test_interrupts_in_a_step_end_the_episode(hooks):
     assert env._ended
     env.reset(seed=0)
     assert env.step(1)[1] == 1.0
-    env.close()
 
 
 @pytest.mark.parametrize("cls", [TASKS[0], Counting])
@@ -253,13 +117,12 @@ def test_snapshots(cls):
 
 def test_series_and_pictures():
     rows, pictures = [], []
-    for hooks in ("compiled", "python"):
-        env = fmugym.envs.PendulumEnv("rgb_array", hooks=hooks, isolation="process")
+    for isolation in ("process", "none"):
+        env = fmugym.envs.PendulumEnv("rgb_array", hooks="python", isolation=isolation)
         recorded = RecordSeries(env)
         recorded.reset(seed=1)
         for _ in range(5):
             recorded.step(np.array([1.0], np.float32))
-        assert (env._play is not None) == (hooks == "compiled")
         pictures.append(env.render())
         rows.append(recorded.series)
         recorded.close()

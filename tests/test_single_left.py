@@ -2,7 +2,6 @@
 
 import logging
 import math
-import signal
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +11,6 @@ from vector_tools import Drawing
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
-from fmugym.single.player import Player
 
 
 class Task(Drawing):
@@ -49,14 +47,6 @@ class Task(Drawing):
         return np.array(rows, np.float32)
 
 
-class Inputs(Task):
-    def _get_inputs(self):
-        push = float(self.action[0]) + 0.1 * float(self.previous_action[0])
-        if self.state[0] > self.previous_state[0] or self.step_count > 5:
-            push = -push
-        return push if self.variables["sum"] > 0 else 0.5 * push
-
-
 class Truncated(Task):
     def _is_truncated(self):
         if self.done:
@@ -86,8 +76,16 @@ class Flags(Truncated, Observation):
     pass
 
 
-class Everything(Inputs, Truncated, Reward, Observation):
-    """With so many hooks in Python, compiling the others would save no time."""
+class Inputs(Task):
+    """``_get_inputs`` would have to read what the pool keeps before the FMU steps."""
+
+    def _get_inputs(self):
+        push = float(self.action[0]) + 0.1 * float(self.previous_action[0])
+        return -push if self.state[0] > self.previous_state[0] else push
+
+
+class Everything(Truncated, Reward, Observation):
+    """Three hooks are not compiled."""
 
 
 class Goal(Task):
@@ -119,7 +117,6 @@ class WithInfo(Observation):
 
 
 LEFT = {
-    Inputs: {"_get_inputs"},
     Truncated: {"_is_truncated"},
     Reward: {"_reward_policy"},
     Observation: {"_get_observation"},
@@ -128,19 +125,14 @@ LEFT = {
     Goal: {"_reward_policy"},
     GoalSeen: {"_reward_policy", "_get_observation"},
     WithInfo: {"_get_observation"},
+    Everything: {"_is_truncated", "_reward_policy", "_get_observation"},
 }
 
 
-def at_once(env):
-    """Compile what can be compiled in the first step."""
-    env.reset(seed=5)
-    env._player = Player(required=False)
-    return env
-
-
 def pair(cls):
-    one, other = at_once(cls()), cls()
+    one, other = cls(), cls()
     other._way = "python"
+    one.reset(seed=5)
     other.reset(seed=5)
     return one, other
 
@@ -154,25 +146,26 @@ def test_it_equals_python(cls):
         action = one.action_space.sample()
         first, second = one.step(action), other.step(action)
         assert same(first, second), (index, first, second)
-        compiled += one._play is not None
+        compiled += one._player is not None
         if index % 4 == 0:
             require_readings(one, other)
         if first[2] or first[3]:
             ends += 1
             require_readings(one, other)
             assert same(one.reset(), other.reset())
-    assert set(one._player._task.left) == LEFT[cls]
+    assert set(one._player.left) == LEFT[cls]
     assert ends > 5
     assert compiled > 80
     one.close()
     other.close()
 
 
-@pytest.mark.parametrize("cls", [Inputs, Truncated, Reward, Observation, Both, Flags, GoalSeen])
+@pytest.mark.parametrize("cls", [Truncated, Reward, Observation, Both, Flags, GoalSeen])
 def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
-    env = at_once(cls())
+    env = cls()
+    env.reset(seed=5)
     env.step(env.action_space.sample())
-    assert env._play is not None
+    assert env._player is not None
     calls = []
     for name in LEFT[cls]:
         hook = getattr(cls, name)
@@ -183,8 +176,8 @@ def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
 
         monkeypatch.setattr(cls, name, counted)
     env.step(env.action_space.sample())
-    assert env._play is not None
-    order = ["_get_inputs", "_is_truncated", "_reward_policy", "_get_observation"]
+    assert env._player is not None
+    order = ["_is_truncated", "_reward_policy", "_get_observation"]
     expected = [name for name in order if name in LEFT[cls]]
     if cls is GoalSeen:
         expected = ["_get_observation"]  # ``_goal_reward`` gets the same one
@@ -242,52 +235,6 @@ class TestFaults:
         one.close()
         other.close()
 
-    def test_exceptions_before_the_fmu_steps_change_nothing(self):
-        class Picky(Inputs):
-            def _get_inputs(self):
-                if self.action[0] > 0.0095:
-                    raise ZeroDivisionError("large")
-                return super()._get_inputs()
-
-        one, other = pair(Picky)
-        for env in (one, other):
-            env.step(np.float32([0.004]))
-            with pytest.raises(ZeroDivisionError, match="large"):
-                env.step(np.float32([0.01]))
-        require_readings(one, other)
-        assert same(one.step(np.float32([0.002])), other.step(np.float32([0.002])))
-        require_readings(one, other)
-        one.close()
-        other.close()
-
-    def test_what_a_signal_handler_raises_in_get_inputs_comes_out_once(self):
-        alarms = []
-
-        class Slow(Inputs):
-            def _get_inputs(self):
-                if self.action[0] > 0.0095 and not alarms:
-                    signal.raise_signal(signal.SIGALRM)
-                return super()._get_inputs()
-
-        def ring(*_):
-            alarms.append(True)
-            raise TimeoutError("too late")
-
-        one, other = pair(Slow)
-        before = signal.signal(signal.SIGALRM, ring)
-        try:
-            for env in (one, other):
-                alarms.clear()
-                env.step(np.float32([0.004]))
-                with pytest.raises(TimeoutError):
-                    env.step(np.float32([0.01]))
-        finally:
-            signal.signal(signal.SIGALRM, before)
-        require_readings(one, other)
-        assert same(one.step(np.float32([0.002])), other.step(np.float32([0.002])))
-        one.close()
-        other.close()
-
     @pytest.mark.parametrize(
         ("hook", "value"),
         [
@@ -296,7 +243,6 @@ class TestFaults:
             ("_reward_policy", None),
             ("_get_observation", None),
             ("_get_observation", np.zeros(3)),
-            ("_get_inputs", (1.0, 2.0)),
         ],
     )
     def test_what_cannot_be_used_is_an_error(self, hook, value):
@@ -304,7 +250,7 @@ class TestFaults:
 
         def bad(self):
             good = getattr(cls, hook)(self)
-            return value if self.step_count == (2 if hook == "_get_inputs" else 3) else good
+            return value if self.step_count == 3 else good
 
         one, other = pair(type("Bad", (cls,), {hook: bad}))
         texts = []
@@ -336,12 +282,10 @@ class TestFaults:
 
 
 def test_each_hook_is_named_once(caplog):
-    with caplog.at_level(logging.INFO, logger="fmugym.single.player"):
-        env = at_once(Both())
-        for number in range(3):  # a new attribute makes it compile the hooks again
-            env.step(env.action_space.sample())
-            env._player._wait = 0
-            env.note = number
+    env = Both()
+    with caplog.at_level(logging.INFO, logger="fmugym.vector.one"):
+        for _ in range(3):
+            env.reset(seed=5)
             env.step(env.action_space.sample())
     texts = [record.getMessage() for record in caplog.records]
     assert len(texts) == 2
@@ -353,9 +297,8 @@ def test_each_hook_is_named_once(caplog):
 def test_compiled_is_an_error_and_names_the_hook():
     env = Reward()
     env._way = "compiled"
-    env.reset(seed=0)
     with pytest.raises(ConfigError, match=r"Reward.*_reward_policy, line"):
-        env.step(env.action_space.sample())
+        env.reset(seed=0)
     env.close()
 
 
@@ -393,7 +336,7 @@ class Unsteady(Task):
         return bool(self.state[0] > 0.5 and self.state[1] > 0)
 
 
-@pytest.mark.parametrize("cls", [Noting, Filling, Writing, Unsteady, Everything])
+@pytest.mark.parametrize("cls", [Noting, Filling, Writing, Unsteady, Inputs])
 def test_other_hooks_keep_all_in_python(cls):
     """Above all, hooks that change something: compiled hooks may read it."""
     one, other = pair(cls)
@@ -401,7 +344,7 @@ def test_other_hooks_keep_all_in_python(cls):
         action = one.action_space.sample()
         first, second = one.step(action), other.step(action)
         assert same(first, second)
-        assert one._play is None
+        assert one._player is None
         if first[2] or first[3]:
             assert same(one.reset(), other.reset())
     assert one._player is None

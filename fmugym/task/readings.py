@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from fmugym.task.values import EpisodeVariables, NamedValues
-
-if TYPE_CHECKING:
-    from fmugym.task.hooks import Hooks
 
 __all__ = ["READINGS", "Readings", "read_by", "reading"]
 
@@ -45,7 +42,7 @@ class Readings:
     variables: EpisodeVariables
 
     @classmethod
-    def of(cls, env: Hooks) -> Readings:
+    def of(cls, env: Any) -> Readings:
         """Return what the hooks of an environment read now; the values are not copied."""
         env._keep_readings()
         return replace(env._readings)
@@ -63,7 +60,7 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
         get: Reads it; a function that does nothing else is the fastest way.
     """
 
-    def put(env: Hooks, value: Any) -> None:
+    def put(env: Any, value: Any) -> None:
         env._keep_readings()
         setattr(env._readings, name, value)
 
@@ -71,7 +68,7 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
 
 
 @contextmanager
-def reading(env: Hooks, readings: Readings) -> Iterator[None]:
+def reading(env: Any, readings: Readings) -> Iterator[None]:
     """Let the hooks of an environment read other values inside of a ``with`` block.
 
     The environment stays the same object. So objects and functions that it holds, and that refer

@@ -63,7 +63,7 @@ class Layout:
         """What makes the observation of a single environment, and its info if there is one."""
         if self.names is None:
             return arrays[0][0].copy, None
-        observed, told = self._nested([array[0] for array in arrays])
+        observed, told = self._nested(arrays)
         inform = partial(_copied, told) if told else None
         return partial(_copied, observed), inform
 
@@ -85,10 +85,10 @@ class Layout:
 
 
 def _copied(tree: Any) -> Any:
-    """Copy the arrays of a tree; what has no axis becomes a number of Python."""
+    """Copy the arrays of a tree, without their first axis of one; what has no other is a number."""
     if isinstance(tree, dict):
         return {name: _copied(part) for name, part in tree.items()}
-    return tree.copy() if np.ndim(tree) else tree.item()
+    return tree[0].copy() if tree.ndim > 1 else tree.item()
 
 
 def _pairs(tree: Any) -> Any:

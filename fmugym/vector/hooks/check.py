@@ -7,7 +7,7 @@ answer for all environments. So the check evaluates every hook on some distinct 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,13 +62,16 @@ _WILD_SCALES = (300.0, -1e5)
 """Hooks may fail at these. They reach limits that the FMU's own states are far from."""
 
 
-def find_difference(env: FMUEnv, states: Sequence[Readings] | None = None) -> str | None:
+def find_difference(
+    env: FMUEnv, states: Readings | None = None, alone: Container[str] = ()
+) -> str | None:
     """Look for a reason to call hooks one environment at a time.
 
     Args:
         env: A prototype.
-        states: Batches of states in which hooks may fail; None for those that the FMU takes, if its
-            pool has not been used yet, and others.
+        states: States in which hooks may fail; None for those that the FMU takes, if its pool has
+            not been used yet, and others.
+        alone: Hooks that are called so in any case. They must change nothing.
 
     Returns:
         The hook and how it differs on arrays, or None if all hooks work on arrays.
@@ -84,11 +87,12 @@ def find_difference(env: FMUEnv, states: Sequence[Readings] | None = None) -> st
     ):
         warnings.simplefilter("ignore")
         scales = _SCALES[:1], _SCALES[1:], _WILD_SCALES
-        kinds = [sample_states(env, some) for some in scales] if states is None else states
+        kinds = [sample_states(env, some) for some in scales] if states is None else [states]
         for name in hooks:
             for index, batch in enumerate(kinds):
-                comparison = _Comparison(env, contents, batch, name)
-                difference = comparison.run(is_natural=states is None and index == 0)
+                comparison = _Comparison(env, contents, batch, name, name in alone)
+                may_fail = states is not None or index > 0
+                difference = comparison.run(is_natural=index == 0, may_fail=may_fail)
                 if difference is not None:
                     return f"{name} {difference}"
     return None
@@ -225,20 +229,19 @@ class _Comparison(NamedTuple):
         contents: What the prototype holds; each call is undone.
         batch: What hooks read.
         name: The hook.
+        alone: Whether only to look for what it changes.
     """
 
     env: FMUEnv
     contents: Contents
     batch: Readings
     name: str
+    alone: bool
 
-    def run(self, is_natural: bool) -> str | None:
+    def run(self, is_natural: bool, may_fail: bool) -> str | None:
         """Say how the results differ, or None."""
         count = len(self.batch.step_count)
         calls = [self._call(column(self.batch, index)) for index in range(count)]
-        failures = sum(type(result) is _Failure for result, _ in calls)
-        if failures == count or (failures and not is_natural):
-            return None  # it fails either way: the first step will tell
         changed = next((name for _, name in calls if name is not None), None)
         if changed == "variables":
             return "changes self.variables, which only _update may do"
@@ -246,6 +249,9 @@ class _Comparison(NamedTuple):
             return f"changes {changed.removeprefix(_OUTSIDE)}, which all environments share"
         if is_natural and changed is not None:
             return f"changes self.{changed}, which belongs in 'episode_variables'"
+        failures = sum(type(result) is _Failure for result, _ in calls)
+        if self.alone or failures == count or (failures and may_fail):
+            return None  # if it fails either way, the first step will tell
         together, changed = self._call(copied(self.batch))
         if changed == "out" or changed in _READ_ONLY:
             return f"changes the arrays in self.{changed} in place"
