@@ -203,6 +203,7 @@ class FMUEnv(Constructed):
         pool = self._open_pool("reset")
         if not self._was_reset:
             self._prepare_hooks()  # the constructor of the class may have set some as attributes
+            self._require_way(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
         generator = self._np_random
@@ -254,19 +255,25 @@ class FMUEnv(Constructed):
         read.values = tuple(self._output_row.tolist())
         read.state = read.previous_state = read.values[: self._output_count]
 
+    def _obstacle(self, pool: Pool) -> str | None:
+        """What keeps the pool from calling hooks, whatever they compute."""
+        if self._own.step or self._own.reset:
+            return f"{'step' if self._own.step else 'reset'} is overridden"
+        if not pool.plays_alone or pool.num_instances > 1:
+            return "the pool is not a native one of its own"
+        return None
+
+    def _require_way(self, pool: Pool) -> None:
+        obstacle = self._obstacle(pool)
+        if obstacle is not None and self._way == "compiled":
+            name = type(self).__name__
+            raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
+
     def _choose_player(self, pool: Pool) -> None:
         """Compile the hooks, where that is possible and asked for."""
         self._has_chosen = True
-        obstacle = None
-        if self._own.step or self._own.reset:
-            obstacle = f"{'step' if self._own.step else 'reset'} is overridden"
-        elif not pool.plays_alone or pool.num_instances > 1:
-            obstacle = "the pool is not a native one of its own"
-        if obstacle is None and self._way != "python":
+        if self._way != "python" and self._obstacle(pool) is None:
             self._player = import_module(_PLAYERS).player_of(self, self._way == "compiled")
-        elif obstacle is not None and self._way == "compiled":
-            name = type(self).__name__
-            raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
 
     def _begin_episode(self, episode: Episode) -> None:
         self._keep_readings()
@@ -400,6 +407,9 @@ class FMUEnv(Constructed):
     def _judged_again(self) -> Result:
         """Judge a step in Python: its status or a number is not good, or a hook raises."""
         self._player.go_back(self)
+        if self._pool_observes:
+            with np.errstate(over="ignore"):  # what is infinite then is a fault
+                self._observation_row[:] = self._output_row[: self._output_count]
         self._in_hooks = True
         try:
             pool = self._open_pool("step")
@@ -617,6 +627,7 @@ class FMUEnv(Constructed):
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
         if not self._was_reset:
             self._prepare_hooks()  # as in ``reset``
+            self._require_way(pool)
         require_saving(pool)
         self._keep_readings()
         self._ended = True  # there is no episode if the FMU fails

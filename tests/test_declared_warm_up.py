@@ -55,7 +55,7 @@ def driven(task, controller, seed):
     observation, _ = env.reset(seed=seed)
     for _ in range(STEPS):
         observation, *_ = env.step(bound.act(observation))
-    result = env._values, env.inputs[0], observation[2]
+    result = env._readings.values, env.inputs[0], observation[2]
     env.close()
     return result
 
@@ -66,7 +66,7 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller):
     for seed in (3, 4):
         observation, _ = env.reset(seed=seed)
         values, heating, outside = driven(house(), controller, seed)
-        assert env._values == values
+        assert env._readings.values == values
         assert env.inputs[0] == heating
         assert observation[2] == outside
         assert env.time == 86400.0
@@ -82,7 +82,7 @@ def test_data_move_without_a_controller():
     plain.reset(seed=1)
     for _ in range(STEPS):
         plain.step([0.0])
-    assert env._values == plain._values
+    assert env._readings.values == plain._readings.values
     env.close()
     plain.close()
 
@@ -110,7 +110,7 @@ def test_a_thermostat_whose_arguments_the_task_tells(name, change):
     full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
     env, same = fmugym.load(house(name, **change)), fmugym.load(house(full, **change))
     assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
-    assert env._values == same._values
+    assert env._readings.values == same._readings.values
     env.close()
     same.close()
 
@@ -184,7 +184,7 @@ def test_the_pass_of_the_pool_equals_python(kind, controller, monkeypatch):
     task["variables"] = task["variables"] | noisy
     told = []
     for steps in (10**9, 0):
-        monkeypatch.setattr(warm_ups, "STEPS_BEFORE", steps)
+        monkeypatch.setattr(warm_ups, "_STEPS_BEFORE", steps)
         envs = FMUVectorEnv(partial(fmugym.load, task), 3, autoreset_mode="disabled")
         env = fmugym.load(task)
         seen = [envs.reset(seed=2)[0].tolist(), env.reset(seed=2)[0].tolist()]
@@ -196,7 +196,12 @@ def test_the_pass_of_the_pool_equals_python(kind, controller, monkeypatch):
             seen += [observations.tolist(), envs.reset(options=options)[0].tolist()]
             kept = [one for one, has_begun in zip(before, mask, strict=True) if not has_begun]
             assert kept == [o for o, m in zip(envs.call("inputs"), mask, strict=True) if not m]
-            seen += [envs._pool.outputs.tolist(), env.reset()[0].tolist(), env._values, env.inputs]
+            seen += [
+                envs._pool.outputs.tolist(),
+                env.reset()[0].tolist(),
+                env._readings.values,
+                env.inputs,
+            ]
         assert (envs._engine.env._warm_ups._in_pass is None) == (steps > 0)
         assert (env._warm_ups._in_pass is None) == (steps > 0)
         told.append(seen)
@@ -206,7 +211,7 @@ def test_the_pass_of_the_pool_equals_python(kind, controller, monkeypatch):
 
 
 def test_a_fault_in_the_pass_is_an_error(monkeypatch):
-    monkeypatch.setattr(warm_ups, "STEPS_BEFORE", 0)
+    monkeypatch.setattr(warm_ups, "_STEPS_BEFORE", 0)
     test_a_fault_in_it_is_an_error()
 
 

@@ -17,7 +17,7 @@ class Precise(fmugym.FMUEnv):
     """The point mass by explicit Euler, one internal step for each step, seen as float64."""
 
     version = "2.0"
-    parameters = {  # noqa: RUF012  (nothing changes it)
+    plant = {  # noqa: RUF012  (nothing changes it)
         "m": M,
         "l": L,
         "b": B,
@@ -33,7 +33,7 @@ class Precise(fmugym.FMUEnv):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["q", "q_dot"],
-            "model_parameters": self.parameters,
+            "model_parameters": self.plant,
             "bounds": {"tau": (-0.02, 0.02)},
             "time_step": DT,
         }

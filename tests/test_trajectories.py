@@ -35,7 +35,7 @@ def along(make_env=Precise, actions=TORQUES, num_envs=8, options=None, **argumen
 
 def exact(**changes):
     """The point mass, solved precisely."""
-    return Precise(model_parameters=Precise.parameters | EXACT, **changes)
+    return Precise(model_parameters=Precise.plant | EXACT, **changes)
 
 
 def jacobian(q):
@@ -391,7 +391,7 @@ def test_in_the_middle_of_an_episode(hooks):
 
     class Drawn(Precise):
         def __init__(self):
-            super().__init__(model_parameters=dict(Precise.parameters, b=fmugym.Uniform(0.0, 2e-3)))
+            super().__init__(model_parameters=dict(Precise.plant, b=fmugym.Uniform(0.0, 2e-3)))
 
         def _get_inputs(self):
             return self.action + self.previous_action

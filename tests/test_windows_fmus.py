@@ -408,7 +408,7 @@ class TestInWine:
             ours, theirs = compiled.step(action), python.step(action)
             np.testing.assert_array_equal(ours[0], theirs[0])
             assert ours[1:4] == theirs[1:4]
-        assert compiled._play is not None
+        assert compiled._player is not None
         assert compiled.previous_state == python.previous_state
         envs = opened(fmugym.FMUVectorEnv(partial(ForcedCartPole, cart_pole), 3, workers=2))
         rolled = envs.rollout(compiled.save_state(), np.full((3, 5, 1), 2.0, np.float32))

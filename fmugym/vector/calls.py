@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.task.readings import READINGS
+from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.contents import Contents
 
@@ -64,6 +64,12 @@ def attribute(env: FMUEnv, name: Any) -> Any:
         raise UnknownAttributeError(str(error)) from None
 
 
+def _require_unchanged(before: Readings, after: Readings) -> None:
+    for name in READINGS:
+        if getattr(before, name) is not getattr(after, name):
+            require_settable(name)
+
+
 class MethodCall:
     """What a method of one environment of a batch has assigned.
 
@@ -95,10 +101,11 @@ class MethodCall:
                 attribute in place.
         """
         contents, before = Contents(env), dict(vars(env))
-        variables = dict(env.variables)
+        readings, variables = Readings.of(env), dict(env.variables)
         try:
             value = attribute(env, name)
             returned = value(*arguments, **keywords) if callable(value) else value
+            _require_unchanged(readings, Readings.of(env))
             self._note_attributes(before, vars(env), contents.changed_in_place())
             self.variables = {n: v for n, v in env.variables.items() if variables[n] is not v}
         finally:

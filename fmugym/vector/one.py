@@ -159,7 +159,9 @@ class Player:
                 if name in memory.parameters:
                     memory.parameters[name][0] = np.nan if isinstance(number, str) else number
             for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
-                if np.shape(action) != row.shape[1:] or not _is_exact(np.asarray(action), row.dtype):
+                if np.shape(action) != row.shape[1:] or not _is_exact(
+                    np.asarray(action), row.dtype
+                ):
                     return False
                 row[0] = action
         except ordinary(Exception):  # a user may have assigned anything

@@ -375,6 +375,7 @@ def _replaced(action: npt.NDArray[Any], place: tuple[int, ...], value: Any) -> n
 
 def _inputs_of(env: FMUEnv, action: Any) -> tuple[float, ...]:
     """What the FMU's inputs would be with an action; they stay in the pool."""
+    env._keep_readings()
     before = env.action, env.previous_action, env.previous_state, env.inputs
     try:
         env._take_action(action)
