@@ -7,6 +7,7 @@ import math
 import pickle
 import random
 import signal
+import sys
 import warnings
 import weakref
 from types import MethodType
@@ -23,6 +24,8 @@ import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
 from fmugym.task.readings import READINGS
 from fmugym.testing import check_fmu_env
+from fmugym.vector import FMUVectorEnv
+from fmugym.vector import one as compiler
 
 READ = (*READINGS, "time")
 
@@ -169,6 +172,35 @@ def test_tasks_of_users(cls):
     assert compiled > 60
 
 
+@pytest.mark.parametrize("cls", TASKS)
+def test_it_is_a_batch_of_one(cls):
+    """To the last bit."""
+    one, many = with_hooks(cls, "compiled"), FMUVectorEnv(cls, 1, hooks="compiled")
+    one.reset(seed=5)
+    many.reset(seed=5)
+    many.action_space.seed(1)
+    for _ in range(60):
+        actions = many.action_space.sample()
+        observations, rewards, terminated, truncated, _ = many.step(actions)
+        result = one.step(actions[0])
+        for observation, row in zip(parts_of(result[0]), parts_of(observations), strict=True):
+            assert observation.tobytes() == row[0].tobytes()
+        assert result[1:4] == (rewards[0], terminated[0], truncated[0])
+        if terminated[0] or truncated[0]:
+            one.reset()
+            many.step(actions)  # which begins the next episode
+    one.close()
+    many.close()
+
+
+def parts_of(observation):
+    return (
+        [observation[name] for name in sorted(observation)]
+        if isinstance(observation, dict)
+        else [observation]
+    )
+
+
 def test_overridden_parameters():
     options = ({}, {"model_parameters": {"theta_0": 0.1}}, {"x_init": 0.2}, {"y_init": 0.3})
 
@@ -206,6 +238,27 @@ class TestAttributes:
             env.x_threshold = 1e-9
         assert same(one.step(1), other.step(1))
         assert one.done
+
+    def test_a_number_that_is_assigned_again_needs_no_compilation(self, monkeypatch):
+        one, other = compiled_cart(), fmugym.envs.CartPoleEnv(hooks="python")
+        other.reset(seed=0)
+        other.step(0)
+        one.force_mag = other.force_mag = 4.0
+        one.step(0)
+        other.step(0)
+        monkeypatch.setattr(compiler, "trace_hooks", None)
+        for force in (5.0, 6.0, 10.0):
+            one.force_mag = other.force_mag = force
+            for action in (1, 0):
+                assert same(one.step(action), other.step(action))
+        assert one._player is not None
+
+    def test_what_hooks_read_has_names_of_its_own(self):
+        class Shadow(fmugym.envs.CartPoleEnv):
+            state = None
+
+        with pytest.raises(ConfigError, match=r"Shadow has an attribute 'state' of its own"):
+            Shadow()
 
     def test_hooks_set_in_an_episode_are_noticed(self):
         env = compiled_cart()
@@ -414,6 +467,17 @@ class TestWays:
         env = Overriding(hooks="compiled")
         with pytest.raises(ConfigError, match="step is overridden"):
             env.reset(seed=0)
+        env.close()
+
+    def test_with_a_debugger_hooks_run_in_python(self):
+        usual = sys.gettrace()
+        env = fmugym.envs.CartPoleEnv()
+        sys.settrace(lambda *_: None)
+        try:
+            env.reset(seed=0)
+        finally:
+            sys.settrace(usual)
+        assert env._player is None
         env.close()
 
     def test_names(self):

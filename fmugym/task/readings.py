@@ -45,7 +45,8 @@ class Readings:
     def of(cls, env: Any) -> Readings:
         """Return what the hooks of an environment read now; the values are not copied."""
         env._keep_readings()
-        return replace(env._readings)
+        present: Readings = env._readings
+        return replace(present)
 
 
 READINGS: Final = tuple(field.name for field in fields(Readings) if field.name != "values")

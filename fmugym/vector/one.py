@@ -151,19 +151,12 @@ class Player:
         own, memory = self._own, self._memory
         try:
             for name, row in memory.variables.items():
-                value = np.asarray(own.variables[name])
-                if value.dtype != row.dtype and not _is_exact(value, row.dtype):
-                    return False
-                row[..., 0] = value
+                row[..., 0] = _exactly(own.variables[name], row.dtype)
+            for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
+                row[0] = _exactly(action, row.dtype).reshape(row.shape[1:])
             for name, number in own.parameters.items():
                 if name in memory.parameters:
                     memory.parameters[name][0] = np.nan if isinstance(number, str) else number
-            for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
-                if np.shape(action) != row.shape[1:] or not _is_exact(
-                    np.asarray(action), row.dtype
-                ):
-                    return False
-                row[0] = action
         except ordinary(Exception):  # a user may have assigned anything
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False
@@ -352,9 +345,17 @@ def _repeated(env: FMUEnv, numbers: Mapping[str, Any], count: int) -> Iterator[N
         attributes.update(before)
 
 
-def _is_exact(value: npt.NDArray[Any], dtype: np.dtype[Any]) -> bool:
-    """Whether numbers of another type are the same ones in this type."""
-    return bool(value.dtype.kind in "biuf" and np.all(value.astype(dtype) == value))
+def _exactly(value: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+    """The same numbers in another type.
+
+    Raises:
+        ValueError: If that type does not have them.
+    """
+    given = np.asarray(value)
+    same = given.astype(dtype)
+    if given.dtype != dtype and not np.array_equal(same, given, equal_nan=True):
+        raise ValueError(f"{given} are no numbers of the type {dtype}")
+    return same
 
 
 def _number_of(values: Any) -> Any:
