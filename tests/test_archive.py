@@ -1,6 +1,7 @@
 """FMU archives: what is refused before anything runs, extraction, and cleaning up."""
 
 import gc
+import os
 import pathlib
 import re
 import shutil
@@ -149,6 +150,11 @@ class TestBadArchives:
 
     def test_a_folder(self, tmp_path):
         refused(tmp_path, "there is no FMU at.*folder.*zip")
+
+    @pytest.mark.skipif(os.name != "posix", reason="Windows has no such pipes")
+    def test_a_pipe(self, tmp_path):
+        os.mkfifo(tmp_path / "pipe.fmu")
+        refused(tmp_path / "pipe.fmu", "there is no FMU at.*pipe.fmu, which is no regular file$")
 
     def test_a_misspelt_name(self, tmp_path):
         (tmp_path / "Boiler.fmu").touch()

@@ -3,6 +3,7 @@
 import copy
 import logging
 import random
+import sys
 import time
 import zipfile
 from contextlib import closing
@@ -638,6 +639,22 @@ class TestLarge:
     def test_the_order_takes_as_long_for_each_component(self):
         seconds = [min(self.seconds_to_order(count) for _ in "123") for count in (500, 5000)]
         assert seconds[1] < 30 * seconds[0]
+
+    def test_opening_takes_as_many_calls_for_each_component(self, pack):
+        def calls(count):
+            path, counted = pack(self.chain(count)), []
+            sys.setprofile(lambda frame, event, what: counted.append(None))
+            try:
+                fmu = FMUSystem.read(path).as_fmu(probe_timeout=None)
+                spec = PoolSpec((), (fmu.variable("c1.T_air"),), 60.0)
+                local_pool(fmu, spec, 1, logging.getLogger("fmugym.test")).close()
+            finally:
+                sys.setprofile(None)
+            return len(counted)
+
+        calls(20)  # what is imported and kept only once
+        first, second, third = map(calls, (20, 40, 80))
+        assert third - second == pytest.approx(2 * (second - first), rel=0.02)
 
     def test_a_file_is_read_once(self, pack):
         fmu = FMUSystem.read(pack(self.chain(20))).as_fmu(probe_timeout=None)

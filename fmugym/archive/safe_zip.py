@@ -345,6 +345,8 @@ def _read_at_most(file: BinaryIO, count: int) -> bytes:
 def _what_is_there(path: Path) -> str:
     if path.is_dir():
         return ", which is a folder: put its contents into a zip archive"
+    if path.exists():
+        return ", which is no regular file"
     there = (sorted(one.name for one in path.parent.glob(kind)) for kind in ("*.fmu", "*"))
     near = next(filter(None, (nearest_name(path.name, names) for names in there)), None)
     return "" if near is None else f"; did you mean {near!r}?"

@@ -82,6 +82,7 @@ class Naming:
         self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
+        self._derived: dict[tuple[str, Moment, float], Code] = {}
         self.constants: dict[str, Any] = {}
         self.outputs, self.monitors = self._read_names()
 
@@ -273,11 +274,13 @@ class Naming:
         return self.code(entry, flags["terminated"], Moment.AFTER)
 
     def _code_of_derived(self, name: str, moment: Moment) -> Code:
-        derived = self._declared.derived[name]
+        derived, key = self._declared.derived[name], (name, moment, self._ahead)
         if name in self._open:
             raise derived.entry.error(f"{name!r} depends on itself")
-        with self._opened(name):
-            return self.code(derived.entry, derived.expression, moment)
+        if key not in self._derived:  # many may read it
+            with self._opened(name):
+                self._derived[key] = self.code(derived.entry, derived.expression, moment)
+        return self._derived[key]
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[None]:

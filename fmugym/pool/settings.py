@@ -40,6 +40,7 @@ __all__ = [
     "record_from",
     "solving_settings",
     "table_of",
+    "type_number",
     "variable_settings",
 ]
 
@@ -242,7 +243,7 @@ def listing(variables: Sequence[Variable], version: int) -> tuple[bytes, bytes, 
     """
     rest = unlisted(variables)
     both = [*variables, *rest]
-    types = bytes(_type_number(variable, version) for variable in both)
+    types = bytes(type_number(variable, version) for variable in both)
     elements = np.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
     values = np.array([v.start_number for v in rest]).tobytes()
     return types, elements.tobytes(), values, _texts(variables)
@@ -256,7 +257,8 @@ def _texts(variables: Sequence[Variable]) -> bytes:
     )
 
 
-def _type_number(variable: Variable, version: int) -> int:
+def type_number(variable: Variable, version: int) -> int:
+    """The C type of a variable; see ``listing``."""
     if is_start_time(variable):
         return _START_TIME
     if variable.kind == "string":
@@ -281,7 +283,7 @@ def _variables_of(
     """
     version = table_of(description)
     known = {
-        (_type_number(one, version), one.value_reference): one
+        (type_number(one, version), one.value_reference): one
         for v in description.variables.values()
         if v.is_number or v.kind == "string"
         for one in (v.elements if v.driven is not None else (v,))

@@ -15,6 +15,7 @@ from fmugym.pool.settings import (
     listing,
     manner_of,
     solving_settings,
+    type_number,
 )
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.systems.description import PartVariable, SystemDescription
@@ -130,7 +131,7 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
     return (
         firsts.astype(np.uint32).tobytes(),
         _numbers(end.part for end in ends),
-        b"".join(_type(layout, end) for end in ends),
+        bytes(_type(layout, end) for end in ends),
         _numbers(end.variable.value_reference for end in ends),
         np.array([layout.input_slot(end) for end in ends], np.int32).tobytes(),
         np.array([layout.output_slot(end) for end in ends], np.int32).tobytes(),
@@ -143,12 +144,11 @@ def _variables(layout: Layout) -> tuple[bytes, ...]:
     )
 
 
-def _type(layout: Layout, end: PartVariable) -> bytes:
+def _type(layout: Layout, end: PartVariable) -> int:
     """The C type; strings have none, and are never read."""
     if end.variable.kind == "string":
-        return b"\0"
-    version = layout.parts[end.part].description.fmi_major_version
-    return listing([end.variable], version)[0][:1]
+        return 0
+    return type_number(end.variable, layout.parts[end.part].description.fmi_major_version)
 
 
 def _groups(layout: Layout) -> tuple[tuple[Any, ...], ...]:
