@@ -410,7 +410,7 @@ class TestChoice:
         play(pool)
 
     def test_two_components_of_an_fmu_that_can_be_there_once(self, make, tmp_path):
-        """Each has a library of its own, as the two have no process of their own."""
+        """Each has a copy of its library: the two share a process."""
         rows = []
         for token in ("well behaved", "globals"):
             quirk = quirk_table.quirk_fmu(tmp_path / token, 2, token)
