@@ -75,13 +75,6 @@ def echo_to(memory: Array, /) -> None:
         memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
     """
 
-def serve_component() -> None:
-    """Be the worker of a component until the standard input is closed, which ends the process.
-
-    Raises:
-        OSError: If the standard input is no socket, or on Windows.
-    """
-
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,6 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
-from fmugym.systems.fmu import SystemFMU
 from fmugym.task.starting import checked_value, start_values
 from fmugym.trial.pools import trial_pool
 from fmugym.trial.trial import meet
@@ -32,11 +31,6 @@ logger = logging.getLogger(__name__)
 
 FloatArray = npt.NDArray[np.float64]
 Variables = tuple[Variable, ...]
-
-_ELSEWHERE: Final = {
-    "process": "has isolate=True",
-    "wine": "has libraries for Windows only",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,23 +87,20 @@ def linearize(
         The linear model.
 
     Raises:
-        ConfigError: If the FMU provides no such derivatives or declares no states; if a
-            component of a system runs in another process; if a name is unknown or belongs to a
-            variable of another kind; if a value does not fit.
+        ConfigError: If the FMU provides no such derivatives or declares no states; if a name is
+            unknown or belongs to a variable of another kind; if a value does not fit.
         FMULoadError: If the FMU cannot be loaded.
         SimulationError: If the FMU fails.
     """
     fmu = FMU.of(fmu)
     description = fmu.description
     _require_derivatives(description)
-    if isinstance(fmu, SystemFMU):
-        _require_here(fmu)
     x = _chosen(description, "continuous state", states, list(description.state_derivatives))
     u = _chosen(description, "continuous input", inputs, _inputs(description))
     start = _start_values(description, at or {})
     meet(fmu)
     spec = PoolSpec((), (), 1.0, start_time=description.start_time)
-    with closing(trial_pool(fmu, spec, 1, logger)) as pool:
+    with closing(trial_pool(fmu, spec, 1, logger, isolated=fmu.isolated)) as pool:
         pool.reset(tuple(start), np.array([list(start.values())], float).T)
         if pool.statuses[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
@@ -157,16 +148,6 @@ def _require_chain(description: SystemDescription) -> None:
             )
     if not description.state_derivatives:
         raise ConfigError(f"{plan.name} cannot be linearized: its components declare no states")
-
-
-def _require_here(system: SystemFMU) -> None:
-    """Refuse components in other processes: the chain rule is applied in this one."""
-    for name, place in system.whereabouts_by_name.items():
-        if place != "here":
-            raise ConfigError(
-                f"{system.plan.name} cannot be linearized: component {name!r} {_ELSEWHERE[place]}, "
-                "and the components of a linearized system run in this process"
-            )
 
 
 def _inputs(description: ModelDescription) -> list[str]:

@@ -170,8 +170,8 @@ typedef struct Fmi {
     Status (*deserialize)(const Library *library, void *component, const char *bytes, size_t size,
                           void **state);
 
-    /* Of systems and of components in other processes, otherwise NULL: which FMU failed last and why its
-     * process ended, or NULL; and freeing what may still be freed after a fatal error. */
+    /* Of systems, otherwise NULL: which FMU failed last, or NULL; and freeing what may still be freed
+     * after a fatal error. */
     const char *(*blamed)(const void *component);
     void (*drop)(const Library *library, void *component);
 } Fmi;

@@ -22,8 +22,6 @@ static struct {
     size_t length;
 } echo;
 
-static void (*pass)(uint64_t environment, int status, const char *category, const char *text);
-
 bool log_open(Log *log, size_t count, size_t parts, bool terse) {
     memset(log, 0, sizeof *log);
     log->recent = calloc(count * parts, sizeof *log->recent);
@@ -200,11 +198,6 @@ void log_echo_to(char *memory, size_t size) {
     mutex_unlock(&lock);
 }
 
-void log_pass_to(void (*function)(uint64_t environment, int status, const char *category,
-                                  const char *text)) {
-    pass = function;
-}
-
 /* Drops as much of the beginning as the new line needs. Only the end of a line that is too long
  * stays. */
 static void append_to_echo(const char *category, const char *text) {
@@ -252,15 +245,12 @@ static void keep(uint64_t environment, int status, const char *category, const c
     }
 }
 
-void log_deliver(uint64_t environment, int status, const char *category, char *text) {
+/* The text loses blanks at its end. */
+static void deliver(uint64_t environment, int status, const char *category, char *text) {
     category = category == NULL ? "" : category;
     trim_end(text);
     mutex_lock(&lock);
-    if (pass == NULL) {
-        keep(environment, status, category, text);
-    } else {
-        pass(environment, status, category, text);
-    }
+    keep(environment, status, category, text);
     mutex_unlock(&lock);
 }
 
@@ -362,7 +352,7 @@ static void format_and_deliver(const char *name, int status, const char *categor
     if (format != NULL) {
         vsnprintf(text, sizeof text, format, arguments);
     }
-    log_deliver(environment_of(name), status, category, text);
+    deliver(environment_of(name), status, category, text);
 }
 
 void log_message_fmi1(void *component, const char *name, int status, const char *category,
@@ -389,5 +379,5 @@ void log_message_fmi3(void *environment, int status, const char *category, const
     char copy[TEXT_SIZE];
 
     snprintf(copy, sizeof copy, "%s", text == NULL ? "" : text);
-    log_deliver((uint64_t)(uintptr_t)environment, status, category, copy);
+    deliver((uint64_t)(uintptr_t)environment, status, category, copy);
 }

@@ -80,12 +80,6 @@ void log_forget(Log *log, size_t index);
  * process next. */
 void log_echo_to(char *memory, size_t size);
 
-/* Gives every later message to this function instead of the logs; of several threads, one at a time. */
-void log_pass_to(void (*function)(uint64_t environment, int status, const char *category,
-                                  const char *text));
-/* Receives a message as the callbacks do. The text loses blanks at its end. */
-void log_deliver(uint64_t environment, int status, const char *category, char *text);
-
 /* Fork. The lock is held during a fork, so that the child finds no unfinished change. */
 void log_before_fork(void);
 void log_after_fork_in_parent(void);

@@ -199,18 +199,6 @@ static inline uint64_t clock_now(void) {
 #endif
 }
 
-static inline void clock_sleep_until(uint64_t time) {
-    for (uint64_t now = clock_now(); now < time; now = clock_now()) {
-#if defined _WIN32
-        Sleep((DWORD)((time - now) / 1000000u + 1));
-#else
-        const struct timespec left = {(time_t)((time - now) / 1000000000u),
-                                      (long)((time - now) % 1000000000u)};
-        nanosleep(&left, NULL);
-#endif
-    }
-}
-
 /* Prefetches memory that will be read soon and is probably not in the cache. */
 static inline void prefetch(const void *place) {
 #if defined __GNUC__

@@ -31,8 +31,6 @@ typedef struct Component {
     const char *label;      /* names it in messages */
     const char *not_finite; /* the same if its outputs are not finite */
     const Fmi *fmi;
-    int64_t version, manner; /* for which fmi_table has the functions of the FMU itself */
-    const struct Remote *remote; /* how its workers run, or NULL in this process */
     const char *model, *token, *resources;
     const char **categories;
     size_t number_of_categories;

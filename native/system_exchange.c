@@ -106,7 +106,7 @@ static void carry(Line *line, const Route *route) {
 
 /* Whether the FMI version can set the inputs, step and read the outputs in one call. */
 static bool is_plain(const Component *part) {
-    return part->steps == 1 && part->remote == NULL && access_is_plain(&part->outputs) &&
+    return part->steps == 1 && access_is_plain(&part->outputs) &&
            (part->inputs.count == 0 || access_is_plain(&part->inputs));
 }
 

@@ -5,7 +5,6 @@
 #include <string.h>
 
 #include "log.h"
-#include "remote.h"
 #include "system.h"
 
 /* What takes the place of a table of functions. */
@@ -25,22 +24,12 @@ static bool load_part(Library *library, const System *system, size_t index, cons
     char reason[1200];
 
     library->identifier = part->model;
-    const bool good = part->remote != NULL
-                          ? remote_open(library, part, system->count, reason, sizeof reason)
-                          : library_open(library, path, reason, sizeof reason) &&
-                                part->fmi->bind(library, reason, sizeof reason);
+    const bool good = library_open(library, path, reason, sizeof reason) &&
+                      part->fmi->bind(library, reason, sizeof reason);
     if (!good) {
         snprintf(error, size, "%s: %s", part->label, reason);
     }
     return good;
-}
-
-static void unload_part(Library *library, const Component *part) {
-    if (part->remote != NULL) {
-        remote_close(library);
-    } else {
-        library_close(library);
-    }
 }
 
 bool system_load(Library *library, const System *system, const char *const *paths, char *error,
@@ -63,7 +52,7 @@ bool system_load(Library *library, const System *system, const char *const *path
 
 void system_unload(Library *library) {
     for (size_t i = 0; library->functions != NULL && i < loaded(library)->system->count; i++) {
-        unload_part(&loaded(library)->parts[i], &loaded(library)->system->parts[i]);
+        library_close(&loaded(library)->parts[i]);
     }
     library_close(library);
 }
@@ -189,7 +178,7 @@ bool part_reload(Composite *me, size_t index) {
     Library *library = &me->libraries[index];
     char unused[256];
 
-    unload_part(library, &me->system->parts[index]);
+    library_close(library);
     memset(library, 0, sizeof *library);
     const bool good =
         load_part(library, me->system, index, me->paths[index], unused, sizeof unused);
@@ -205,11 +194,8 @@ void system_free(const Library *library, void *component) {
 
     (void)library;
     for (size_t i = 0; complete && i < me->system->count; i++) {
-        const Fmi *fmi = me->system->parts[i].fmi;
         if (me->components[i] != NULL && !me->parts.dead[i]) {
             part_free(me, i);
-        } else if (me->components[i] != NULL && fmi->drop != NULL) {
-            fmi->drop(&me->libraries[i], me->components[i]);
         }
     }
     free_arrays(me);

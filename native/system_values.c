@@ -6,20 +6,10 @@
 
 #include "system.h"
 
-/* Names a part, and tells why its process has ended. */
-static const char *label_of(const Composite *me, size_t index) {
-    const Component *part = &me->system->parts[index];
-    const char *label =
-        part->fmi->blamed == NULL || me->components[index] == NULL
-            ? NULL
-            : part->fmi->blamed(me->components[index]);
-    return label == NULL ? part->label : label;
-}
-
 Status part_judge(Composite *me, size_t index, Status status) {
     floats_restore_if_seen(me->floats);
     if (status > STATUS_WARNING && status != STATUS_TERMINATED) {
-        me->blamed = me->blamed == NULL ? label_of(me, index) : me->blamed;
+        me->blamed = me->blamed == NULL ? me->system->parts[index].label : me->blamed;
         me->parts.dead[index] |= status == STATUS_FATAL;
         me->parts.failed[index] |= status == STATUS_ERROR;
     }

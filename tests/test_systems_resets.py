@@ -13,7 +13,7 @@ import quirk_table
 import ssp_tools
 from exchange_tools import exchange_fmu
 
-from fmugym import Component, FMUSystem
+from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
@@ -46,12 +46,9 @@ def trials(monkeypatch, tmp_path_factory):
     monkeypatch.setenv("FMUGYM_CACHE_DIR", cache)
 
 
-def chain(fmu_of, *tokens, version=2, isolate=""):
-    """Components in a row; some have processes of their own."""
-    paths = [
-        Component(fmu_of(token, version), isolate=name in isolate)
-        for name, token in zip(NAMES, tokens, strict=False)
-    ]
+def chain(fmu_of, *tokens, version=2):
+    """Components in a row."""
+    paths = [fmu_of(token, version) for token in tokens]
     return FMUSystem(
         dict(zip(NAMES, paths, strict=False)),
         [
@@ -157,14 +154,6 @@ class TestMethods:
         # the reset of the first does nothing, so that only its restored state can be right
         assert found[2].tobytes() != right.tobytes()
         assert found[2].tobytes() == found[1].tobytes() != found[0].tobytes()
-
-    @pytest.mark.skipif(os.name == "nt", reason="they have processes of their own on Unix only")
-    def test_of_components_in_processes_of_their_own(self, fmu_of):
-        tokens = "well behaved", "reset does nothing", "well behaved"
-        methods = (RESTORE, INSTANCE, RESTORE)
-        one = episodes(chain(fmu_of, *tokens), methods)
-        other = episodes(chain(fmu_of, *tokens, isolate="bc"), methods)
-        assert [rows.tobytes() for rows in one] == [rows.tobytes() for rows in other]
 
     def test_two_liars_at_once(self, fmu_of):
         system = chain(fmu_of, "well behaved", "reset does nothing", "restore forgets")

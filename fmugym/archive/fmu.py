@@ -270,11 +270,17 @@ class FMU(LoadableFMU, KnownArguments):
             f"{self.path.name} has no library for this platform ({self.library}); it was built "
             f"for: {', '.join(self.platforms) or 'no platform at all'}"
         )
-        if any(place.startswith("sources/") for place in self._archive.files):
-            text += f". It has its source code: fmugym compile {shlex.quote(self.path.name)}"
+        text += self._how_to_compile
         if can_run_windows() and {p.casefold() for p in self.platforms} & _WINDOWS_32:
             text += ". Those for 32-bit Windows cannot run in Wine here; export for 64-bit Windows"
         return text
+
+    @property
+    def _how_to_compile(self) -> str:
+        """The end of an error's text; "" if the FMU does not have its source code."""
+        if not any(place.startswith("sources/") for place in self._archive.files):
+            return ""
+        return f". It has its source code: fmugym compile {shlex.quote(self.path.name)}"
 
     def _extract_to(self, folder: Path, only: str = "") -> None:
         """Extract the files that are needed, or those of one folder of them."""

@@ -30,7 +30,7 @@ class LoadableFMU(ABC):
 
     Attributes:
         in_wine: Whether the library is one for Windows that can only run in Wine here.
-        isolated: Whether it is a component of a system that has a process of its own.
+        isolated: Whether it is a system that shall run in worker processes.
     """
 
     in_wine = False
@@ -68,40 +68,7 @@ class LoadableFMU(ABC):
         """
         if not self.parts:
             return [self.prepare_library()]
-        return [
-            part.extract() / part.library if part.is_apart else part.prepare_library()
-            for part in self.parts
-        ]
-
-    @property
-    def is_apart(self) -> bool:
-        """Whether it runs in another process, if it is a component."""
-        return self.whereabouts != "here"
-
-    @property
-    def whereabouts(self) -> str:
-        """Where it runs, if it is a component: ``"here"``, ``"process"`` or ``"wine"``."""
-        if self.in_wine:
-            return "wine"
-        return "process" if self.isolated else "here"
-
-    @property
-    def loaded_before(self) -> tuple[str, ...]:
-        """What another process loads before the FMU's library; see ``prepare_library``.
-
-        Raises:
-            FMULoadError: If libraries are missing.
-        """
-        if self.in_wine:
-            return ()
-        library = self.extract() / self.library
-        self._require_libraries(library)
-        return *self.preload, *map(str, stray_libraries(library))
-
-    def _require_libraries(self, library: Path) -> None:
-        missing = missing_libraries(library, self.preload)
-        if missing:
-            raise FMULoadError(describe_missing(self.path.name, missing))
+        return [part.prepare_library() for part in self.parts]
 
     @property
     def platform(self) -> str:
@@ -145,7 +112,9 @@ class LoadableFMU(ABC):
         library = self.extract() / self.library
         for path in self.preload:
             load_globally(path)
-        self._require_libraries(library)
+        missing = missing_libraries(library, self.preload)
+        if missing:
+            raise FMULoadError(describe_missing(self.path.name, missing))
         for stray in stray_libraries(library):
             load_globally(str(stray))
         return library

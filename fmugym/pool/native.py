@@ -42,7 +42,6 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
-from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
 from fmugym.pool.saving import SavingPool, Serialized
 from fmugym.pool.settings import (
@@ -160,9 +159,7 @@ class NativePool(SavingPool):
                         "private": private_libraries,
                         "logging": log.isEnabledFor(logging.INFO),
                         "solving": solving_settings(description, spec),
-                        "system": system_settings(
-                            fmu, spec, folder, self._hosts(private_libraries)
-                        ),
+                        "system": system_settings(fmu, spec, folder),
                     },
                 ),
                 experiment=cast("_native.Experiment", experiment_settings(spec)),
@@ -187,13 +184,6 @@ class NativePool(SavingPool):
             )
         except ordinary(OSError) as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
-
-    def _hosts(self, private_libraries: bool) -> Hosts:
-        """The processes of components that have some: one for each thread or private library."""
-        if private_libraries:
-            return Hosts(call_timeout=self._spec.call_timeout)
-        workers = min(self.threads, self.num_instances)
-        return Hosts(workers, self.num_instances, self._spec.call_timeout)
 
     def _access(self, variables: tuple[Variable, ...]) -> _native.Access:
         """Find or make the access to variables; there is one for each list of variables."""

@@ -142,8 +142,6 @@ class PoolSpec:
         solver: The method of integration for FMUs of model exchange, one of ``SOLVERS``.
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
-        call_timeout: How long a call of a component with a process of its own may take, in seconds
-            of real time; an initialization may take ten times as long.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
             FMU's states can be saved; see ``fmugym.pool.saving``.
     """
@@ -170,7 +168,6 @@ class PoolSpec:
     records: bool = False
     solver: str = SOLVERS[0]
     max_step: float | None = None
-    call_timeout: float = DEFAULT_CALL_TIMEOUT
 
     def communication_point(self, count: int, start_time: float | None = None) -> float:
         """The time after ``count`` communication steps; not a running sum, which would drift.

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.loadable import LoadableFMU
-from fmugym.pool.remote import Hosts, place_of, remote_settings
 from fmugym.pool.settings import (
+    PlaceOfFMU,
     library_settings,
     listing,
     manner_of,
@@ -28,19 +28,13 @@ _RUNGS: Final = tuple(ResetMethod)
 """In the order of ``Rung`` of ``native/system.h``."""
 
 
-def system_settings(
-    fmu: LoadableFMU, spec: PoolSpec, folder: Path, hosts: Hosts
-) -> tuple[Any, ...] | None:
+def system_settings(fmu: LoadableFMU, spec: PoolSpec, folder: Path) -> tuple[Any, ...] | None:
     """What ``take_system`` of ``native/python/systems.c`` takes; None for an FMU.
 
     Args:
         fmu: The system or FMU.
         spec: That of the pool.
         folder: That of the extracted system.
-        hosts: For components that have processes of their own.
-
-    Raises:
-        FMULoadError: If Wine is needed and missing here.
     """
     description = fmu.description
     if not isinstance(description, SystemDescription):
@@ -49,7 +43,7 @@ def system_settings(
     rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     return (
         tuple(
-            _part(part, one, spec, rung, folder / str(i), hosts)
+            _part(part, one, spec, rung, folder / str(i))
             for i, (part, one, rung) in enumerate(zip(layout.parts, fmu.parts, rungs, strict=True))
         ),
         _routes(layout),
@@ -66,11 +60,11 @@ def _part(
     spec: PoolSpec,
     rung: ResetMethod,
     folder: Path,
-    hosts: Hosts,
 ) -> tuple[Any, ...]:
     description = part.description
     version = description.fmi_major_version
-    known = library_settings(description, spec, place_of(fmu, folder))
+    place = PlaceOfFMU.here(folder, (folder / fmu.library,), version)
+    known = library_settings(description, spec, place)
     label = part.label
     numbers = [(v, float(x)) for v, x in part.starts if v.numeric]
     texts = [(v.value_reference, str(x).encode()) for v, x in part.starts if not v.numeric]
@@ -92,7 +86,6 @@ def _part(
         _doubles(x for _, x in numbers),
         tuple(texts),
         (known["structural_references"], known["structural_values"]),
-        remote_settings(fmu, folder, hosts),
     )
 
 

@@ -45,9 +45,8 @@ class Component(KnownArguments):
         steps: Communication steps of this component in one of the system.
         feedthrough: False says that no output depends on an input without a step in between, for
             FMUs that tell nothing of it; None for what the FMU tells.
-        isolate: Whether it runs in a process of its own, so that a crash of it ends single
-            episodes only. On Linux, FMUs that have libraries for Windows only run in processes of
-            their own in any case, in Wine.
+        isolate: Whether the whole system runs in worker processes because of it, so that a crash
+            ends single episodes only. ``isolation`` of an environment wins.
 
     Raises:
         ConfigError: If a value does not fit.

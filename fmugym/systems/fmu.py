@@ -11,16 +11,14 @@ from functools import cached_property
 from pathlib import Path
 
 from fmugym.archive.bundled import is_bundled
-from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
 from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
-from fmugym.errors import ConfigError, FMULoadError, shown
+from fmugym.errors import ConfigError, FMULoadError
 from fmugym.systems.description import SystemDescription, describe_system
 from fmugym.systems.layout import Layout
 from fmugym.systems.plan import Component, SystemPlan
-from fmugym.wine.loader import can_run_windows
 
 __all__ = ["ExtractedSystem", "SystemFMU"]
 
@@ -47,19 +45,9 @@ class ExtractedSystem(ExtractedFMU):
 def _parts_in(folder: Path, description: SystemDescription) -> tuple[LoadableFMU, ...]:
     pairs = zip(description.plan.components, description.parts, strict=True)
     return tuple(
-        _part_in(folder / str(number), component, part)
+        ExtractedFMU(component.path, part, component.preload, folder / str(number))
         for number, (component, part) in enumerate(pairs)
     )
-
-
-def _part_in(folder: Path, component: Component, description: ModelDescription) -> LoadableFMU:
-    """Of libraries for Windows, only those that run here in Wine were extracted."""
-    part = ExtractedFMU(component.path, description, component.preload, folder)
-    part.isolated = component.isolate
-    if can_run_windows() and not (folder / part.library).exists():
-        part.in_wine = True  # names the library for Windows, which is missing, too, after a close
-        part.in_wine = (folder / part.library).exists()
-    return part
 
 
 class SystemFMU(FMU):
@@ -93,6 +81,7 @@ class SystemFMU(FMU):
         self.limits, self.interface = ArchiveLimits(), None
         self.probe_timeout = probe_timeout
         self.findings = plan.findings
+        self.isolated = any(component.isolate for component in plan.components)
         self._folder: Path | None = None
         self._remove_folder = None
 
@@ -111,11 +100,6 @@ class SystemFMU(FMU):
         assert isinstance(self.description, SystemDescription)
         return _parts_in(self.extract(), self.description)
 
-    @property
-    def whereabouts_by_name(self) -> dict[str, str]:
-        """Where each component runs: ``"here"``, ``"process"`` or ``"wine"``."""
-        return {component.name: fmu.whereabouts for component, fmu in self._pairs()}
-
     @cached_property
     def platforms(self) -> tuple[str, ...]:
         """The platforms for which all FMUs were built, by the names of each."""
@@ -124,10 +108,32 @@ class SystemFMU(FMU):
     @cached_property
     def obstacles(self) -> tuple[str, ...]:
         """What keeps the components from being loaded; see ``FMU.obstacles``."""
-        return tuple(
+        of_components = (
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
+            if not fmu.in_wine
             for text in fmu.obstacles
+        )
+        return (*of_components, *filter(None, [self._for_windows]))
+
+    @property
+    def _for_windows(self) -> str:
+        """Name the components that could run in Wine only, and the cure; "" if there are none.
+
+        A system runs in one process, and the worker program of Wine runs no systems.
+        """
+        names, others = (
+            ", ".join(repr(one.name) for one, fmu in self._pairs() if fmu.in_wine is in_wine)
+            for in_wine in (True, False)
+        )
+        if not names:
+            return ""
+        ways = [fmu._how_to_compile for fmu in dict.fromkeys(self._opened) if fmu.in_wine]
+        return (
+            f"{self.plan.name} cannot run here: of its components, {names} have libraries for "
+            f"Windows only, and {others or 'none'} for this platform. All components of a system "
+            f"run in one process, and Wine runs single FMUs only; export {names} for Linux, "
+            f"too{''.join(ways)}"
         )
 
     @cached_property
@@ -147,9 +153,11 @@ class SystemFMU(FMU):
         """
         if self._folder is not None:
             return self._folder
+        if self._for_windows:
+            raise FMULoadError(self._for_windows)
         for component, fmu in self._pairs():
             with _naming(component):
-                _require_runnable(fmu)
+                fmu._check_library()
         folder = folder_name()
         self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
         try:
@@ -178,15 +186,13 @@ def _opened(components: Iterable[Component]) -> Iterator[FMU]:
 
 def _open(component: Component) -> FMU:
     with _naming(component):
-        fmu = FMU(
+        return FMU(
             component.path,
             limits=component.limits,
             preload=component.preload,
             interface=component.interface,
             sizes=dict(component.sizes),
         )
-    fmu.isolated = component.isolate
-    return fmu
 
 
 @contextmanager
@@ -196,12 +202,3 @@ def _naming(component: Component) -> Iterator[None]:
         yield
     except FMULoadError as error:
         raise FMULoadError(f"component {component.name!r}: {error}") from None
-
-
-def _require_runnable(fmu: FMU) -> None:
-    fmu._check_library()
-    if fmu.in_wine and fmu.preload:
-        raise FMULoadError(
-            f"{fmu.path.name} has libraries for Windows only, which run here in Wine. There is no "
-            f"preload there, got {shown(list(fmu.preload))}"
-        )

@@ -59,7 +59,7 @@ class Component:
             elements of arrays. Those that an environment sets win.
         limits, preload: See ``fmugym.FMU``.
         sizes: The values of structural parameters.
-        isolate: Whether it runs in a process of its own.
+        isolate: Whether the system shall run in worker processes because of it.
     """
 
     name: str

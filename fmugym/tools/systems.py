@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
@@ -79,8 +79,7 @@ def overview_of_system(
     resets = (facts["trial"] or {}).get("component_resets", {})
     facts["system"] = {
         "components": [
-            _component(system, name) | {"runs": where, "begins_by": resets.get(name)}
-            for name, where in fmu.whereabouts_by_name.items()
+            _component(system, name) | {"begins_by": resets.get(name)} for name in system.components
         ],
         "connections": [asdict(link) for link in system.links],
         "connectors": [asdict(connector) for connector in system.connectors],
@@ -101,6 +100,7 @@ def _component(system: FMUSystem, name: str) -> dict[str, Any]:
         "interface": description.interface,
         "generation_tool": description.generation_tool,
         "steps": component.given.steps,
+        "isolate": component.given.isolate,
         "start_values": dict(component.starts),
     }
 
@@ -124,9 +124,11 @@ def _heading(facts: Mapping[str, Any]) -> Iterator[str]:
     times = facts["default_experiment"]
     step = times["step_size"]
     obstacles = "; ".join(facts["obstacles"])
+    isolated = any(one["isolate"] for one in facts["system"]["components"])
+    how = "runs here, in worker processes" if isolated else "runs here"
     rows = {
         "file": facts["path"],
-        "this machine": f"does NOT run here: {obstacles}" if obstacles else "runs here",
+        "this machine": f"does NOT run here: {obstacles}" if obstacles else how,
         "step": "not given" if step is None else f"{step:g} s",
         "master": facts["system"]["master"],
         "order": " -> ".join(map(_group, facts["system"]["order"])),
@@ -140,9 +142,6 @@ def _group(group: Mapping[str, Any]) -> str:
     return f"({names})" if group["is_loop"] else names
 
 
-_WHEREABOUTS: Final = {"here": "", "process": ", in a process of its own", "wine": ", in Wine"}
-
-
 def _parts(system: Mapping[str, Any]) -> Iterator[str]:
     yield f"\nComponents ({len(system['components'])})"
     for one in system["components"]:
@@ -151,7 +150,8 @@ def _parts(system: Mapping[str, Any]) -> Iterator[str]:
         tool = f", by {one['generation_tool']}" if one["generation_tool"] else ""
         steps = f", {one['steps']} steps in one of the system" if one["steps"] > 1 else ""
         begins = f", episodes begin by {one['begins_by']!r}" if one["begins_by"] else ""
-        yield f"  {plain(text + tool + steps + _WHEREABOUTS[one['runs']] + begins)}"
+        isolate = ", isolated" if one["isolate"] else ""
+        yield f"  {plain(text + tool + steps + isolate + begins)}"
     yield f"\nConnections ({len(system['connections'])})"
     for link in system["connections"]:
         yield f"  {plain(_link(link))}"

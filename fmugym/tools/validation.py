@@ -15,14 +15,12 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.export.logic import logic_of
 from fmugym.series.choice import quantities_of
-from fmugym.systems.fmu import SystemFMU
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, advise, rounded_down
@@ -207,7 +205,6 @@ def _flat(observation: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_faults(first)
-    yield from _of_components(env.fmu)
     yield _of_repetition(env, first)
     pairs = {
         name: [_play(env, _always(value)) for value in ends]
@@ -232,21 +229,6 @@ def _of_faults(first: _Episode) -> Finding:
         f"step {steps} of random actions failed: {first.fault}",
         "narrow the limits of the actions, shorten the time step, or use more substeps",
     )
-
-
-_WHEREABOUTS: Final = {
-    "here": "in the process of the environment",
-    "process": "in a process of its own",
-    "wine": "in Wine",
-}
-
-
-def _of_components(fmu: FMU) -> Iterator[Finding]:
-    """Tell where the components of a system run, if it is not all in one process."""
-    where = fmu.whereabouts_by_name if isinstance(fmu, SystemFMU) else {}
-    if set(where.values()) - {"here"}:
-        text = "; ".join(f"{name!r} runs {_WHEREABOUTS[place]}" for name, place in where.items())
-        yield Finding("ok", "components", text)
 
 
 def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:

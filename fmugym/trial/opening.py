@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.checks import check_number
 from fmugym.errors import (
     ConfigError,
     FMULoadError,
@@ -89,8 +87,9 @@ def make_pool(
         private_libraries: See ``NativePool``; by default True if two instances disturb each other
             in the trial. With FMPy each always has one.
         isolation: ``"process"`` for worker processes, ``"none"`` for this process. By default this
-            process, unless the FMU says that it can be instantiated only once per process, or
-            instances disturb each other and private libraries do not help.
+            process, unless the FMU says that it can be instantiated only once per process,
+            instances disturb each other and private libraries do not help, it has harmed its
+            process in the trial, or a component of a system shall be isolated.
         workers: See ``ProcessPool``; by default one for each instance if they disturb each other.
         call_timeout: See ``ProcessPool``; calls in this process have no time limit.
         spare: Whether there may be one more instance, in a trial of saved states.
@@ -112,15 +111,12 @@ def make_pool(
         )
     plan = Plan(reset_method, threads, private_libraries, isolation, workers)
     plan = plan.checked(fmu)
-    timeout = math.inf
-    if call_timeout is not None:
-        timeout = check_number("call_timeout", call_timeout, positive=True)
 
     def attempt() -> Pool:
         verdict = _verdict(fmu, spec, starts, num_instances, plan)
         completed = plan.completed(fmu, verdict, num_instances, log)
 
-        actual = replace(spec, blind_start=verdict.blind_start, call_timeout=timeout)
+        actual = replace(spec, blind_start=verdict.blind_start)
         _tell_of_reading(fmu, verdict, log)
         with progress(log, f"{fmu.path.name}: the instantiation of {num_instances} instance(s)"):
             trust = _Trust.of(fmu, actual, starts, completed, spare=spare)

@@ -11,7 +11,6 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, unknown_name
 from fmugym.pool.base import first_of
 from fmugym.pool.spec import ISOLATIONS, ResetMethod
-from fmugym.systems.fmu import SystemFMU
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
 from fmugym.wine.prefix import Wine
@@ -39,8 +38,8 @@ class Plan:
         if self.reset_method not in (None, *ResetMethod):
             raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
         if not fmu.in_wine:
-            _prepare_components(fmu)
-            return self
+            isolated = self.isolation is None and fmu.isolated
+            return replace(self, isolation="process") if isolated else self
         _prepare_wine(fmu, self.private_libraries, self.isolation)
         return replace(self, threads=1, private_libraries=None, isolation="process")
 
@@ -153,20 +152,6 @@ def _prepare_wine(fmu: FMU, private_libraries: bool | None, isolation: str | Non
     except BaseException:
         fmu.close()
         raise
-
-
-def _prepare_components(fmu: FMU) -> None:
-    """Make Wine ready for components that need it: this may take longer than a trial waits.
-
-    Raises:
-        FMULoadError: If Wine is missing.
-    """
-    if isinstance(fmu, SystemFMU) and "wine" in fmu.whereabouts_by_name.values():
-        try:
-            Wine.ready()
-        except BaseException:
-            fmu.close()
-            raise
 
 
 def is_alone(fmu: FMU) -> bool:

@@ -23,8 +23,9 @@ def trial_pool(
     log: logging.Logger,
     *,
     private_libraries: bool = False,
+    isolated: bool = False,
 ) -> SavingPool:
-    """Make a pool in this process, or in one in Wine if the FMU's library runs only there.
+    """Make a pool in this process, or in a worker process, as the FMU may need one in Wine.
 
     Args:
         fmu: The FMU; closed with the pool.
@@ -32,12 +33,13 @@ def trial_pool(
         num_instances: N.
         log: The logger that gets the FMU's messages.
         private_libraries: See ``NativePool``.
+        isolated: Whether to use a worker process.
 
     Raises:
         LicenceError: If the FMU gets no licence.
         FMULoadError: As ``local_pool``; or if private libraries are wanted in Wine.
     """
-    if not fmu.in_wine:
+    if not (fmu.in_wine or isolated):
         return local_pool(
             fmu,
             spec,
@@ -49,11 +51,11 @@ def trial_pool(
     if private_libraries:
         fmu.close()
         raise FMULoadError(f"{fmu.path.name} runs in Wine, with one native library a process")
-    return _pool_in_wine(fmu, spec, num_instances, log)
+    return _isolated_pool(fmu, spec, num_instances, log)
 
 
 @licence_errors()
-def _pool_in_wine(fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> SavingPool:
+def _isolated_pool(fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> SavingPool:
     announce(INITIALIZATION)
     pool = ProcessPool(fmu, spec, num_instances, log, workers=1, threads=1, call_timeout=None)
     announce(STEP)

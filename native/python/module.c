@@ -4,7 +4,6 @@
 
 #include "programs.h"
 
-#include "served.h"
 #include "texts.h"
 #include "threads.h"
 
@@ -79,19 +78,6 @@ static PyObject *py_text_with(PyObject *module, PyObject *number) {
     return PyUnicode_DecodeUTF8(text, (Py_ssize_t)strlen(text), "replace");
 }
 
-static PyObject *py_serve_component(PyObject *module, PyObject *unused) {
-    (void)module;
-    (void)unused;
-#if defined _WIN32
-    PyErr_SetString(PyExc_OSError, "components have processes of their own on Linux and macOS only");
-#else
-    Py_BEGIN_ALLOW_THREADS serve_standard_streams();
-    Py_END_ALLOW_THREADS
-    PyErr_SetString(PyExc_OSError, "the standard streams cannot be used");
-#endif
-    return NULL;
-}
-
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
@@ -102,7 +88,6 @@ static PyMethodDef functions[] = {
     {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {"text_with", py_text_with, METH_O, NULL},
-    {"serve_component", py_serve_component, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -5,7 +5,6 @@
 #include <string.h>
 
 #include "python.h"
-#include "remote.h"
 
 /* Bytes that hold values of one size. */
 typedef struct {
@@ -98,50 +97,8 @@ static bool take_part_strings(PyObject *tuple, Component *part) {
     return part->strings != NULL;
 }
 
-static const char **texts_of(PyObject *tuple, size_t *count) {
-    *count = PyTuple_Check(tuple) ? (size_t)PyTuple_Size(tuple) : 0;
-    return PyTuple_Check(tuple) ? take_texts(tuple) : NULL;
-}
-
-/* None, or how the workers of a part run. take_texts adds a NULL to the texts. */
-static bool take_remote(PyObject *object, Component *part) {
-    PyObject *command, *environment, *preload;
-    Py_ssize_t workers, instances;
-    size_t unused;
-
-    if (object == Py_None) {
-        return true;
-    }
-    Remote *remote = calloc(1, sizeof *remote);
-    part->remote = remote;
-    if (remote == NULL || !PyTuple_Check(object) ||
-        !PyArg_ParseTuple(object, "OOOynnd", &command, &environment, &preload, &remote->path,
-                          &workers, &instances, &remote->call_timeout) ||
-        workers < 1 || instances < 1) {
-        return refuse("workers");
-    }
-    remote->workers = (size_t)workers;
-    remote->instances = (size_t)instances;
-    remote->command = texts_of(command, &unused);
-    remote->environment = texts_of(environment, &unused);
-    remote->preload = texts_of(preload, &remote->number_of_preloads);
-    part->fmi = remote_table(part->version);
-    return (remote->command != NULL && remote->environment != NULL && remote->preload != NULL &&
-            part->fmi != NULL) ||
-           refuse("workers");
-}
-
-static void drop_remote(const Remote *remote) {
-    if (remote != NULL) {
-        free((void *)remote->command);
-        free((void *)remote->environment);
-        free((void *)remote->preload);
-        free((void *)remote);
-    }
-}
-
 static bool take_part(PyObject *tuple, Component *part) {
-    PyObject *categories, *solving, *strings, *remote;
+    PyObject *categories, *solving, *strings;
     Variables inputs, outputs, starts;
     Bytes input_starts, start_values, structural_references, structural_values, none = {NULL, 0};
     int version, manner, has_mode, rung;
@@ -149,17 +106,15 @@ static bool take_part(PyObject *tuple, Component *part) {
 
     if (!PyTuple_Check(tuple) ||
         !PyArg_ParseTuple(
-            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#y#)y#(y#y#y#y#)(y#y#y#y#)y#O!(y#y#)O", &part->name,
+            tuple, "(yyy)(iipi)(yyy)O!LO(y#y#y#y#)y#(y#y#y#y#)(y#y#y#y#)y#O!(y#y#)", &part->name,
             &part->label, &part->not_finite, &version, &manner, &has_mode, &rung, &part->model,
             &part->token, &part->resources, &PyTuple_Type, &categories, &steps, &solving,
             VARIABLES(inputs),
             BYTES(input_starts), VARIABLES(outputs), VARIABLES(starts), BYTES(start_values),
-            &PyTuple_Type, &strings, BYTES(structural_references), BYTES(structural_values),
-            &remote)) {
+            &PyTuple_Type, &strings, BYTES(structural_references),
+            BYTES(structural_values))) {
         return refuse("parts");
     }
-    part->version = version;
-    part->manner = manner;
     part->fmi = version == 0 ? NULL : fmi_of(version, manner);
     const size_t structural = count_of(structural_references, sizeof(uint32_t));
     if (part->fmi == NULL || steps < 1 || rung < RUNG_RESTORE || rung > RUNG_LIBRARY ||
@@ -176,7 +131,7 @@ static bool take_part(PyObject *tuple, Component *part) {
     part->start_values = doubles_of(start_values);
     part->number_of_categories = (size_t)PyTuple_Size(categories);
     part->categories = take_texts(categories);
-    return part->categories != NULL && take_remote(remote, part) && take_solving(solving, &part->solving) &&
+    return part->categories != NULL && take_solving(solving, &part->solving) &&
            open_access(&part->inputs, part, inputs, input_starts) &&
            open_access(&part->outputs, part, outputs, none) &&
            open_access(&part->starts, part, starts, start_values) &&
@@ -491,7 +446,6 @@ void drop_system(System *s) {
         access_close(&part->starts);
         free((void *)part->categories);
         free(part->strings);
-        drop_remote(part->remote);
     }
     if (s != NULL) {
         free(s->parts);

@@ -40,14 +40,6 @@ bool frames_open(void) {
     return input != NULL && output != NULL;
 }
 
-void *frames_input(void) {
-    return input;
-}
-
-void *frames_output(void) {
-    return output;
-}
-
 static bool receive(char *bytes, size_t size) {
     while (size > 0) {
         const DWORD wanted = size > 1 << 20 ? 1 << 20 : (DWORD)size;

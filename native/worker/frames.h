@@ -30,9 +30,6 @@ enum {
 /* Keeps the standard streams for messages; what the FMU prints goes to the standard error. */
 bool frames_open(void);
 
-/* The streams themselves. */
-void *frames_input(void);
-void *frames_output(void);
 /* A count in shared memory that the other end raises after each message. From now on receive_code
  * watches it for a short time before it goes to sleep. */
 void frames_watch(const Atomic *bell);

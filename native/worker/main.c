@@ -1,14 +1,11 @@
 /* The worker program for Windows libraries, which runs in Wine: the native pool without Python.
  *
  * It answers requests that come on the standard input until one is to close, or the other end is
- * gone. Answers go to the standard output, and what the FMU prints to the standard error. With the
- * argument "component" it serves a component of systems. */
+ * gone. Answers go to the standard output, and what the FMU prints to the standard error. */
 
 #include <stdio.h>
 #include <stdlib.h>
-#include <string.h>
 
-#include "../served.h"
 #include "worker.h"
 
 /* Tells what has ended the process; Windows would open a dialogue, Wine a debugger. */
@@ -67,16 +64,7 @@ static bool open_worker(Worker *worker) {
     return false;
 }
 
-static int serve_system(void) {
-    Channel channel;
-
-    if (channel_open(&channel, frames_input(), frames_output())) {
-        serve_component(&channel);
-    }
-    return 1;
-}
-
-int main(int argc, char **argv) {
+int main(void) {
     static Worker worker; /* the settings point into it */
     char code;
 
@@ -87,9 +75,6 @@ int main(int argc, char **argv) {
         return 1;
     }
     pool_prepare_process();
-    if (argc > 1 && strcmp(argv[1], "component") == 0) {
-        return serve_system();
-    }
     if (!open_worker(&worker)) {
         return 0;
     }

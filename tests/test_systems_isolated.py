@@ -1,0 +1,493 @@
+"""Systems in worker processes: what they compute, how these die, and which systems go there.
+
+What a system computes does not depend on where it runs.
+"""
+
+import contextlib
+import logging
+import pickle
+from dataclasses import replace
+
+import clocks_tools
+import exchange_tools
+import fmu_tools
+import numpy as np
+import pytest
+import quirk_table
+import source_tools
+import ssp_tools
+import values_tools
+from process_tools import (
+    faulty_fmu,
+    fixture_faulty,  # noqa: F401  # the fixture "faulty"
+    start_values,
+)
+from system_tools import linear, linear_fmu, masses, system
+
+import fmugym
+from fmugym import Component, ConfigError, Connection, FMULoadError, FMUSystem, bundled_fmu
+from fmugym.pool import PoolSpec
+from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.native import NativePool
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.spec import ResetMethod
+from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.plan import Component as Planned
+from fmugym.systems.plan import Connector, End, Link, Loop
+from fmugym.tools import cli
+from fmugym.trial import opening
+from fmugym.wine.loader import can_run_windows
+
+LOG = logging.getLogger("fmugym.test")
+MASSES = ["first.y1", "second.y2"]
+
+
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    """The FMU of linear equations by FMI version."""
+    folder = tmp_path_factory.mktemp("linear")
+    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
+
+
+@pytest.fixture(name="make")
+def closing_pools():
+    """Make pools of plans as environments do; they are closed after the test."""
+    with contextlib.ExitStack() as stack:
+
+        def make(plan, outputs, inputs=(), count=2, time_step=0.1, spec=None, **options):
+            fmu = SystemFMU(plan)
+            variables = tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs))
+            whole = PoolSpec(*variables, time_step, **(spec or {}))
+            pool = opening.make_pool(fmu, whole, count, LOG, **options)
+            pool.variable = fmu.variable
+            return stack.enter_context(contextlib.closing(pool))
+
+        yield make
+
+
+def isolated(plan):
+    """The same plan with ``isolate=True`` for one component, the last one."""
+    *others, last = plan.components
+    return replace(plan, components=(*others, replace(last, isolate=True)))
+
+
+def reset(pool, names=(), values=None):
+    variables = tuple(map(pool.variable, names))
+    values = np.zeros((0, pool.num_instances)) if values is None else np.array(values, float)
+    return pool.reset(variables, values)[1]
+
+
+def play(pool, steps=10, inputs=None):
+    """Reset and step; the outputs, shape (steps + 1, k, N)."""
+    assert not reset(pool).any(), pool.failure(0)
+    rows = [pool.outputs.copy()]
+    for step in range(steps):
+        outputs, statuses = pool.step(None if inputs is None else inputs[step])
+        assert not statuses.any(), pool.failure(0)
+        rows.append(outputs.copy())
+    return np.array(rows)
+
+
+# The plan of a system, the names of its outputs and inputs, and what the pool does, each a function
+# of the FMUs of linear equations and of a folder.
+
+
+def coupled(versions):
+    return lambda fmus, _: (masses([fmus[v] for v in versions], (2, 1)), MASSES, (), {})
+
+
+def loop(master):
+    def make(fmus, _):
+        direct = {"a": [[-1, 0], [0, 0]], "c": [[1, 0], [0, 0]], "d": [[0.5, 0], [0, 0]]}
+        parts = (
+            linear("p", fmus[2], (1.0, 0.0), **direct),
+            linear("q", fmus[3], (-0.4, 0.0), **direct),
+        )
+        links = (Link("p", "y1", "q", "u1"), Link("q", "y1", "p", "u1"))
+        return system(parts, links, Loop(), master=master), ["p.y1", "q.y1"], (), {}
+
+    return make
+
+
+def ball(version):
+    def make(_, folder):
+        path = exchange_tools.exchange_fmu(folder / "Ball.fmu", "ball", version)
+        plan = system([Planned("ball", path, "model_exchange")], ())
+        return plan, ["ball.h", "ball.v"], (), {"solver": "rk4"}
+
+    return make
+
+
+def discarding(fmus, _):
+    """Steps that are too long are repeated in parts."""
+    plan = masses([fmus[2], fmus[2]])
+    first = replace(plan.components[0], starts=(*plan.components[0].starts, ("limit", 0.06)))
+    return replace(plan, components=(first, plan.components[1])), MASSES, (), {"fault_retries": 2}
+
+
+def arrays(_, folder):
+    """Their sizes differ from those that the FMU has by itself."""
+    path = values_tools.state_space_fmu(folder / "S.fmu")
+    sizes = {"n": 3, "m": 2, "r": 2}
+    starts = {
+        "A": (-np.eye(3) + 0.1).tolist(),
+        "B": np.full((3, 2), 0.3).tolist(),
+        "C": np.arange(6.0).reshape(2, 3).tolist(),
+        "D": np.zeros((2, 2)).tolist(),
+        "x_0": [1.0, -0.5, 0.25],
+    }
+    one = Component(path, sizes | starts, feedthrough=False)
+    both = FMUSystem({"p": one, "q": one}, ["p.y -> q.u", "q.y -> p.u"])
+    return both.plan, [f"{name}.y[{i}]" for name in "pq" for i in (1, 2)], (), {}
+
+
+def types(version):
+    def make(_, folder):
+        plan = system([Planned("f", values_tools.feedthrough_fmu(folder / "F.fmu", version))], ())
+        variables = SystemFMU(plan).description.variables.values()
+        inputs, outputs = (
+            [
+                one.name
+                for v in variables
+                if v.is_number and v.causality == causality
+                for one in v.elements
+            ]
+            for causality in ("input", "output")
+        )
+        return plan, outputs, inputs, {}
+
+    return make
+
+
+def clocks(_, folder):
+    plan = system([Planned("c", clocks_tools.clocks_fmu(folder / "C.fmu", "CoSimulation"))], ())
+    outputs = [f"c.count of {name}" for name in clocks_tools.CLOCKS]
+    outputs += ["c.x", "c.sample", "c.bell", "c.strike", "c.countdown"]
+    return plan, outputs, ["c.strike", "c.command", "c.pace"], {}
+
+
+KINDS = {
+    "FMI 1 and 2": coupled((1, 2)),
+    "FMI 3 and 1": coupled((3, 1)),
+    "loop": loop("gauss_seidel"),
+    "loop of jacobi": loop("jacobi"),
+    "model exchange of FMI 1": ball(1),
+    "model exchange of FMI 3": ball(3),
+    "discarded steps": discarding,
+    "arrays": arrays,
+    "types of FMI 2": types(2),
+    "types of FMI 3": types(3),
+    "clocks": clocks,
+}
+
+
+class TestResults:
+    """They equal those of systems in this process to the last bit."""
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_of_each_kind(self, make, fmus, tmp_path, kind):
+        plan, outputs, inputs, spec = KINDS[kind](fmus, tmp_path)
+        given = np.random.default_rng(0).integers(0, 2, (20, len(inputs), 2)) / 1.0
+        if "c.pace" in inputs:
+            given[:, 2] += 0.3
+        here = make(plan, outputs, inputs, spec=spec)
+        there = make(isolated(plan), outputs, inputs, spec=spec, workers=2)
+        assert (type(here), type(there)) == (NativePool, ProcessPool)
+        rows = play(here, 20, given)
+        assert np.ptp(rows, axis=0).max() > 0
+        for _ in range(2):
+            assert play(there, 20, given).tobytes() == rows.tobytes()
+        assert there.health()["retries"].sum() == 2 * here.health()["retries"].sum()
+        assert (here.health()["retries"].sum() > 0) == (kind == "discarded steps")
+
+    @pytest.mark.parametrize("method", ResetMethod)
+    def test_episodes_begin_by_each_method(self, make, fmus, method):
+        plan = masses([fmus[2], fmus[3]])
+        rows = play(make(plan, MASSES))
+        pool = make(isolated(plan), MASSES, reset_method=method)
+        for _ in range(4):
+            assert play(pool).tobytes() == rows.tobytes()
+
+    def test_values_that_are_set_and_read_between_steps(self, make, fmus):
+        plan = masses([fmus[2], fmus[3]])
+        connector = Connector("push", (End("first", "u2", 2.0), End("second", "u2")), "input")
+        plan = replace(plan, connectors=(connector,), links=plan.links[::2])
+        plan = replace(plan, initialization=plan.initialization[:2])
+        rows = []
+        for one in (plan, isolated(plan)):
+            pool = make(one, MASSES, ["push"])
+            assert not reset(pool, ["second.x1_0"], [[0.3, -0.2]]).any()
+            for k in range(6):
+                pool.step(np.array([[0.1 * k, -0.2]]))
+                rows.append(pool.outputs.tobytes())
+            pool.write((pool.variable("first.a21"),), np.array([[-9.0, -8.0]]))
+            read = pool.read(tuple(map(pool.variable, ["first.a21", "second.x1_0", "first.t"])))
+            rows.append(read.tobytes())
+            pool.step(np.array([[0.5, 0.5]]))
+            rows.append(pool.outputs.tobytes())
+        assert rows[:8] == rows[8:]
+
+    def test_states(self, make, fmus):
+        """Snapshots, and states that go to another pool as bytes."""
+        plan = masses([fmus[2], fmus[2]])
+        here, there = make(plan, MASSES), make(isolated(plan), MASSES)
+        later = []
+        for pool in (here, there):
+            play(pool, 3)
+            snapshot = pool.save()
+            first = [pool.step()[0].copy() for _ in range(3)]
+            pool.restore(snapshot, np.array([True, False]))
+            again = [pool.step()[0].copy() for _ in range(3)]
+            assert all(
+                a[:, 0].tobytes() == b[:, 0].tobytes() for a, b in zip(first, again, strict=True)
+            )
+            later.append(pool.outputs.tobytes())
+        assert later[0] == later[1]
+        for pool in (here, there):
+            pool.save_by(lambda: SaveMethod.STATE)
+            play(pool, 2)
+        bundle = pickle.loads(pickle.dumps(there.save_instances(np.arange(2))))
+        here.restore_instances(bundle, np.array([1, 0]), np.arange(2))
+        for _ in range(3):
+            assert np.array_equal(here.step()[0], there.step()[0][:, ::-1])
+
+    @pytest.mark.parametrize("version", [1, 2, 3])
+    def test_strings_and_messages(self, make, tmp_path, caplog, version):
+        """The FMU logs its String; the message names the system and the component."""
+        probe = fmu_tools.probe_fmu(tmp_path, version)
+        plan = system([Planned("loud", probe, starts=(("label", "Ümlaut"),))], ())
+        told = []
+        for one in (plan, isolated(plan)):
+            pool = make(one, ["loud.sum"])
+            caplog.clear()
+            assert not reset(pool, ["loud.log_status"], [[-1.0, 1.0]]).any(), pool.failure(0)
+            pool.step()
+            told.append([r.getMessage() for r in caplog.records if "loud" in r.getMessage()])
+        assert any("system_1.loud" in text and "Ümlaut is 100%" in text for text in told[0])
+        assert sorted(told[0]) == sorted(told[1])
+
+
+class Telling(fmugym.FMUEnv):
+    """Reads a text that an FMU gives."""
+
+    def __init__(self, source):
+        config = {
+            "model_input_names": ["f.Float64_in"],
+            "model_output_names": ["f.Float64_out"],
+            "model_parameters": {
+                "f.String_parameter": fmugym.Choice(["short", "", "a longer one"])
+            },
+            "monitor_names": ["f.String_told"],
+            "time_step": 0.1,
+            "bounds": {"f.Float64_in": (-1, 1), "f.Float64_out": (-1, 1)},
+        }
+        super().__init__(source, config)
+
+    def _is_done(self):
+        return False
+
+
+class Chain(fmugym.FMUEnv):
+    """Pushes the first pendulum of a chain."""
+
+    def __init__(self, source, **options):
+        config = {
+            "model_input_names": ["a.tau"],
+            "model_output_names": ["a.theta", "b.theta"],
+            "model_parameters": {"b.q_0": fmugym.Uniform(-0.2, 0.2)},
+            "time_step": 0.02,
+            "bounds": {"a.tau": (-1, 1)},
+            "max_episode_steps": 20,
+        }
+        super().__init__(source, config, **options)
+
+    def _is_done(self):
+        return abs(self.out["b.theta"]) > 10
+
+
+def chain(first=None, **options):
+    """Two pendulums, of which the first drives the second."""
+    pendulum = bundled_fmu("Pendulum")
+    components = {"a": Component(first or pendulum, **options), "b": pendulum}
+    connection = Connection("a.theta", "b.tau", gain=0.5, convert_units=False)
+    return FMUSystem(components, [connection], step_size=0.02)
+
+
+def episodes(env, seed=3):
+    """The observations of a vector environment over the end of its episodes."""
+    env.action_space.seed(seed)
+    first, _ = env.reset(seed=seed)
+    return np.array([first, *(env.step(env.action_space.sample())[0] for _ in range(30))])
+
+
+class TestEnvironments:
+    def test_hooks_read_texts(self, tmp_path):
+        path = values_tools.feedthrough_fmu(tmp_path / "F.fmu", 3)
+        told = []
+        for isolate in (False, True):
+            source = FMUSystem({"f": Component(path, isolate=isolate)})
+            with contextlib.closing(Telling(source)) as env:
+                for seed in range(4):
+                    env.reset(seed=seed)
+                    env.step(env.action_space.sample())
+                    told.append(env.out["f.String_told"])
+        assert len(set(told)) > 1
+        assert told[:4] == told[4:]
+
+    def test_a_vector_environment(self):
+        results = []
+        for isolate in (False, True):
+            env = fmugym.FMUVectorEnv(lambda i=isolate: Chain(chain(isolate=i)), 3)
+            with contextlib.closing(env):
+                results.append(episodes(env))
+        assert results[0].tobytes() == results[1].tobytes()
+
+
+class TestFaults:
+    NAMES = tuple(f"bad.{name}" for name in start_values())
+
+    @pytest.mark.parametrize(
+        ("fault", "cause"),
+        [("crash", "signal SIGSEGV"), ("exit", "exit status 0"), ("hang", "call_timeout")],
+    )
+    def test_one_ends_the_episodes_of_its_worker(self, make, fmus, faulty, fault, cause):
+        parts = (
+            linear("sound", fmus[2], (1.0, 0.0), a=[[-1, 0], [0, 0]], c=np.eye(2)),
+            Planned("bad", faulty),
+        )
+        plan = isolated(system(parts, [Link("sound", "y1", "bad", "u")]))
+        options = {"workers": 2, "call_timeout": 1.0 if fault == "hang" else 60.0}
+        pool = make(plan, ("bad.y", "sound.y1"), count=4, time_step=0.5, **options)
+
+        def values(*faults):
+            return np.array([list(start_values(one).values()) for one in faults], float).T
+
+        assert not reset(pool, self.NAMES, values(fault, "none", "none", "none")).any()
+        pool.step()
+        before = pool.outputs.copy()
+        _, statuses = pool.step()
+        assert statuses.tolist() == [4, 4, 0, 0]
+        assert pool.outputs[:, :2].tobytes() == before[:, :2].tobytes()
+        for text in (cause, "this is fault"):
+            assert text in pool.failure(0)
+        mask = np.array([True, True, False, False])
+        pool.reset(tuple(map(pool.variable, self.NAMES)), values(*["none"] * 4), mask)
+        assert not pool.step()[1].any()
+        assert pool.outputs[0, 0] == pool.outputs[0, 1] == before[0, 0]
+
+    def test_a_library_that_cannot_be_loaded_is_named(self, make, fmus, tmp_path):
+        from fmugym import _native
+
+        files = fmu_tools.read_fmu(fmus[2])
+        library = next(name for name in files if name.startswith("binaries/"))
+        with open(_native.__file__, "rb") as file:
+            files[library] = file.read()
+        broken = fmu_tools.write_fmu(tmp_path / "Broken.fmu", files)
+        plan = isolated(masses([fmus[2], broken]))
+        with pytest.raises(FMULoadError, match="'second': it does not export fmi2"):
+            make(plan, MASSES)
+
+
+class TestChoice:
+    def test_an_environment_wins(self, make, fmus):
+        plan = isolated(masses([fmus[2], fmus[2]]))
+        assert isinstance(make(plan, MASSES, isolation="none"), NativePool)
+
+    @pytest.mark.parametrize("value", [2, "yes", None])
+    def test_the_argument_is_a_flag(self, value):
+        with pytest.raises(ConfigError, match="isolate"):
+            Component(bundled_fmu("Pendulum"), isolate=value)
+
+    def test_a_trial_moves_the_whole_system(self, make, fmus, tmp_path, monkeypatch, caplog):
+        """It finds a component of which a process can have one instance only."""
+        monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
+        monkeypatch.setenv("FMUGYM_PROBE", "on")
+        alone = Planned("bad", faulty_fmu(tmp_path, "{lonely}"))
+        plan = system([linear("sound", fmus[2]), alone], [Link("sound", "y1", "bad", "u")])
+        pool = make(plan, ["bad.y"], count=3)
+        assert len(pool.processes()) == 3
+        assert "each gets a process" in caplog.text
+        play(pool)
+
+    def test_two_components_of_an_fmu_that_can_be_there_once(self, make, tmp_path):
+        """Each has a copy of its library: the two share a process."""
+        rows = []
+        for token in ("well behaved", "globals"):
+            quirk = quirk_table.quirk_fmu(tmp_path / token, 2, token)
+            flag = {"<CoSimulation ": '<CoSimulation canBeInstantiatedOnlyOncePerProcess="true" '}
+            path = fmu_tools.edited_fmu(quirk, tmp_path / token, flag)
+            both = FMUSystem({"a": Component(path, {"gain": 2.0}), "b": path}, ["a.y -> b.u"])
+            pool = make(both.plan, ["a.y", "b.y"], ["a.u"])
+            assert len(pool.processes()) == 2
+            rows.append(play(pool, 10, np.random.default_rng(0).normal(size=(10, 1, 2))))
+        assert np.ptp(rows[0]) > 0
+        assert rows[0].tobytes() == rows[1].tobytes()
+
+    @pytest.mark.parametrize("copy", [pickle.dumps, None], ids=["pickle", "archive"])
+    def test_a_copy_keeps_it(self, tmp_path, copy):
+        made = chain(isolate=True)
+        if copy is None:
+            plan = FMUSystem.read(ssp_tools.write(made, tmp_path / "chain.ssp")).plan
+        else:
+            plan = pickle.loads(copy(made)).plan
+        assert [component.isolate for component in plan.components] == [True, False]
+
+    def test_info_says_so(self, tmp_path, capsys):
+        task = tmp_path / "task.toml"
+        task.write_text(
+            """
+            time_step = 0.02
+            episode_length = 0.2
+            reward = "-abs(theta)"
+            [system]
+            connections = [{ source = "a.theta", target = "b.tau", convert_units = false }]
+            [system.components]
+            a = { fmu = { bundled = "Pendulum" }, isolate = true }
+            b = { bundled = "Pendulum" }
+            [variables]
+            theta = { name = "b.theta", min = -10, max = 10 }
+            tau = { name = "a.tau", min = -1, max = 1 }
+            [agent]
+            actions = ["tau"]
+            observations = ["theta"]
+            """
+        )
+        assert cli.main(["info", str(task)]) == 0
+        told = capsys.readouterr().out
+        lines = [line for line in told.splitlines() if "Pendulum.fmu" in line]
+        assert [("isolated" in line) for line in lines] == [True, False]
+        assert "runs here, in worker processes" in told
+
+
+@pytest.mark.skipif(not can_run_windows(), reason="Wine runs on Linux on x86_64 only")
+class TestLibrariesForWindows:
+    """A system with one is refused: Wine runs single FMUs."""
+
+    @pytest.fixture(name="windows")
+    def for_windows(self, tmp_path):
+        library = {"binaries/win64/Pendulum.dll": b"MZ"}
+        return fmu_tools.edited_fmu("Pendulum", tmp_path, drop=["binaries/"], add=library)
+
+    def test_a_mix_is_refused_by_name(self, windows):
+        with pytest.raises(FMULoadError, match=r"'a'.*Windows only, and 'b'.*'a' for Linux"):
+            Chain(chain(windows))
+
+    def test_so_is_a_system_of_them_alone(self, windows):
+        both = FMUSystem({"a": windows, "b": windows})
+        with pytest.raises(FMULoadError, match="'a', 'b' have libraries for Windows only"):
+            both.as_fmu().extract()
+        with pytest.raises(FMULoadError, match="'a', 'b' have libraries for Windows only"):
+            fmugym.linearize(both)
+
+    def test_info_says_so(self, windows, tmp_path, capsys):
+        archive = ssp_tools.write(chain(windows), tmp_path / "chain.ssp")
+        assert cli.main(["info", str(archive)]) == 0
+        told = capsys.readouterr().out
+        assert "does NOT run here" in told
+        assert "install Wine" not in told
+
+    def test_source_code_is_a_cure(self, tmp_path):
+        library = {"binaries/win64/Model.dll": b"MZ"}
+        source = source_tools.write_source_fmu(tmp_path / "of code.fmu", 2, library)
+        (obstacle,) = FMUSystem({"a": source}).as_fmu().obstacles
+        assert "fmugym compile 'of code.fmu'" in obstacle
