@@ -130,10 +130,9 @@ class SystemFMU(FMU):
             return ""
         ways = [fmu._how_to_compile for fmu in dict.fromkeys(self._opened) if fmu.in_wine]
         return (
-            f"{self.plan.name} cannot run here: of its components, {names} have libraries for "
-            f"Windows only, and {others or 'none'} for this platform. All components of a system "
-            f"run in one process, and Wine runs single FMUs only; export {names} for Linux, "
-            f"too{''.join(ways)}"
+            f"{self.plan.name} cannot run here: its components with libraries for Windows only are "
+            f"{names}, the others are {others or 'none'}. A system runs in one process, and Wine "
+            f"runs single FMUs only. Export {names} for Linux, too{''.join(ways)}"
         )
 
     @cached_property
