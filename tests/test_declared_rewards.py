@@ -79,7 +79,10 @@ def in_a_row(text, count):
 
 
 REWARD = 'reward = "shift"'
+DOUBLED, ROW = in_a_row("E + E", 13)
+KPIS = "\n".join(["", "[kpis]", *(f'k{i} = "shift * {i}"' for i in range(50))])
 LARGE = {
+    "many that are large": (DOUBLED, ROW + KPIS),
     "doubled": in_a_row("E + E", 30),
     "many operands": in_a_row("max(E, 1, E, 2, E, 3, E, 4, E, E, E, E)", 9),
     "long row": in_a_row("E + 1", 900),

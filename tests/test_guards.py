@@ -1,4 +1,4 @@
-"""Guards in the process, in all pools: finite values, retries, health, recycling."""
+"""Guards in the process, in all pools: finite values, retries, health, leaks."""
 
 import ctypes
 import itertools

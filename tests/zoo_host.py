@@ -15,7 +15,6 @@ from pathlib import Path
 
 import zoo_tools
 
-from fmugym.caching import cache_folder
 from fmugym.pool import native  # noqa: F401 (so that the forks need not import it)
 from fmugym.pool.process.last_words import describe_exit
 
@@ -58,14 +57,7 @@ def visit_in_fork(cell, path):
         return [("hangs", "")], []
     if path.exists():
         return json.loads(path.read_text())
-    forget_crashes()
     return [("dies", describe_exit(code))], []
-
-
-def forget_crashes():
-    """Let the next cell meet the FMU as if it had not crashed; ``test_crashes.py`` tests that."""
-    for mark in (cache_folder() / "marks").glob("*"):
-        mark.unlink()
 
 
 def wait(child, patience):

@@ -31,6 +31,7 @@ _LONGEST: Final = 2000
 _MOST_NODES: Final = 500
 _DEEPEST: Final = 40
 _LONGEST_CODE: Final = 200_000
+_LONGEST_FUNCTION: Final = 1_000_000
 
 _BINARY: Final[Mapping[type[ast.operator], str]] = {
     ast.Add: "({} + {})",
@@ -408,14 +409,17 @@ def function_of(text: str, constants: Mapping[str, Any], file: str) -> Callable[
         file: A name for the code in tracebacks.
 
     Raises:
-        ConfigError: If the code is too large for Python.
+        ConfigError: If the code is too large.
     """
+    too_large = ConfigError(
+        f"{file}: expressions read each other in too long a row, or have too many terms"
+    )
+    if len(text) > _LONGEST_FUNCTION:
+        raise too_large
     try:
         code = compile(f"lambda env: {text}", f"<{file}>", "eval")
     except (SyntaxError, MemoryError, RecursionError):  # limits of Python's own
-        raise ConfigError(
-            f"{file}: expressions read each other in too long a row, or have too many terms"
-        ) from None
+        raise too_large from None
     function: Callable[[Any], Any] = eval(code, {**_NAMESPACE, **constants})
     if not _MAY_WARN.search(text):
         return function

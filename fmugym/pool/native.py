@@ -86,7 +86,7 @@ class NativePool(SavingPool):
             processor that this process may use. The results do not depend on it.
         private_libraries: Whether each instance gets a private copy of the FMU's library, and so
             of its global variables. By default only if the FMU says that it can be
-            instantiated only once per process. See ``fmugym.trial.shared_globals``.
+            instantiated only once per process. See ``fmugym.trial.neighbours``.
         first_index: The number of the first instance in messages.
         counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 

@@ -1,7 +1,8 @@
 """``fmugym compile``: a library for this machine from the source code in an FMU.
 
 FMI 2.0 lists the source files in the model description, FMI 3.0 in
-``sources/buildDescription.xml``. FMI 1.0 has no list.
+``sources/buildDescription.xml``. FMI 1.0 has no list. FMPy builds FMUs, too, but leaves
+prefixes in the names of functions and knows no folders of headers; OpenModelica's code has both.
 """
 
 from __future__ import annotations
