@@ -221,43 +221,6 @@ def test_programs_whose_results_are_nan_are_the_hooks():
     FMUVectorEnv(NotANumber, 2, hooks="compiled").close()
 
 
-def constant(env):
-    return np.where(env.done, -1.0, np.minimum(2.0, 1.0))
-
-
-def loaded(env):
-    return np.maximum(abs(env.state[0]), -env.parameters["m"])
-
-
-def counting(env):
-    return 1.0 - (env.done & (env.state[0] > 0.5)) + 3.0 * (env.step_count > 5)
-
-
-def unknown(env):
-    return np.where(env.done, np.nan, 1.0)
-
-
-def overflowing(env):
-    return np.where(env.done, 1.0, env.state[0] * env.state[0])
-
-
-def dividing(env):
-    return 1.0 / env.state[0]
-
-
-@pytest.mark.parametrize(
-    ("reward", "is_finite"),
-    [
-        *[(constant, True), (loaded, True), (counting, True)],
-        *[(overflowing, False), (dividing, False), (unknown, False)],
-    ],
-)
-def test_which_rewards_are_always_finite(reward, is_finite):
-    env = type("Other", (Arithmetic,), {"_reward_policy": reward})()
-    assert trace_hooks(env).judgement.is_always_finite is is_finite
-    env.close()
-
-
 class Unattended(Arithmetic):
     """It has no inputs."""
 

@@ -1,7 +1,7 @@
 """The functions of expressions, for numbers, arrays and symbols.
 
-All of them give one number the same value, to the last bit, as an element of an array: they are
-numpy's functions, or operators that IEEE 754 settles.
+In Python all of them give one number the same value, to the last bit, as an element of an array:
+they are numpy's functions, or operators that IEEE 754 settles.
 """
 
 from __future__ import annotations
@@ -40,6 +40,12 @@ def _remainder(first: Any, second: Any) -> Any:
         return first % second
     except ZeroDivisionError:
         return np.remainder(first, second)
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    if isinstance(exponent, float) and exponent == 2.0:  # a product takes far less time
+        return np.square(base, dtype=np.float64)
+    return np.float_power(base, exponent)
 
 
 def _where(condition: Any, first: Any, second: Any) -> Any:
@@ -132,7 +138,7 @@ def _maximum(*values: Any) -> Any:
 OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "divide": _divide,
     "remainder": _remainder,
-    "power": np.float_power,
+    "power": _power,
     "where": _where,
     "float64": _float64,
     "take": _take,

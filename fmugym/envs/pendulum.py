@@ -166,8 +166,9 @@ class PendulumEnv(FMUEnv):
 def _squared(value: Any) -> Any:
     """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
 
-    For arrays numpy has its own loops; ``float_power`` comes nearest.
+    For arrays numpy has its own loops; ``float_power`` comes nearest. It is exact for a float32,
+    whose product fits a float64.
     """
-    if isinstance(value, np.ndarray):
-        return np.float_power(value, 2.0).astype(value.dtype)
-    return value**2
+    if not isinstance(value, np.ndarray):
+        return value**2
+    return np.square(value) if value.dtype == np.float32 else np.float_power(value, 2.0)

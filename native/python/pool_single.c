@@ -64,7 +64,6 @@ static bool fits(const Prepared *p, const Py_buffer *b) {
 static bool is_nan(char letter, const void *values, size_t i) {
     const double *doubles = values;
     const float *floats = values;
-    const Half *halves = values;
 
     switch (letter) {
     case 'd':
@@ -72,7 +71,7 @@ static bool is_nan(char letter, const void *values, size_t i) {
     case 'f':
         return floats[i] != floats[i];
     default:
-        return letter == 'e' && half_is_nan(halves[i]);
+        return false;
     }
 }
 

@@ -3,7 +3,6 @@
 #ifndef FMUGYM_PREPARED_H
 #define FMUGYM_PREPARED_H
 
-#include "halves.h"
 #include "programs.h"
 #include "single.h"
 

@@ -25,7 +25,7 @@ from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import Row
+from fmugym.vector.hooks.program import Row, letter_of
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 from fmugym.vector.infos import (
     not_finite,
@@ -39,7 +39,7 @@ logger = logging.getLogger(__name__)
 
 _BOOL = np.dtype(np.bool_)
 
-_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
+_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
 _REFUSALS = (TypeError, ValueError, BufferError)
@@ -170,7 +170,7 @@ class CompiledEngine(BatchEngine):
         flat = [actions.reshape(-1) for actions in self._actions]
         return {
             "shape": self._actions[0].shape[1:],
-            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
+            "letter": letter_of(dtype),
             "size": dtype.itemsize,
             "check": check,
             "lowest": low,

@@ -22,7 +22,6 @@ from fmugym.vector.hooks.symbols import (
     handlers,
     has_symbols,
     lift,
-    stand_in,
 )
 
 __all__ = [
@@ -179,32 +178,6 @@ def _take(a: Any, indices: Any, axis: Any = None, out: Any = None, mode: Any = "
     return look_up(table, (slice(None),) * (axis % table.ndim) + (index,))
 
 
-def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Any:
-    graph = graph_of(arr, indices)
-    table, index = as_symbols(graph, arr), as_symbols(graph, indices).cast(_INTEGER)
-    if axis is None:
-        return look_up(table.like(table.cells.ravel()), index)
-    columns = list(np.moveaxis(table.cells, axis, 0))
-    rows = [
-        each(lambda at, *cells: _chosen(graph, at, cells), row, *columns)
-        for row in np.moveaxis(index.cells, axis, 0)
-    ]
-    return table.like(np.moveaxis(np.stack(rows), 0, axis))
-
-
-def _choose(a: Any, choices: Any, out: Any = None, mode: Any = "raise") -> Any:
-    if out is not None or mode != "raise":
-        raise UntraceableError("it uses an argument of numpy.choose")
-    graph = graph_of(a, choices)
-    parts = [as_symbols(graph, choice) for choice in choices]
-    dtype = np.result_type(*(stand_in(graph, choice) for choice in choices))
-    index = as_symbols(graph, a).cast(_INTEGER)
-    checked: Any = np.where(index < 0, len(parts), index)  # numpy.choose knows no negative index
-    cells = [part.cast(dtype).cells for part in parts]
-    chosen = each(lambda at, *values: _chosen(graph, at, values), checked.cells, *cells)
-    return Symbols(graph, chosen, dtype)
-
-
 # Searching
 
 
@@ -242,25 +215,25 @@ def _digitize(x: Any, bins: Any, right: bool = False) -> Any:
 def _interp(
     x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
 ) -> Symbols:
-    graph = graph_of(x, xp, fp, left, right, period)
-    xp, fp, left, right, period = (_known(graph, part) for part in (xp, fp, left, right, period))
-    xs, ys = (np.asarray(part, np.float64) for part in (xp, fp))
+    graph = graph_of(x, xp, fp, left, right)
+    xs, ys = (np.asarray(_known(graph, part), np.float64) for part in (xp, fp))
     if xs.ndim != 1 or xs.shape != ys.shape or not xs.size:
         raise ValueError("fp and xp are not of the same length")
-    if period is not None:
-        x, xs, ys, left, right = (*_repeated(x, xs, ys, abs(period)), None, None)
-    ends = [ys[0] if left is None else left, ys[-1] if right is None else right]
-    number = _place_table(graph, np.concatenate([xs, ys, np.array(ends, np.float64)]))
-    floats = as_symbols(graph, x).cast(np.float64)
+    if period is not None or not np.all(xs[:-1] <= xs[1:]):
+        raise UntraceableError("numpy.interp has a period, or coordinates that fall")
+    sides = ys[0] if left is None else left, ys[-1] if right is None else right
+    ends = [_known(graph, side) for side in sides]
+    table = np.concatenate([xs, ys, np.array(ends, np.float64)])
+    number = _place_table(graph, table)
+    floats, double = as_symbols(graph, x).cast(np.float64), np.dtype(np.float64)
 
     def fold(values: Any) -> Any:
-        return np.interp(values, xs, ys, left, right)
+        return np.interp(values, xs, ys, *ends)
 
     cells = each(
-        lambda cell: graph.compute("interpolate", number, (cell,), np.dtype(np.float64), fold),
-        floats.cells,
+        lambda cell: graph.compute("interpolate", number, (cell,), double, fold), floats.cells
     )
-    return Symbols(graph, cells, np.float64)
+    return Symbols(graph, cells, double)
 
 
 def _known(graph: Graph, part: Any) -> Any:
@@ -274,21 +247,10 @@ def _known(graph: Graph, part: Any) -> Any:
     return np.array(values, symbols.dtype).reshape(symbols.shape)
 
 
-def _repeated(x: Any, xs: Any, ys: Any, period: float) -> tuple[Any, Any, Any]:
-    """The argument and the table of ``numpy.interp`` for values that repeat."""
-    xs = xs % period
-    order = np.argsort(xs)
-    xs, ys = xs[order], ys[order]
-    longer = np.concatenate([xs[-1:] - period, xs, xs[:1] + period])
-    return x % period, longer, np.concatenate([ys[-1:], ys, ys[:1]])
-
-
 handlers.update(index=look_up)
 
 FUNCTIONS: Final[Mapping[Any, Any]] = {
     np.take: _take,
-    np.take_along_axis: _take_along_axis,
-    np.choose: _choose,
     np.searchsorted: _searchsorted,
     np.digitize: _digitize,
     np.interp: _interp,

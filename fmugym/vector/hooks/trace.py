@@ -25,7 +25,7 @@ from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
-from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.program import TYPES, Program, UntraceableError, letter_of
 from fmugym.vector.hooks.results import type_of_variable
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
@@ -80,8 +80,8 @@ class TracedTask:
         updated: The names of the variables that ``_update`` writes.
         left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
             what they return.
-        is_inexact: Whether the last bits may differ from those of hooks on arrays, because there
-            are products of matrices.
+        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
+            one: 0 if there are no functions of the C library and no products of matrices.
     """
 
     inputs: Program
@@ -90,7 +90,7 @@ class TracedTask:
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
     left: Mapping[str, str]
-    is_inexact: bool = False
+    tolerance: float = 0.0
 
     def loads(self, kind: str) -> bool:
         """Whether one of the programs loads values of this kind."""
@@ -112,6 +112,8 @@ def trace_hooks(
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
+    if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
+        raise UntraceableError(f"its actions are {env.action_space.dtype}")
     with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
         return Tracer(env, attributes).task()
 
@@ -149,7 +151,7 @@ class Tracer:
     def _traced(self) -> TracedTask:
         self._left = {}
         inputs = self._trace_inputs()
-        has_inexact_inputs = self._graph.is_inexact
+        tolerance = self._graph.tolerance
         self._begin(judging=True)
         stores, updated = self._trace_update()
         done = int(self._call("_is_done", self._flag_node))
@@ -162,7 +164,7 @@ class Tracer:
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
-        return TracedTask(*parts, has_inexact_inputs or self._graph.is_inexact)
+        return TracedTask(*parts, max(tolerance, self._graph.tolerance))
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
