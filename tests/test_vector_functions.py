@@ -84,7 +84,11 @@ COMPILED = {
     **dict.fromkeys(("cbrt", "hypot"), "dfq"),
     **dict.fromkeys(("power", "fmod", "reciprocal"), "df"),
     **dict.fromkeys(("bitwise_or", "invert"), "?"),
-    **{"add": "dfq?", "multiply": "dfq?", "divide": "dfq?", "right_shift": "q", "conjugate": "dfq"},
+    "add": "dfq?",
+    "multiply": "dfq?",
+    "divide": "dfq?",
+    "right_shift": "q",
+    "conjugate": "dfq",
 }
 """For which types functions of numpy are compiled; all others are refused."""
 

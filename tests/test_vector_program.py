@@ -92,7 +92,7 @@ LEAVES = (
     *("0.3", "-2", "1", "np.float32(0.7)", "np.int64(3)", "True", "-0.0", "np.nan"),
 )
 UNARY = (
-    *("-({})", "abs({})", "+({})", "({}) ** 2", "({}) ** 0.5", "np.sqrt({})", "np.square({})"),
+    *("-({})", "abs({})", "+({})", "({}) ** 2", "np.sqrt({})", "np.square({})"),
     *("np.floor({})", "np.rint({})", "np.trunc({})", "np.sign({})", "np.isnan({})"),
     *("np.isinf({})", "np.logical_not({})", "np.float64({})", "np.asarray({}, np.float32)"),
     *("np.reciprocal(1.5 + {})", "np.deg2rad({})", "np.round(1.0 * ({}), 2)"),
