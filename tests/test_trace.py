@@ -129,7 +129,7 @@ def array(self):
 
 
 def sorted_(self):
-    return np.sort([self.state[0], self.state[1]], axis=0)[0] > 1.0
+    return np.sort(self.state, axis=0)[0] > 1.0
 
 
 def mixed(self):

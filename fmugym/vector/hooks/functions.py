@@ -21,12 +21,10 @@ from fmugym.vector.hooks.symbols import (
     each,
     graph_of,
     handlers,
-    has_symbols,
     lift,
-    stand_in,
 )
 
-__all__ = ["full_like"]
+__all__ = ["COMPOSED", "full_like"]
 
 # Functions element by element.
 
@@ -41,7 +39,7 @@ def call_ufunc(
     if ufunc is np.matmul and method == "__call__":
         result = products.matmul(*inputs, **keywords)
     elif method == "__call__" and ufunc.nout == 1 and ufunc.signature is None:
-        result = _applied(graph, ufunc, inputs, out, **keywords)
+        result = _applied(graph, ufunc, inputs, **keywords)
     elif method == "reduce":
         result = _reduced(graph, ufunc, *inputs, **keywords)
     else:
@@ -59,11 +57,19 @@ def _into(out: Any, result: Symbols) -> Any:
     return out
 
 
-def _kind_of(value: Any) -> Any:
+def _kind_of(graph: Graph, value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
     if isinstance(value, Symbols) and value.weak is not None:
         return value.weak
-    return type(value) if type(value) in (int, float) else np.asarray(value).dtype
+    return type(value) if type(value) in (int, float) else as_symbols(graph, value).dtype
+
+
+def _type_of(graph: Graph, values: Sequence[Any]) -> np.dtype[Any]:
+    """The type to which numpy converts all of some values."""
+    kinds = [_kind_of(graph, value) for value in values]
+    dtype = np.result_type(*(kind(1) if isinstance(kind, type) else kind for kind in kinds))
+    letter_of(dtype)
+    return dtype
 
 
 def _operand(graph: Graph, value: Any, dtype: np.dtype[Any]) -> Symbols:
@@ -72,33 +78,30 @@ def _operand(graph: Graph, value: Any, dtype: np.dtype[Any]) -> Symbols:
     return as_symbols(graph, value).cast(dtype)
 
 
-def _symbols_of(graph: Graph, value: Any) -> Any:
-    is_list = isinstance(value, list | tuple)
-    return as_symbols(graph, value) if is_list and has_symbols(value) else value
-
-
 def _applied(
     graph: Graph,
     ufunc: Any,
     inputs: tuple[Any, ...],
-    out: Any = None,
     dtype: Any = None,
     casting: Any = "same_kind",
     where: Any = True,
     subok: bool = True,
 ) -> Symbols:
-    inputs = tuple(_symbols_of(graph, value) for value in inputs)
-    *types, result = _types_of(ufunc, inputs, dtype)
+    if where is not True:
+        raise UntraceableError(f"it uses numpy.{ufunc.__name__} with where: use numpy.where")
+    *types, result = _types_of(graph, ufunc, inputs, dtype)
     operands = [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
     values = _computed(graph, ufunc, operands, result)
     if values.dtype != result:
         raise UntraceableError(f"it uses numpy.{ufunc.__name__} of {types[0]}")
-    return values if where is True else _where_else(ufunc, where, values, out)
+    return values
 
 
-def _types_of(ufunc: Any, inputs: tuple[Any, ...], dtype: Any) -> tuple[np.dtype[Any], ...]:
+def _types_of(
+    graph: Graph, ufunc: Any, inputs: tuple[Any, ...], dtype: Any
+) -> tuple[np.dtype[Any], ...]:
     """The types of the loop that numpy would choose, the result last."""
-    kinds = [_kind_of(value) for value in inputs]
+    kinds = [_kind_of(graph, value) for value in inputs]
     signature = {} if dtype is None else {"signature": (*(None for _ in inputs), np.dtype(dtype))}
     types: tuple[np.dtype[Any], ...] = ufunc.resolve_dtypes((*kinds, None), **signature)
     for one in types:
@@ -183,13 +186,6 @@ _COMPOSED_UFUNCS: Final[Mapping[Any, Callable[..., Any]]] = {
 """Functions that others make up, of values without an operation of their own."""
 
 
-def _where_else(ufunc: Any, where: Any, values: Symbols, out: Any) -> Symbols:
-    """The values where a condition holds; what was in the output array elsewhere."""
-    if out is None:
-        raise UntraceableError(f"it uses numpy.{ufunc.__name__} with where, but without out")
-    return _where(where, values.cast(out.dtype), out)
-
-
 def _reduced(
     graph: Graph,
     ufunc: Any,
@@ -237,7 +233,7 @@ def call_function(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]
         return own(*args, **keywords)
     if function in _REARRANGING:
         return _rearranged(function, args, keywords)
-    if function in _COMPOSED:
+    if function in COMPOSED:
         return function._implementation(*args, **keywords)
     raise UntraceableError(f"it uses {function.__module__}.{function.__name__}")
 
@@ -265,19 +261,16 @@ def _broadcast_arrays(*arrays: Any, subok: bool = False) -> Any:
 
 def _where(condition: Any, first: Any, second: Any) -> Symbols:
     graph = graph_of(condition, first, second)
-    dummies = [stand_in(graph, value) for value in (first, second)]
-    dtype = np.where(np.ones(1, np.bool_), *dummies).dtype
-    letter_of(dtype)
+    dtype = _type_of(graph, (first, second))
     chosen = as_symbols(graph, condition).cast(np.bool_)
-    values = [_operand(graph, _symbols_of(graph, value), dtype) for value in (first, second)]
+    values = [_operand(graph, value, dtype) for value in (first, second)]
     cells = each(graph.choose, chosen.cells, *(one.cells for one in values))
     return Symbols(graph, cells, dtype)
 
 
 def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
     graph = graph_of(condlist, choicelist, default)
-    values = [*choicelist, default]
-    dtype = np.result_type(*(stand_in(graph, value) for value in values))
+    dtype = _type_of(graph, [*choicelist, default])
     result: Any = as_symbols(graph, default).cast(dtype)
     for condition, choice in zip(reversed(condlist), reversed(choicelist), strict=True):
         result = _where(condition, as_symbols(graph, choice).cast(dtype), result)
@@ -305,14 +298,10 @@ def full_like(a: Any, fill_value: Any, dtype: Any = None, **_: Any) -> Symbols:
 
 
 def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:  # noqa: A002  (numpy's)
-    """The norm of vectors; numpy computes others with its linear algebra."""
-    if axis is None or np.ndim(axis) != 0 or ord not in (None, 2, 1, np.inf):
-        raise UntraceableError("it uses numpy.linalg.norm without one axis")
+    """The length of vectors; numpy computes others with its linear algebra."""
+    if axis is None or np.ndim(axis) != 0 or ord not in (None, 2):
+        raise UntraceableError("it uses numpy.linalg.norm without one axis, or not of lengths")
     symbols = x if x.dtype.kind == "f" else x.astype(np.float64)
-    if ord == np.inf:
-        return np.max(np.absolute(symbols), axis=axis, keepdims=keepdims)
-    if ord == 1:
-        return np.sum(np.absolute(symbols), axis=axis, keepdims=keepdims)
     return np.sqrt(np.sum(symbols * symbols, axis=axis, keepdims=keepdims))
 
 
@@ -367,9 +356,9 @@ _REARRANGING: Final = frozenset(
 )
 """Functions whose first argument is an array or a list of arrays, and that move elements."""
 
-_COMPOSED: Final = frozenset(
+COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
     | {np.round, np.around, np.clip, np.ptp, np.diff, np.polyval, np.isclose, np.append}
-    | {np.average, np.fix, np.count_nonzero, getattr(np, "trapezoid", None), np.gradient}
+    | {np.average, np.fix, np.count_nonzero}
 )
 """Functions that numpy composes of others."""

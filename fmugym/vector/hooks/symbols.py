@@ -32,7 +32,6 @@ __all__ = [
     "same_cells",
     "same_for_all",
     "spread",
-    "stand_in",
     "writeable",
 ]
 
@@ -327,15 +326,6 @@ def as_symbols(graph: Graph, value: Any) -> Symbols:
         dtype = np.result_type(*(part.dtype for part in parts))
         return Symbols(graph, np.stack([part.cast(dtype).cells for part in parts]), dtype)
     return lift(graph, np.asarray(value))
-
-
-def stand_in(graph: Graph, value: Any) -> Any:
-    """A number or array of the same type, of which numpy makes the same type of result."""
-    if type(value) in (int, float, bool):
-        return value
-    if isinstance(value, Symbols) and value.weak is not None:
-        return value.weak(1)
-    return np.ones(1, as_symbols(graph, value).dtype)
 
 
 def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
