@@ -123,8 +123,8 @@ def _computed(
         wide = [one.cast(wider) for one in operands]
         kept = wider if result == np.float32 else result
         return _computed(graph, ufunc, wide, kept).cast(result)
-    if is_wider and ufunc in _COMPOSED_UFUNCS:
-        composed: Symbols = _COMPOSED_UFUNCS[ufunc](*operands)
+    if is_wider and ufunc in _MADE_OF:
+        composed: Symbols = _MADE_OF[ufunc](*operands)
         return composed
     cells = [one.cells for one in operands]
     return Symbols(graph, each(lambda *some: graph.apply(ufunc, some, result), *cells), result)
@@ -165,7 +165,7 @@ def _whole_power(base: Any, exponent: Any) -> Any:
 
 _LARGEST_POWER: Final = 64
 
-_COMPOSED_UFUNCS: Final[Mapping[Any, Callable[..., Any]]] = {
+_MADE_OF: Final[Mapping[Any, Callable[..., Any]]] = {
     **dict.fromkeys((np.floor, np.ceil, np.trunc, np.conjugate), _same),
     **dict.fromkeys((np.degrees, np.rad2deg), lambda x: x * _ratio(x, 180.0, np.pi)),
     **dict.fromkeys((np.radians, np.deg2rad), lambda x: x * _ratio(x, np.pi, 180.0)),
