@@ -193,6 +193,22 @@ def test_hooks_with_rare_functions_run_on_arrays_beside_compiled_ones(reason, ca
     theirs.close()
 
 
+class Differing(Arithmetic):
+    """Its truncation is another one as a program, as if it hung on the last bit of a sine."""
+
+    def _is_truncated(self):
+        return super()._is_truncated() ^ isinstance(self.state, Symbols)
+
+
+def test_a_program_that_differs_leaves_only_its_own_hook_to_arrays(caplog):
+    with caplog.at_level("INFO", "fmugym"):
+        require_pair_equal(Differing, steps=40, hooks="auto")
+        envs = FMUVectorEnv(Differing, 3)
+    assert "the program gives other values than _is_truncated. It runs on arrays" in caplog.text
+    assert list(envs._engine._task.left) == ["_is_truncated"]
+    envs.close()
+
+
 def test_why_hooks_are_not_compiled_stands_in_the_log(caplog):
     with caplog.at_level("INFO", "fmugym"):
         FMUVectorEnv(Branching, 2).close()

@@ -15,7 +15,13 @@ from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.graph import TOLERANCES
-from fmugym.vector.hooks.program import Row, UntraceableError, evaluate, writes_variable
+from fmugym.vector.hooks.program import (
+    DifferenceError,
+    Row,
+    UntraceableError,
+    evaluate,
+    writes_variable,
+)
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.views import copied
 
@@ -25,10 +31,10 @@ __all__ = ["require_same"]
 def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
     """Run programs in C and hooks on arrays, and compare all results.
 
-    They must be equal to the last bit, zeros of different sign are not; NaNs are. Where hooks use
-    functions of the C library or multiply matrices, floats may differ by the tolerance of the task,
-    times the largest of all results. Booleans and integers may not: where a flag or a count
-    depends on such a last bit, the hooks run on arrays.
+    They must be equal to the last bit: NaNs are equal, zeros of different sign are not. Where hooks
+    use functions of the C library or multiply matrices, floats may differ by the tolerance of the
+    task, times the largest of all results. Booleans and integers may not: a flag that hangs on
+    such a last bit is no program's.
 
     Args:
         env: The environment with the hooks.
@@ -36,7 +42,8 @@ def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
         task: The programs.
 
     Raises:
-        UntraceableError: If a result differs.
+        DifferenceError: If a result differs.
+        UntraceableError: If another hook than ``_update`` writes a variable.
     """
     own = copied(batch)
     with np.errstate(all="ignore"), borrowed(env, outside=True), reading(env, own):
@@ -171,7 +178,7 @@ class _Comparison:
     ) -> None:
         tolerance = self._task.tolerance
         if not _equal(value, expected) and not _nearly_equal(value, expected, tolerance):
-            raise UntraceableError(f"the program gives other values than {hook}")
+            raise DifferenceError(hook)
 
 
 def _equal(value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> bool:

@@ -20,6 +20,7 @@ from fmugym.pool.extension import has_native_pool
 __all__ = [
     "OPERATIONS",
     "TYPES",
+    "DifferenceError",
     "Program",
     "UntraceableError",
     "evaluate",
@@ -92,6 +93,18 @@ if has_native_pool():
 
 class UntraceableError(Exception):
     """A hook does what a program cannot do."""
+
+
+class DifferenceError(UntraceableError):
+    """The program of a hook gives other values than the hook.
+
+    Args:
+        hook: Its name.
+    """
+
+    def __init__(self, hook: str) -> None:
+        super().__init__(f"the program gives other values than {hook}")
+        self.hook = hook
 
 
 def writes_variable(name: str) -> str:

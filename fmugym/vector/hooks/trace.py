@@ -98,13 +98,16 @@ class TracedTask:
 
 
 def trace_hooks(
-    env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+    env: FMUEnv,
+    attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
+    refused: Mapping[str, str] = MappingProxyType({}),
 ) -> TracedTask:
     """Trace the hooks of an environment.
 
     Args:
         env: A prototype whose actions make an array.
         attributes: Those that have one number for each environment, by name.
+        refused: Hooks that are not to be traced, and why.
 
     Raises:
         UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
@@ -115,7 +118,7 @@ def trace_hooks(
     if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
         raise UntraceableError(f"its actions are {env.action_space.dtype}")
     with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
-        return Tracer(env, attributes).task()
+        return Tracer(env, attributes, refused).task()
 
 
 class Tracer:
@@ -124,10 +127,16 @@ class Tracer:
     Args:
         env: The prototype.
         attributes: Those that have one number for each environment.
+        refused: Hooks that are not to be traced, and why.
     """
 
-    def __init__(self, env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]]) -> None:
-        self._env, self._attributes = env, attributes
+    def __init__(
+        self,
+        env: FMUEnv,
+        attributes: Mapping[str, npt.NDArray[Any]],
+        refused: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self._env, self._attributes, self._refused = env, attributes, refused
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
@@ -178,6 +187,8 @@ class Tracer:
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make nodes of what it returns."""
+        if name in self._refused:
+            raise UntraceableError(self._refused[name])
         with in_hook(self._env, name):
             with numpy_of(self._graph), np.errstate(all="ignore"):
                 value = getattr(self._env, name)()
