@@ -409,13 +409,23 @@ def to_integer(variable: Any, value: Any) -> Any:
     low, high = variable.integer_limits
     largest = 2.0**53
     rounded: Any = np.rint(value) + 0.0  # an integer has no negative zero
-    items = {item for _, item in variable.items}
+    items = [item for _, item in variable.items]
     if items:
         low, high = min(items), max(items)
-    if items and len(items) <= high - low:
-        raise UntraceableError(f"{variable.name!r} does not have all items from {low} to {high}")
+        rounded = _nearest(items, rounded)
     within = (rounded >= float(max(low, -largest))) & (rounded <= float(min(high, largest)))
     return np.where(within, rounded, np.where(np.isfinite(value), np.nan, value))
+
+
+def _nearest(items: list[int], value: Any) -> Any:
+    """The nearest of some items, the first of those that are as near; others stay."""
+    if set(items) == set(range(min(items), max(items) + 1)):
+        return value
+    nearest: Any = np.full_like(value, float(items[0]))
+    for item in items[1:]:
+        nearest = np.where(abs(item - value) < abs(nearest - value), float(item), nearest)
+    inside = (value >= min(items)) & (value <= max(items))
+    return np.where(inside, nearest, value)
 
 
 @contextmanager
