@@ -29,7 +29,7 @@ from tables import Table, duration, times
 
 import fmugym
 from fmugym.task.interface import resolve
-from fmugym.vector.hooks.program import OPERATIONS
+from fmugym.vector.hooks.program import OPERATIONS, is_function
 
 __all__ = ["TASKS", "Task", "fmugym_run", "per_env_runs", "tables"]
 
@@ -141,9 +141,9 @@ def _allowed(operation: str) -> float:
     """The time in ns that an operation may take; moving values belongs to the environment."""
     if operation.startswith(("load_", "store_")):
         return 0.0
-    if operation.startswith("scalar_power") or operation == "call_square":
+    if operation.startswith("power"):
         return 60.0
-    return 30.0 if operation in {"call", "call_sine", "call_cosine"} else 1.0
+    return 30.0 if is_function(operation) else 1.0
 
 
 def _rest(seconds: dict[str, float], size: int, each: float) -> str:

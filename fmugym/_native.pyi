@@ -42,9 +42,6 @@ def evaluate(
         Whether an index was outside of its table.
     """
 
-def is_free_loop(capsule: object, /) -> bool:
-    """Whether a loop of numpy, from ``_get_strided_loop``, can run without the GIL."""
-
 def distributions() -> tuple[str, ...]:
     """The kinds of distributions, in the order of their numbers."""
 

@@ -22,84 +22,69 @@
     }                                                                                              \
     break
 
-/* Integers wrap around, as those of numpy do. */
-#define WRAPPED(expression) (int64_t)(expression)
+/* Integers wrap around, as those of numpy do, if they are added without their sign. */
+#define ARITHMETIC_OF(T, Type, Added)                                                              \
+    case ADD_##T:                                                                                  \
+        EACH(Added, Type, (Type)(x[j] + y[j]));                                                    \
+    case SUBTRACT_##T:                                                                             \
+        EACH(Added, Type, (Type)(x[j] - y[j]));                                                    \
+    case MULTIPLY_##T:                                                                             \
+        EACH(Added, Type, (Type)(x[j] * y[j]));                                                    \
+    case MINIMUM_##T:                                                                              \
+        EACH(Type, Type, x[j] < y[j] || x[j] != x[j] ? x[j] : y[j]);                               \
+    case MAXIMUM_##T:                                                                              \
+        EACH(Type, Type, x[j] > y[j] || x[j] != x[j] ? x[j] : y[j]);                               \
+    case LESS_##T:                                                                                 \
+        EACH(Type, uint8_t, x[j] < y[j]);                                                          \
+    case LESS_EQUAL_##T:                                                                           \
+        EACH(Type, uint8_t, x[j] <= y[j]);                                                         \
+    case GREATER_##T:                                                                              \
+        EACH(Type, uint8_t, x[j] > y[j]);                                                          \
+    case GREATER_EQUAL_##T:                                                                        \
+        EACH(Type, uint8_t, x[j] >= y[j]);                                                         \
+    case EQUAL_##T:                                                                                \
+        EACH(Type, uint8_t, x[j] == y[j]);                                                         \
+    case NOT_EQUAL_##T:                                                                            \
+        EACH(Type, uint8_t, x[j] != y[j])
 
 WIDE void operation_compute(uint16_t operation, const void *first, const void *second,
                             const void *third, size_t blocks, void *to) {
     switch (operation) {
-    case ADD_D:
-        EACH(double, double, x[j] + y[j]);
-    case SUBTRACT_D:
-        EACH(double, double, x[j] - y[j]);
-    case MULTIPLY_D:
-        EACH(double, double, x[j] * y[j]);
-    case DIVIDE_D:
-        EACH(double, double, x[j] / y[j]);
-    case SQUARE_D:
-        EACH(double, double, x[j] * x[j]);
+        ARITHMETIC_OF(D, double, double);
+        ARITHMETIC_OF(F, float, float);
+        ARITHMETIC_OF(Q, int64_t, uint64_t);
     case NEGATIVE_D:
         EACH(double, double, -x[j]);
-    case ABSOLUTE_D:
-        EACH(double, double, fabs(x[j]));
-    case SQRT_D:
-        EACH(double, double, sqrt(x[j]));
-    case MINIMUM_D:
-        EACH(double, double, x[j] < y[j] || isnan(x[j]) ? x[j] : y[j]);
-    case MAXIMUM_D:
-        EACH(double, double, x[j] > y[j] || isnan(x[j]) ? x[j] : y[j]);
-    case LESS_D:
-        EACH(double, uint8_t, x[j] < y[j]);
-    case LESS_EQUAL_D:
-        EACH(double, uint8_t, x[j] <= y[j]);
-    case GREATER_D:
-        EACH(double, uint8_t, x[j] > y[j]);
-    case GREATER_EQUAL_D:
-        EACH(double, uint8_t, x[j] >= y[j]);
-    case EQUAL_D:
-        EACH(double, uint8_t, x[j] == y[j]);
-    case NOT_EQUAL_D:
-        EACH(double, uint8_t, x[j] != y[j]);
-    case ADD_F:
-        EACH(float, float, x[j] + y[j]);
-    case SUBTRACT_F:
-        EACH(float, float, x[j] - y[j]);
-    case MULTIPLY_F:
-        EACH(float, float, x[j] * y[j]);
-    case DIVIDE_F:
-        EACH(float, float, x[j] / y[j]);
-    case SQUARE_F:
-        EACH(float, float, x[j] * x[j]);
     case NEGATIVE_F:
         EACH(float, float, -x[j]);
+    case NEGATIVE_Q:
+        EACH(uint64_t, int64_t, (int64_t)(0 - x[j]));
+    case DIVIDE_D:
+        EACH(double, double, x[j] / y[j]);
+    case DIVIDE_F:
+        EACH(float, float, x[j] / y[j]);
+    case ABSOLUTE_D:
+        EACH(double, double, fabs(x[j]));
     case ABSOLUTE_F:
         EACH(float, float, fabsf(x[j]));
+    case SQRT_D:
+        EACH(double, double, sqrt(x[j]));
     case SQRT_F:
         EACH(float, float, sqrtf(x[j]));
-    case MINIMUM_F:
-        EACH(float, float, x[j] < y[j] || isnan(x[j]) ? x[j] : y[j]);
-    case MAXIMUM_F:
-        EACH(float, float, x[j] > y[j] || isnan(x[j]) ? x[j] : y[j]);
-    case ADD_Q:
-        EACH(uint64_t, int64_t, WRAPPED(x[j] + y[j]));
-    case SUBTRACT_Q:
-        EACH(uint64_t, int64_t, WRAPPED(x[j] - y[j]));
-    case MULTIPLY_Q:
-        EACH(uint64_t, int64_t, WRAPPED(x[j] * y[j]));
-    case NEGATIVE_Q:
-        EACH(uint64_t, int64_t, WRAPPED(0 - x[j]));
-    case LESS_Q:
-        EACH(int64_t, uint8_t, x[j] < y[j]);
-    case LESS_EQUAL_Q:
-        EACH(int64_t, uint8_t, x[j] <= y[j]);
-    case GREATER_Q:
-        EACH(int64_t, uint8_t, x[j] > y[j]);
-    case GREATER_EQUAL_Q:
-        EACH(int64_t, uint8_t, x[j] >= y[j]);
-    case EQUAL_Q:
-        EACH(int64_t, uint8_t, x[j] == y[j]);
-    case NOT_EQUAL_Q:
-        EACH(int64_t, uint8_t, x[j] != y[j]);
+    case FLOOR_D:
+        EACH(double, double, floor(x[j]));
+    case CEIL_D:
+        EACH(double, double, ceil(x[j]));
+    case TRUNC_D:
+        EACH(double, double, trunc(x[j]));
+    case RINT_D:
+        EACH(double, double, rint(x[j]));
+    case BITWISE_AND_Q:
+        EACH(int64_t, int64_t, x[j] & y[j]);
+    case BITWISE_XOR_Q:
+        EACH(int64_t, int64_t, x[j] ^ y[j]);
+    case RIGHT_SHIFT_Q:
+        EACH(int64_t, int64_t, x[j] >> ((uint64_t)y[j] < 64 ? y[j] : 63));
     case AND:
         EACH(uint8_t, uint8_t, x[j] & y[j]);
     case OR:
@@ -112,25 +97,7 @@ WIDE void operation_compute(uint16_t operation, const void *first, const void *s
         CHOOSE(uint64_t);
     case WHERE_4:
         CHOOSE(uint32_t);
-    case WHERE_2:
-        CHOOSE(uint16_t);
     default:
         CHOOSE(uint8_t);
-    }
-}
-
-/* The power of scalars, which is that of the C library in Python and in numpy. */
-void operation_power(uint16_t operation, size_t count, const void *bases, const void *exponents,
-                     Register *to) {
-    if (operation == POWER_D) {
-        const double *base = bases, *exponent = exponents;
-        for (size_t j = 0; j < count; j++) {
-            to->doubles[j] = pow(base[j], exponent[j]);
-        }
-        return;
-    }
-    const float *base = bases, *exponent = exponents;
-    for (size_t j = 0; j < count; j++) {
-        to->floats[j] = powf(base[j], exponent[j]);
     }
 }

@@ -24,10 +24,14 @@ void program_prepare(const Program *program, Register *memory, Registers *regist
     }
 }
 
+static size_t size_of_result(Instruction i) {
+    return i.operation == POWER_F ? sizeof(float) : sizeof(double);
+}
+
 /* The operations that are neither moves nor arithmetic. */
-static size_t run_other(const Evaluation *e, const Instruction *next) {
-    const Instruction i = *next;
+static void run_other(const Evaluation *e, Instruction i) {
     const void *first = e->registers->places[i.a];
+    const Table *table = &e->program->tables[i.extra];
     Register *to = &e->registers->own[i.to];
 
     switch (i.operation) {
@@ -35,78 +39,66 @@ static size_t run_other(const Evaluation *e, const Instruction *next) {
         operation_cast(i.extra, first, e->lanes / PROGRAM_BLOCK, to);
         break;
     case TAKE:
-        operation_take(&e->program->tables[i.extra], first, e->count, (char *)to->bytes, e->notes);
-        clear_rest(to, e->count, e->lanes, e->program->tables[i.extra].size);
+        operation_take(table, first, e->count, (char *)to->bytes, e->notes);
+        clear_rest(to, e->count, e->lanes, table->size);
         break;
     case INTERPOLATE:
-        operation_interpolate(&e->program->tables[i.extra], first, e->count, to->doubles);
+        operation_interpolate(table, first, e->count, to->doubles);
         clear_rest(to, e->count, e->lanes, sizeof(double));
         break;
-    case POWER_D:
-    case POWER_F:
-        operation_power(i.operation, e->count, first, e->registers->places[i.b], to);
-        clear_rest(to, e->count, e->lanes,
-                   i.operation == POWER_D ? sizeof(double) : sizeof(float));
-        break;
     default:
-        return operation_call(e, next);
+        operation_call(i.operation, first, e->registers->places[i.b], e->count, to);
+        clear_rest(to, e->count, e->lanes, size_of_result(i));
     }
-    return 1;
 }
 
-/* Whether these values of a run are all the same, bit by bit. Most that differ do so at once. */
-static bool are_same(const void *values, size_t count, size_t size) {
+/* Whether these values of 8 bytes are all the same in a run. Most that differ do so at once. */
+static bool are_same(const void *values, size_t count) {
+    const size_t size = sizeof(double);
     return memcmp(values, (const char *)values + size, (count - 1) * size) == 0;
 }
 
 /* Whether an operation takes much time, and would compute the same for all of a run. */
 static bool is_shared(const Evaluation *e, Instruction i) {
     const void *const *places = e->registers->places;
-    const size_t size = sizeof(double); /* these operations take nothing else */
+    const bool has_two = i.operation >= ARCTAN2;
 
-    switch (i.operation) {
-    case INTERPOLATE:
-    case CALL_SINE:
-    case CALL_COSINE:
-        return are_same(places[i.a], e->count, size);
-    case CALL_REMAINDER:
-    case POWER_D:
-        return are_same(places[i.a], e->count, size) && are_same(places[i.b], e->count, size);
-    default:
+    if ((i.operation < SIN && i.operation != INTERPOLATE) || i.operation == POWER_F) {
         return false;
     }
+    return are_same(places[i.a], e->count) && (!has_two || are_same(places[i.b], e->count));
 }
 
 /* Computes what is the same for all of a run once: what depends on nothing but the time often is. */
-static size_t run_once(const Evaluation *e, const Instruction *next) {
+static void run_once(const Evaluation *e, Instruction i) {
     Evaluation once = *e;
-    double *to = e->registers->own[next->to].doubles;
+    uint64_t *to = (uint64_t *)(void *)e->registers->own[i.to].bytes;
 
     once.count = 1;
     once.lanes = PROGRAM_BLOCK;
-    const size_t done = run_other(&once, next);
+    run_other(&once, i);
     for (size_t j = 1; j < e->lanes; j++) {
         to[j] = to[0];
     }
-    return done;
 }
 
-static inline size_t run_one(const Evaluation *e, const Instruction *next) {
-    const Instruction i = *next;
+static inline void run_one(const Evaluation *e, Instruction i) {
     const void **places = e->registers->places;
     Register *to = &e->registers->own[i.to];
 
-    if (i.operation < CALL) {
+    if (i.operation < CAST) {
         operation_move(e, i);
-        return 1;
+        return;
     }
     places[i.to] = to;
-    if (i.operation < ADD_D || i.operation >= POWER_D) {
-        return e->count > 1 && is_shared(e, i) ? run_once(e, next) : run_other(e, next);
+    if (i.operation >= ADD_D && i.operation < SIN) {
+        operation_compute(i.operation, places[i.a], places[i.b], places[i.c],
+                          e->lanes / PROGRAM_BLOCK, to);
+    } else if (e->count > 1 && is_shared(e, i)) {
+        run_once(e, i);
+    } else {
+        run_other(e, i);
     }
-    operation_compute(i.operation, places[i.a], places[i.b], places[i.c], e->lanes / PROGRAM_BLOCK,
-                      to);
-    return 1;
 }
 
 static inline size_t whole_blocks(size_t count) {
@@ -116,9 +108,8 @@ static inline size_t whole_blocks(size_t count) {
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers *registers, Notes *notes) {
     const Evaluation e = {program, source, begin, count, whole_blocks(count), registers, notes};
-    const Instruction *end = program->code + program->length;
 
-    for (const Instruction *next = program->code; next < end;) {
-        next += run_one(&e, next);
+    for (size_t i = 0; i < program->length; i++) {
+        run_one(&e, program->code[i]);
     }
 }

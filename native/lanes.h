@@ -22,11 +22,4 @@ enum {
         statement;                                                                                 \
     }
 
-/* The upper half of a number's digits (G. W. Veltkamp, T. J. Dekker 1971). The product of two such
- * halves is exact. */
-static inline double upper_half(double x) {
-    const double shifted = x * 134217729.0;
-    return shifted - (shifted - x);
-}
-
 #endif

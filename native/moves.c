@@ -5,7 +5,6 @@
 #include <string.h>
 
 #include "fmi.h"
-#include "halves.h"
 #include "platform.h"
 
 #define EACH_ITEM(size, type)                                                                      \
@@ -29,7 +28,6 @@ static void copy_values(void *to, size_t to_step, const void *from, size_t from_
     switch (size) {
         EACH_ITEM(8, uint64_t)
         EACH_ITEM(4, uint32_t)
-        EACH_ITEM(2, uint16_t)
         EACH_ITEM(1, uint8_t)
     }
 }
@@ -95,7 +93,7 @@ static void load_stopped(const Evaluation *e, uint8_t *to) {
     }
 }
 
-static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
+static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 1};
 
 /* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \
@@ -111,12 +109,6 @@ static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 
 
 NOTE_NOT_FINITE(double, note_not_finite, int64_t, fabs, DBL_MAX)
 NOTE_NOT_FINITE(float, note_not_finite32, int32_t, fabsf, FLT_MAX)
-
-static void note_not_finite16(const Half *values, size_t count, Notes *notes) {
-    for (size_t j = 0; j < count; j++) {
-        notes->not_finite[j] |= !half_is_finite(values[j]);
-    }
-}
 
 void program_clear_seen(const Program *program, char *const *seen, size_t index) {
     for (size_t i = 0; i < program->number_of_slots; i++) {
@@ -141,8 +133,6 @@ static void store_seen(const Evaluation *e, const Slot *slot, const void *from) 
         note_not_finite(from, e->count, e->notes);
     } else if (slot->type == VALUE_FLOAT) {
         note_not_finite32(from, e->count, e->notes);
-    } else if (slot->type == VALUE_HALF) {
-        note_not_finite16(from, e->count, e->notes);
     }
 }
 

@@ -29,10 +29,6 @@ static inline void clear_rest(void *values, size_t count, size_t lanes, size_t s
 /* moves.c: moves values between registers and memory that is not the program's. */
 void operation_move(const Evaluation *e, Instruction i);
 
-/* numpy_loops.c: calls a loop of numpy with all values, or with the few that need it. Returns how
- * many instructions it has done: the sine and the cosine of the same values are computed at once. */
-size_t operation_call(const Evaluation *e, const Instruction *next);
-
 /* casts.c */
 void operation_cast(uint16_t types, const void *from, size_t blocks, void *to);
 
@@ -44,7 +40,9 @@ void operation_interpolate(const Table *table, const double *x, size_t count, do
 /* arithmetic.c */
 void operation_compute(uint16_t operation, const void *first, const void *second,
                        const void *third, size_t blocks, void *to);
-void operation_power(uint16_t operation, size_t count, const void *bases, const void *exponents,
-                     Register *to);
+
+/* functions.c: those of the C library, and what else takes longer. */
+void operation_call(uint16_t operation, const void *first, const void *second, size_t count,
+                    void *to);
 
 #endif

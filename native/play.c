@@ -4,7 +4,6 @@
 #include <math.h>
 #include <string.h>
 
-#include "halves.h"
 #include "platform.h"
 
 enum { DONE, TRUNCATED, REWARD };
@@ -20,20 +19,17 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
 }
 
 /* The notes are as wide as the values, so that the compiler can vectorize. */
-#define ANY_NAN(Type, name, Whole, is_nan)                                                         \
+#define ANY_NAN(Type, name, Whole)                                                                 \
     WIDE static bool name(const Type *values, size_t count) {                                      \
         Whole any = 0;                                                                             \
         for (size_t i = 0; i < count; i++) {                                                       \
-            any |= is_nan(values[i]);                                                              \
+            any |= values[i] != values[i];                                                         \
         }                                                                                          \
         return any != 0;                                                                           \
     }
 
-#define DIFFERS(value) ((value) != (value))
-
-ANY_NAN(double, is_any_nan, int64_t, DIFFERS)
-ANY_NAN(float, is_any_nan32, int32_t, DIFFERS)
-ANY_NAN(Half, is_any_nan16, int16_t, half_is_nan)
+ANY_NAN(double, is_any_nan, int64_t)
+ANY_NAN(float, is_any_nan32, int32_t)
 
 bool play_has_bad_action(const Turn *turn) {
     const Actions *a = &turn->play->actions;
@@ -47,8 +43,6 @@ bool play_has_bad_action(const Turn *turn) {
         return is_any_nan(actions, count);
     case ACTIONS_FLOAT32:
         return is_any_nan32(actions, count);
-    case ACTIONS_FLOAT16:
-        return is_any_nan16(actions, count);
     default:
         return false;
     }

@@ -15,8 +15,7 @@ typedef enum {
     ACTIONS_ANY,
     ACTIONS_IN_RANGE,
     ACTIONS_FLOAT64,
-    ACTIONS_FLOAT32,
-    ACTIONS_FLOAT16
+    ACTIONS_FLOAT32
 } ActionCheck;
 
 /* The actions of one environment follow each other in memory. */

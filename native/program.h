@@ -12,14 +12,27 @@
 
 enum {
     PROGRAM_REGISTERS = 256, /* maximum number of registers */
-    PROGRAM_RESULTS = 3,     /* maximum number of results */
-    CALL_VALUES = 4          /* maximum number of inputs and outputs of a loop of numpy */
+    PROGRAM_RESULTS = 3      /* maximum number of results */
 };
 
 /* OPERATIONS in fmugym/vector/hooks/program.py lists their names in the same order. Importing
  * that module compares the two. The letters are those of numpy's types: d float64, f float32,
  * q int64. Booleans are bytes, 0 or 1. Those that move values come first; arithmetic is from ADD_D
- * to WHERE_1. */
+ * to WHERE_1; what takes longer is from SIN on, and has one operand until CBRT. */
+#define OPERATIONS_OF(X, T, letter)                                                                \
+    X(ADD_##T, "add " letter)                                                                      \
+    X(SUBTRACT_##T, "subtract " letter)                                                            \
+    X(MULTIPLY_##T, "multiply " letter)                                                            \
+    X(NEGATIVE_##T, "negative " letter)                                                            \
+    X(MINIMUM_##T, "minimum " letter)                                                              \
+    X(MAXIMUM_##T, "maximum " letter)                                                              \
+    X(LESS_##T, "less " letter)                                                                    \
+    X(LESS_EQUAL_##T, "less_equal " letter)                                                        \
+    X(GREATER_##T, "greater " letter)                                                              \
+    X(GREATER_EQUAL_##T, "greater_equal " letter)                                                  \
+    X(EQUAL_##T, "equal " letter)                                                                  \
+    X(NOT_EQUAL_##T, "not_equal " letter)
+
 #define EACH_OPERATION(X)                                                                          \
     X(LOAD_ROW, "load_row")                                                                        \
     X(LOAD_ACTION, "load_action")                                                                  \
@@ -29,60 +42,62 @@ enum {
     X(STORE_ROW, "store_row")                                                                      \
     X(STORE_SEEN, "store_seen")                                                                    \
     X(STORE_FLOATS, "store_floats")                                                                \
-    X(CALL, "call")                                                                                \
-    X(CALL_SQUARE, "call_square")                                                                  \
-    X(CALL_REMAINDER, "call_remainder")                                                            \
-    X(CALL_SINE, "call_sine")                                                                      \
-    X(CALL_COSINE, "call_cosine")                                                                  \
     X(CAST, "cast")                                                                                \
     X(TAKE, "take")                                                                                \
     X(INTERPOLATE, "interpolate")                                                                  \
-    X(ADD_D, "add d")                                                                              \
-    X(SUBTRACT_D, "subtract d")                                                                    \
-    X(MULTIPLY_D, "multiply d")                                                                    \
+    OPERATIONS_OF(X, D, "d")                                                                       \
+    OPERATIONS_OF(X, F, "f")                                                                       \
+    OPERATIONS_OF(X, Q, "q")                                                                       \
     X(DIVIDE_D, "divide d")                                                                        \
-    X(SQUARE_D, "square d")                                                                        \
-    X(NEGATIVE_D, "negative d")                                                                    \
-    X(ABSOLUTE_D, "absolute d")                                                                    \
-    X(SQRT_D, "sqrt d")                                                                            \
-    X(MINIMUM_D, "minimum d")                                                                      \
-    X(MAXIMUM_D, "maximum d")                                                                      \
-    X(LESS_D, "less d")                                                                            \
-    X(LESS_EQUAL_D, "less_equal d")                                                                \
-    X(GREATER_D, "greater d")                                                                      \
-    X(GREATER_EQUAL_D, "greater_equal d")                                                          \
-    X(EQUAL_D, "equal d")                                                                          \
-    X(NOT_EQUAL_D, "not_equal d")                                                                  \
-    X(ADD_F, "add f")                                                                              \
-    X(SUBTRACT_F, "subtract f")                                                                    \
-    X(MULTIPLY_F, "multiply f")                                                                    \
     X(DIVIDE_F, "divide f")                                                                        \
-    X(SQUARE_F, "square f")                                                                        \
-    X(NEGATIVE_F, "negative f")                                                                    \
+    X(ABSOLUTE_D, "absolute d")                                                                    \
     X(ABSOLUTE_F, "absolute f")                                                                    \
+    X(SQRT_D, "sqrt d")                                                                            \
     X(SQRT_F, "sqrt f")                                                                            \
-    X(MINIMUM_F, "minimum f")                                                                      \
-    X(MAXIMUM_F, "maximum f")                                                                      \
-    X(ADD_Q, "add q")                                                                              \
-    X(SUBTRACT_Q, "subtract q")                                                                    \
-    X(MULTIPLY_Q, "multiply q")                                                                    \
-    X(NEGATIVE_Q, "negative q")                                                                    \
-    X(LESS_Q, "less q")                                                                            \
-    X(LESS_EQUAL_Q, "less_equal q")                                                                \
-    X(GREATER_Q, "greater q")                                                                      \
-    X(GREATER_EQUAL_Q, "greater_equal q")                                                          \
-    X(EQUAL_Q, "equal q")                                                                          \
-    X(NOT_EQUAL_Q, "not_equal q")                                                                  \
+    X(FLOOR_D, "floor d")                                                                          \
+    X(CEIL_D, "ceil d")                                                                            \
+    X(TRUNC_D, "trunc d")                                                                          \
+    X(RINT_D, "rint d")                                                                            \
+    X(BITWISE_AND_Q, "bitwise_and q")                                                              \
+    X(BITWISE_XOR_Q, "bitwise_xor q")                                                              \
+    X(RIGHT_SHIFT_Q, "right_shift q")                                                              \
     X(AND, "and")                                                                                  \
     X(OR, "or")                                                                                    \
     X(XOR, "xor")                                                                                  \
     X(NOT, "not")                                                                                  \
     X(WHERE_8, "where 8")                                                                          \
     X(WHERE_4, "where 4")                                                                          \
-    X(WHERE_2, "where 2")                                                                          \
     X(WHERE_1, "where 1")                                                                          \
-    X(POWER_D, "scalar_power d")                                                                   \
-    X(POWER_F, "scalar_power f")
+    X(SIN, "sin d")                                                                                \
+    X(COS, "cos d")                                                                                \
+    X(TAN, "tan d")                                                                                \
+    X(ARCSIN, "arcsin d")                                                                          \
+    X(ARCCOS, "arccos d")                                                                          \
+    X(ARCTAN, "arctan d")                                                                          \
+    X(SINH, "sinh d")                                                                              \
+    X(COSH, "cosh d")                                                                              \
+    X(TANH, "tanh d")                                                                              \
+    X(ARCSINH, "arcsinh d")                                                                        \
+    X(ARCCOSH, "arccosh d")                                                                        \
+    X(ARCTANH, "arctanh d")                                                                        \
+    X(EXP, "exp d")                                                                                \
+    X(EXP2, "exp2 d")                                                                              \
+    X(EXPM1, "expm1 d")                                                                            \
+    X(LOG, "log d")                                                                                \
+    X(LOG2, "log2 d")                                                                              \
+    X(LOG10, "log10 d")                                                                            \
+    X(LOG1P, "log1p d")                                                                            \
+    X(CBRT, "cbrt d")                                                                              \
+    X(ARCTAN2, "arctan2 d")                                                                        \
+    X(HYPOT, "hypot d")                                                                            \
+    X(POWER, "power d")                                                                            \
+    X(POWER_F, "power f")                                                                          \
+    X(FMOD, "fmod d")                                                                              \
+    X(COPYSIGN, "copysign d")                                                                      \
+    X(REMAINDER, "remainder d")                                                                    \
+    X(FLOOR_DIVIDE, "floor_divide d")                                                              \
+    X(REMAINDER_Q, "remainder q")                                                                  \
+    X(FLOOR_DIVIDE_Q, "floor_divide q")
 
 #define NUMBER_IT(operation, name) operation,
 typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;
@@ -90,28 +105,15 @@ typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;
 
 extern const char *const operation_names[NUMBER_OF_OPERATIONS];
 
-/* TYPES in fmugym/vector/hooks/program.py lists them in the same order. A cast's extra is
- * from * VALUE_TYPES + to. */
-#define EACH_TYPE(X)                                                                               \
-    X(double, 'd')                                                                                 \
-    X(float, 'f')                                                                                  \
-    X(int64_t, 'q')                                                                                \
-    X(int32_t, 'i')                                                                                \
-    X(int16_t, 'h')                                                                                \
-    X(int8_t, 'b')                                                                                 \
-    X(uint64_t, 'Q')                                                                               \
-    X(uint32_t, 'I')                                                                               \
-    X(uint16_t, 'H')                                                                               \
-    X(uint8_t, 'B')                                                                                \
-    X(Flag, '?')                                                                                   \
-    X(Half, 'e')
+/* TYPES in fmugym/vector/hooks/program.py lists them in the same order: d, f, q and Booleans. A
+ * cast's extra is from * VALUE_TYPES + to. */
+enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_TYPES };
 
 enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
-enum { VALUE_TYPES = 12, VALUE_DOUBLE = 0, VALUE_FLOAT = 1, VALUE_HALF = 11 };
 
 /* to, a, b and c are registers. extra is the number of a row, of an element of an action, of a
- * slot, a call, a table or a pair of types, as the operation needs it. In STORE_FLOATS, extra is the
- * first slot, a the first row, and b how many there are. */
+ * slot, a table or a pair of types, as the operation needs it. In STORE_FLOATS, extra is the first
+ * slot, a the first row, and b how many there are. */
 typedef struct {
     uint16_t operation, extra, to, a, b, c;
 } Instruction;
@@ -132,17 +134,6 @@ typedef struct {
     uint32_t unused;
 } Constant;
 
-/* A loop of numpy: PyArrayMethod_StridedLoop. */
-typedef int Loop(void *context, char *const *data, const ptrdiff_t *dimensions,
-                 const ptrdiff_t *strides, void *auxiliary);
-
-typedef struct {
-    Loop *loop;
-    void *context, *auxiliary;
-    uint16_t inputs, values, kept; /* number of inputs; of these and outputs; which one is kept */
-    ptrdiff_t sizes[CALL_VALUES];  /* bytes of each input, then of each output */
-} Called;
-
 /* One value for each instance. */
 typedef struct {
     char *data;
@@ -157,12 +148,11 @@ typedef struct {
     uint32_t type;
 } Slot;
 
-/* Values to look up. For an interpolation: n coordinates, n values, and the values to the left
- * and to the right of them. */
+/* Values to look up. For an interpolation: n coordinates that never fall, n values, and the values to
+ * the left and to the right of them. */
 typedef struct {
     const char *data;
     size_t length, size;
-    bool rising; /* whether coordinates to interpolate between never fall */
 } Table;
 
 /* The owner provides the memory that the pointers refer to. */
@@ -170,12 +160,11 @@ typedef struct {
     const Instruction *code;
     const Constant *constants;
     const Register *filled; /* the constants, in all places of their registers */
-    const Called *calls;
     const Row *rows;
     const Slot *slots;
     const Table *tables;
-    size_t length, number_of_constants, number_of_calls, number_of_rows, number_of_slots,
-        number_of_tables, number_of_seen, registers, number_of_results;
+    size_t length, number_of_constants, number_of_rows, number_of_slots, number_of_tables,
+        number_of_seen, registers, number_of_results;
     uint16_t results[PROGRAM_RESULTS];
 } Program;
 
@@ -222,9 +211,9 @@ bool program_is_sound(const Program *program, size_t action_elements);
 /* Sets what the program would store in the arrays of one instance to 0. */
 void program_clear_seen(const Program *program, char *const *seen, size_t index);
 
-/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Its own operations
- * compute whole blocks, because compilers turn such loops into vector instructions without a
- * remainder; the loops of numpy compute exactly count values. */
+/* Evaluates the program for at most PROGRAM_WIDTH instances, starting at begin. Arithmetic is done
+ * for whole blocks, because compilers turn such loops into vector instructions without a remainder;
+ * functions of the C library compute exactly count values. */
 void program_run(const Program *program, const Source *source, size_t begin, size_t count,
                  Registers *registers, Notes *notes);
 

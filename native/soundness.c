@@ -1,8 +1,6 @@
 #include "program.h"
 
-
-
-static size_t number_of_operands(const Program *program, Instruction i) {
+static size_t number_of_operands(Instruction i) {
     switch (i.operation) {
     case LOAD_ROW:
     case LOAD_ACTION:
@@ -11,43 +9,31 @@ static size_t number_of_operands(const Program *program, Instruction i) {
     case LOAD_STOPPED:
     case STORE_FLOATS:
         return 0;
-    case CALL:
-        return program->calls[i.extra].inputs;
-    case CALL_SQUARE:
-    case CALL_REMAINDER:
-        return 2;
+    case WHERE_8:
+    case WHERE_4:
+    case WHERE_1:
+        return 3;
     case STORE_ROW:
     case STORE_SEEN:
-    case CALL_SINE:
-    case CALL_COSINE:
     case CAST:
     case TAKE:
     case INTERPOLATE:
-    case SQUARE_D:
     case NEGATIVE_D:
-    case ABSOLUTE_D:
-    case SQRT_D:
-    case SQUARE_F:
     case NEGATIVE_F:
-    case ABSOLUTE_F:
-    case SQRT_F:
     case NEGATIVE_Q:
+    case ABSOLUTE_D:
+    case ABSOLUTE_F:
+    case SQRT_D:
+    case SQRT_F:
+    case FLOOR_D:
+    case CEIL_D:
+    case TRUNC_D:
+    case RINT_D:
     case NOT:
         return 1;
-    case WHERE_8:
-    case WHERE_4:
-    case WHERE_2:
-    case WHERE_1:
-        return 3;
     default:
-        return 2;
+        return i.operation >= SIN && i.operation <= CBRT ? 1 : 2;
     }
-}
-
-/* Whether an instruction calls a loop with one result that has so many inputs. */
-static bool calls_with(const Program *program, Instruction i, size_t inputs) {
-    return i.extra < program->number_of_calls && program->calls[i.extra].inputs == inputs &&
-           program->calls[i.extra].values == inputs + 1;
 }
 
 static bool store_is_sound(const Program *program, Instruction i) {
@@ -79,14 +65,6 @@ static bool extra_is_sound(const Program *program, size_t action_elements, Instr
         return i.extra < program->number_of_slots;
     case STORE_FLOATS:
         return store_is_sound(program, i);
-    case CALL:
-        return i.extra < program->number_of_calls;
-    case CALL_SQUARE:
-    case CALL_REMAINDER:
-        return calls_with(program, i, 2);
-    case CALL_SINE:
-    case CALL_COSINE:
-        return calls_with(program, i, 1);
     case CAST:
         return i.extra < VALUE_TYPES * VALUE_TYPES;
     case TAKE:
@@ -116,7 +94,7 @@ static bool instruction_is_sound(const Program *program, size_t action_elements,
     for (size_t k = 0; k < 3; k++) {
         /* The loops promise the compiler, by restrict, that they do not write to operands. */
         const bool overwritten =
-            !stores && k < number_of_operands(program, i) && operands[k] == i.to;
+            !stores && k < number_of_operands(i) && operands[k] == i.to;
         if (operands[k] >= program->registers || overwritten) {
             return false;
         }

@@ -193,10 +193,8 @@ FUNCTIONS = [
     *(np.floor_divide, np.fmod, np.hypot, np.arctan2, np.power, np.float_power),
     *(np.sin, np.cos, np.tan, np.arcsin, np.arccos, np.arctan, np.sinh, np.cosh, np.tanh),
     *(np.arcsinh, np.arccosh, np.arctanh, np.exp, np.exp2, np.expm1, np.log, np.log2, np.log10),
-    *(np.log1p, np.sqrt, np.square, np.absolute, np.fabs, np.negative, np.sign, np.floor),
-    *(np.ceil, np.rint, np.reciprocal, np.degrees, np.radians, np.isnan, np.isinf, np.isfinite),
+    *(np.log1p, np.sqrt, np.absolute, np.negative, np.floor, np.ceil, np.rint),
     *(np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal),
-    *(np.logical_and, np.logical_or, np.logical_not),
 ]
 """Functions that agents may use in C and ONNX."""
 
@@ -213,6 +211,4 @@ def arguments_of(ufunc, dtype):
         first = abs(first) + 0.1
     if name == "arccosh":
         first = abs(first) + 1.1
-    if name == "reciprocal":
-        first = abs(first) + 0.5
     return [part.astype(dtype) for part in (first, second)[: ufunc.nin]]

@@ -7,6 +7,7 @@ import pytest
 
 import fmugym
 from fmugym import FMUVectorEnv
+from fmugym.declared import functions
 from fmugym.errors import TaskError
 
 DT = 0.05
@@ -36,6 +37,13 @@ def episode(env, seed=None, steps=20):
         observed.append(seen[0])
         true.append(reward)
     return np.array(observed, np.float64), np.array(true), info
+
+
+def test_the_bits_of_noise_are_those_of_splitmix64():
+    """The reference is Vigna's program of 2015 with the seed 1234567."""
+    seeds = np.int64(1234567) + np.arange(1, 4) * functions._STEP
+    expected = [6457827717110365317, 3203168211198807973, 9817491932198370423]
+    assert functions._mixed(seeds).view(np.uint64).tolist() == expected
 
 
 def test_noise_is_normal_and_differs_in_steps_and_episodes():

@@ -18,7 +18,6 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import Record
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
-from fmugym.vector.hooks.loops import loop_of
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
 
 
@@ -152,7 +151,6 @@ def program(*rows, results=(), registers=4, seen=0, slots=(), tables=(), **chang
         "code": np.array(rows, np.uint16).tobytes(),
         "constants": b"",
         "slots": np.array(list(slots), SLOT).tobytes(),
-        "calls": (),
         "rows": (),
         "tables": tables,
         "registers": registers,
@@ -229,7 +227,6 @@ class TestPrograms:
             ("store_row", 0, 0, 1),
             ("store_seen", 0, 0, 1),
             ("store_floats", 0, 0, 0, 1),
-            ("call", 0, 1),
             ("cast", 144, 1),
             ("take", 0, 1),
             ("interpolate", 0, 1),
@@ -281,32 +278,6 @@ class TestPrograms:
     def test_rows_of_another_length(self, cart_poles):
         with pytest.raises(ValueError, match="a row of a program must be a vector of"):
             prepare(cart_poles, program(ACTION, rows=(np.zeros(1),)))
-
-    def test_loops_that_are_none(self, cart_poles):
-        with pytest.raises(ValueError, match="PyCapsule"):
-            prepare(cart_poles, program(ACTION, calls=((object(), 1, (8, 8), 1),)))
-
-    @pytest.mark.parametrize(
-        ("inputs", "sizes", "kept"),
-        [
-            (1, (8, 8), 0),
-            (1, (8, 8), 2),
-            (0, (8, 8), 1),
-            (4, (8, 8, 8, 8), 3),
-            (1, (8,) * 5, 4),
-            (1, (16, 8), 1),
-            (1, (-8, 8), 1),
-        ],
-    )
-    def test_loops_with_other_values(self, cart_poles, inputs, sizes, kept):
-        loop = loop_of(np.sin, (np.dtype(np.float64),) * 2)
-        with pytest.raises(ValueError, match="a loop cannot be called"):
-            prepare(cart_poles, program(ACTION, calls=((loop, inputs, sizes, kept),)))
-
-    def test_sizes_that_are_no_numbers(self, cart_poles):
-        loop = loop_of(np.sin, (np.dtype(np.float64),) * 2)
-        with pytest.raises(TypeError):
-            prepare(cart_poles, program(ACTION, calls=((loop, 1, ("x", 8), 1),)))
 
     @pytest.mark.parametrize(
         "actions",

@@ -246,7 +246,7 @@ class TestAttributes:
         one.force_mag = other.force_mag = 4.0
         one.step(0)
         other.step(0)
-        monkeypatch.setattr(compiler, "trace_hooks", None)
+        monkeypatch.setattr(compiler, "compile_hooks", None)
         for force in (5.0, 6.0, 10.0):
             one.force_mag = other.force_mag = force
             for action in (1, 0):
@@ -639,7 +639,7 @@ class TestSideEffects:
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
-@pytest.mark.parametrize("name", ["find_difference", "require_same"])
+@pytest.mark.parametrize("name", ["find_difference", "compile_hooks"])
 def test_what_a_signal_handler_raises_while_hooks_are_compiled_comes_out(monkeypatch, name):
     """It is no mistake of the hooks."""
 

@@ -128,9 +128,8 @@ def array(self):
     return self.state[0] > np.array([1.0, 2.0])
 
 
-def wide(self):
-    rows = [self.state[0] * float(i) for i in range(300)]
-    return sum(np.sort(rows, axis=0)) > 1.0
+def sorted_(self):
+    return np.sort(self.state, axis=0)[0] > 1.0
 
 
 def mixed(self):
@@ -156,7 +155,7 @@ def selected(self):
         (remembered, "changes self.worst"),
         (number, "a flag is no Boolean"),
         (array, "operands could not be broadcast|shape mismatch"),
-        (wide, "sorts more than 32 elements"),
+        (sorted_, r"uses numpy\.sort"),
         (mixed, "mixes the values of several environments"),
         (indexed, "needs numpy.take"),
         (selected, "that a condition selects: use numpy.where"),

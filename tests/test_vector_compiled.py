@@ -160,6 +160,55 @@ def test_reasons_against_compiling(reason):
     assert re.match(rf"_reward_policy, line \d+: .*{reason}", left["_reward_policy"])
 
 
+RARE = {
+    "numpy.sort": lambda env: np.sort(env.state, axis=0)[0],
+    "numpy.median": lambda env: np.median(env.state, axis=0),
+    "numpy.nansum": lambda env: np.nansum(env.state, axis=0),
+    "numpy.einsum": lambda env: np.einsum("i...,i...->...", env.state, env.state),
+    "numpy.piecewise": lambda env: np.piecewise(env.state[0], [env.state[0] < 0], [-1.0, 1.0]),
+    "numpy.cumsum": lambda env: np.cumsum(env.state, axis=0)[1],
+    "numpy.modf": lambda env: np.modf(3.0 * env.state[0])[0],
+    "float16": lambda env: np.asarray(env.state[0], np.float16),
+    "int32": lambda env: np.asarray(10.0 * env.state[0], np.int32),
+    "uint64": lambda env: np.asarray(env.step_count).astype(np.uint64) % np.uint64(3),
+    "where: use numpy.where": lambda env: np.divide(
+        1.0, env.state[0], out=np.zeros_like(env.state[0]), where=env.state[0] != 0.0
+    ),
+    "a condition selects": lambda env: env.state[0] + np.sum(env.state[0][env.state[0] > 9]),
+}
+
+
+@pytest.mark.parametrize("reason", RARE)
+def test_hooks_with_rare_functions_run_on_arrays_beside_compiled_ones(reason, caplog):
+    class Other(Arithmetic):
+        def _reward_policy(self):
+            return RARE[reason](self)
+
+    with caplog.at_level("INFO", "fmugym"):
+        ours, theirs = (FMUVectorEnv(Other, 5, hooks=hooks) for hooks in ("auto", "array"))
+    assert list(ours._engine._task.left) == ["_reward_policy"]
+    assert reason in caplog.text
+    run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 40)
+    ours.close()
+    theirs.close()
+
+
+class Differing(Arithmetic):
+    """Its truncation is another one as a program, as if it hung on the last bit of a sine."""
+
+    def _is_truncated(self):
+        return super()._is_truncated() ^ isinstance(self.state, Symbols)
+
+
+def test_a_program_that_differs_leaves_only_its_own_hook_to_arrays(caplog):
+    with caplog.at_level("INFO", "fmugym"):
+        require_pair_equal(Differing, steps=40, hooks="auto")
+        envs = FMUVectorEnv(Differing, 3)
+    assert "the program gives other values than _is_truncated. It runs on arrays" in caplog.text
+    assert list(envs._engine._task.left) == ["_is_truncated"]
+    envs.close()
+
+
 def test_why_hooks_are_not_compiled_stands_in_the_log(caplog):
     with caplog.at_level("INFO", "fmugym"):
         FMUVectorEnv(Branching, 2).close()
@@ -219,43 +268,6 @@ class NotANumber(Arithmetic):
 
 def test_programs_whose_results_are_nan_are_the_hooks():
     FMUVectorEnv(NotANumber, 2, hooks="compiled").close()
-
-
-def constant(env):
-    return np.where(env.done, -1.0, np.minimum(2.0, 1.0))
-
-
-def loaded(env):
-    return np.maximum(abs(env.state[0]), -env.parameters["m"])
-
-
-def counting(env):
-    return 1.0 - (env.done & (env.state[0] > 0.5)) + 3.0 * (env.step_count > 5)
-
-
-def unknown(env):
-    return np.where(env.done, np.nan, 1.0)
-
-
-def overflowing(env):
-    return np.where(env.done, 1.0, env.state[0] * env.state[0])
-
-
-def dividing(env):
-    return 1.0 / env.state[0]
-
-
-@pytest.mark.parametrize(
-    ("reward", "is_finite"),
-    [
-        *[(constant, True), (loaded, True), (counting, True)],
-        *[(overflowing, False), (dividing, False), (unknown, False)],
-    ],
-)
-def test_which_rewards_are_always_finite(reward, is_finite):
-    env = type("Other", (Arithmetic,), {"_reward_policy": reward})()
-    assert trace_hooks(env).judgement.is_always_finite is is_finite
-    env.close()
 
 
 class Unattended(Arithmetic):

@@ -1,5 +1,6 @@
 """What users write in hooks, line by line: it is compiled, and gives what numpy gives on arrays."""
 
+import contextlib
 import math
 import re
 import textwrap
@@ -20,7 +21,7 @@ from fmugym.vector.hooks.trace import trace_hooks
 GAINS = np.array([1.5, -0.7])
 MATRIX = np.array([[1.0, 2.0], [3.0, 4.0]])
 LEVELS = np.array([1.0, 3.0, 7.0, -2.0])
-COUNTS = np.array([[5, 6, 7], [8, 9, 10]], np.int32)
+COUNTS = np.array([[5, 6, 7], [8, 9, 10]])
 PAIRS = np.arange(20).reshape(2, 10)[:, :8]
 TIMES = np.linspace(0.0, 1.0, 5)
 GOAL = [0.1, 0.2]
@@ -34,13 +35,11 @@ TABLES = (
     f"COUNTS[self.step_count % 2, ({Q} > 0).astype(int)]",
     "COUNTS[-1, self.step_count % 3]",
     "COUNTS[self.step_count % 2][..., 1]",
-    "COUNTS[:, self.step_count % 3][1]",
-    "COUNTS[..., self.step_count % 3][0]",
     "COUNTS[1][self.step_count % 3]",
     "np.asarray(GOAL)[self.step_count % 2]",
     "np.linspace(0, 1, 4)[self.step_count % 4]",
     "np.take(GOAL, self.step_count % 2)",
-    "np.take(COUNTS, self.step_count % 3, axis=1)[0]",
+    "np.take(COUNTS, self.step_count % 2, axis=0)[..., 2]",
     "self.table[self.step_count % 3]",
     "float(self.table[1]) * self.state[0] + int(self.on_class[0])",
     f"np.interp({Q}, self.table - 2.0, self.table)",
@@ -51,38 +50,22 @@ TABLES = (
     f"np.searchsorted(np.array([-0.5, 0.0, 0.0, 0.5]), np.round({Q}), side='right')",
     f"np.searchsorted([-1, 0, 0, 2], {Q}) + np.searchsorted([3], self.step_count)",
     f"LEVELS[np.minimum(np.searchsorted(TIMES, {Q}), 3)]",
-    f"np.digitize({Q}, [-0.5, 0.0, 0.5])",
-    f"np.digitize({Q}, [0.5, 0.0, -0.5], right=True)",
     f"np.interp({Q}, [0.0, 1.0], [2.0, 5.0])",
     "np.interp(self.time, TIMES, TIMES**2)",
-    "np.interp(self.time, TIMES, TIMES**2, period=0.7)",
-    f"np.choose(self.step_count % 2, [{Q}, {W}])",
-    "np.take_along_axis(self.state, np.argmax(self.state, axis=0)[None], axis=0)[0]",
 )
 
 CHOICES = (
     f"np.where({Q} > 0.5, 1.0, np.where({Q} > 0, 2, 3))",
     f"np.select([{Q} > 0.5, {Q} > 0], [1.0, {W}], default=-1.0)",
-    f"np.piecewise({Q}, [{Q} < 0, {Q} >= 0], [-1.0, 1.0])",
-    f"np.piecewise({Q}, [{Q} < 0], [lambda x: x * x, lambda x: 3 * x])",
-    f"np.sqrt({Q}, out=np.zeros_like({Q}), where={Q} > 0)",
-    f"np.divide(1.0, {Q}, out=np.zeros_like({Q}), where={Q} != 0)",
-    "np.sum(self.state, axis=0, where=self.state > 0)",
-    "np.max(self.state, axis=0, where=self.state > 0, initial=-1.0)",
     "np.argmax(self.state, axis=0)",
     "self.state.argmin(axis=0)",
     "np.argmax(np.sqrt(self.state), axis=0)",
-    f"np.nan_to_num(np.log({Q}))",
     f"np.isclose({Q}, 0.0, atol=0.1)",
-    "np.isin(self.step_count, [1, 3, 5])",
     "np.count_nonzero(self.state > 0, axis=0)",
     f"np.clip({Q}, -0.1, 0.1, out=np.zeros_like({Q}))",
 )
 
 FUNCTIONS = (
-    f"np.modf(3.7 * {Q})[0]",
-    f"np.modf(3.7 * {Q})[1]",
-    "np.modf(1.7 * self.action[0])[0]",
     f"divmod({Q}, 0.3)[0]",
     f"divmod({Q}, -0.3)[1]",
     "divmod(self.step_count, 3)[1]",
@@ -90,18 +73,14 @@ FUNCTIONS = (
     f"np.fmod({Q} + np.pi, 2 * np.pi)",
     f"np.hypot({Q}, {W})",
     f"np.deg2rad({Q}) + np.degrees({W})",
-    f"np.sign({Q}) * np.heaviside({W}, 0.5)",
-    f"np.sinc({Q})",
+    f"np.sign({Q}) * np.copysign({W}, 0.5)",
     f"np.fix({Q}) + np.trunc({W})",
     f"np.floor(10 * {Q}).astype(np.int64) // 3",
     f"np.polyval([1.0, 2.0, 3.0], {Q})",
-    f"np.ldexp({Q}, 2)",
     f"math.sin(0.5) * {Q}",
-    f"np.angle({Q})",
 )
 
 ARRAYS = (
-    "np.cumsum(self.state, axis=0)[-1]",
     "np.diff(self.state, axis=0)[0]",
     "np.roll(self.state, 1, axis=0)[0]",
     "np.concatenate([self.state, self.previous_state])[3]",
@@ -114,8 +93,6 @@ ARRAYS = (
     "np.sum(self.state[np.array([True, False])], axis=0)",
     "np.mean(self.state, axis=0) + np.std(self.state, axis=0)",
     "np.average(self.state, axis=0, weights=[0.3, 0.7])",
-    "np.trapezoid(self.state, axis=0)",
-    "np.gradient(self.state, axis=0)[0]",
     "np.linalg.norm(self.state, axis=0)",
     "np.add.reduce(self.state)",
     "sum(w * x for w, x in zip(GOAL, self.state))",
@@ -133,14 +110,7 @@ PRODUCTS = (
     "self.state.T.dot(GAINS)",
     "np.inner(GAINS, self.state.T)",
     "np.outer(GAINS, [1.0, 2.0])[0, 1] * self.state[0]",
-    "np.tensordot(MATRIX, self.state, 1)[0]",
-    "np.tensordot(MATRIX, self.state, axes=([0], [0]))[1]",
-    "np.einsum('i...,i...->...', self.state, self.state)",
-    "np.einsum('ij,j...->i...', MATRIX, self.state)[1]",
-    "np.einsum('i...,ij,j...', self.state, MATRIX, self.state)",
     "np.sum(self.state * (MATRIX @ self.state), axis=0)",
-    "np.vecdot(self.state, GAINS[:, None], axis=0)",
-    "np.linalg.vecdot(self.state.T, GAINS)",
     "np.cross([self.state[0], 0 * self.state[0], self.state[1]], [1.0, 2.0, 3.0], axis=0)[1]",
     "(COUNTS[:, :2] @ np.array([self.step_count, 2 * self.step_count]))[0]",
     "np.matmul(MATRIX.astype(np.float32), np.asarray(self.state, np.float32))[0]",
@@ -153,15 +123,8 @@ BLOCKS = (
     "out = np.zeros_like(self.state)\nout[0] = self.action[0]\nout[1] += 2\nreturn out[0] + out[1]",
     "out = np.zeros((3, *np.shape(self.state[0])))\nout[:2] = self.state\nreturn out.sum(axis=0)",
     "x = np.array(self.state[0])\nx[x > 0] = 0.5\nreturn x",
-    "x = np.array(self.state[0])\ny = np.zeros_like(x)\ny[x > 0] = np.sqrt(x[x > 0])\nreturn y",
     "x = np.array(self.state, dtype=np.float64)\nx[x > 0.5] = 0.5\nreturn x[0] + x[1]",
-    "r = np.zeros_like(self.state[0])\nr[self.state[0] > 0] += 2.0\nreturn r",
-    "r = np.ones_like(self.state[0])\nfar = abs(self.state[0]) > 0.4\n"
-    "r[far] = r[far] * 2.0 - self.state[1][far]\nreturn r",
     "x = np.array(self.state)\nx[:, self.state[0] > 0] = 0.0\nreturn x[0] + x[1]",
-    "x = np.array(self.state)\nx[1, self.state[0] > 0] *= 2.0\nreturn x[1]",
-    "x = np.array(self.state[0])\nnp.putmask(x, x > 0, 1.0)\nreturn x",
-    "x = np.array(self.state[0])\nnp.copyto(x, 1.0, where=x > 0)\nreturn x",
     "x = np.empty_like(self.state[0])\nx.fill(3)\nreturn x + self.state[0]",
     "h = np.roll(np.array([self.state[0], self.state[1]]), 1, axis=0)\nh[0] = 1.0\nreturn h[1]",
     "levels = np.array([1.0, 2.0, 3.0])\nreturn levels[self.step_count % 3]",
@@ -213,16 +176,11 @@ def compiled(prototype, body):
     return task
 
 
-@pytest.mark.parametrize("body", [*TABLES, *CHOICES, *FUNCTIONS, *ARRAYS, *BLOCKS])
+@pytest.mark.parametrize("body", [*TABLES, *CHOICES, *FUNCTIONS, *ARRAYS, *BLOCKS, *PRODUCTS])
 def test_snippets_are_compiled(prototype, body):
-    """These were refused, or nobody had tried: they give numpy's values to the last bit."""
-    assert not compiled(prototype, body).is_inexact
-
-
-@pytest.mark.parametrize("body", PRODUCTS)
-def test_products_of_matrices_are_compiled(prototype, body):
-    """Their sums are rounded in another order than those of the linear algebra library."""
-    compiled(prototype, body)
+    """These were refused, or nobody had tried."""
+    uses_functions = re.search(r"hypot|math\.sin", body) or body in PRODUCTS
+    assert bool(compiled(prototype, body).tolerance) <= bool(uses_functions)
 
 
 def test_a_product_is_the_sum_in_the_order_of_its_terms(prototype):
@@ -247,11 +205,27 @@ def test_a_product_is_the_sum_in_the_order_of_its_terms(prototype):
         one.close()
 
 
-def test_a_wrong_product_would_be_found(prototype):
+NEAR = {
+    "a function, nearly": (f"np.exp({Q})", f"np.exp({Q}) * (1 + 1e-13)", True),
+    "another function": (f"np.exp({Q})", f"np.exp({Q}) * (1 + 1e-11)", False),
+    "a function of float32": ("np.exp(self.action[0])", "np.exp(self.action[0]) * 1.000001", True),
+    "another of float32": ("np.exp(self.action[0])", "np.exp(self.action[0]) * 1.0001", False),
+    "a product, nearly": ("GAINS @ self.state", "GAINS @ self.state * (1 + 1e-13)", True),
+    "another product": ("GAINS @ self.state", "GAINS @ self.state * (1 + 1e-10)", False),
+    "arithmetic": (f"3.0 * {Q}", f"3.0 * {Q} * (1 + 2**-52)", False),
+    "a count of a function": (f"np.sign(np.exp({Q}))", f"np.sign(np.exp({Q}) - 1.0)", False),
+}
+
+
+@pytest.mark.parametrize("name", NEAR)
+def test_how_far_results_may_differ(prototype, name):
+    """Relative to the largest; see docs/vector.md."""
     env, batch, _ = prototype
-    task = compiled(prototype, "GAINS @ self.state")
-    env._reward_policy = hook_of("GAINS @ self.state * (1 + 1e-7)").__get__(env)
-    with pytest.raises(Exception, match="other values than _reward_policy"):
+    body, other, is_same = NEAR[name]
+    task = compiled(prototype, body)
+    env._reward_policy = hook_of(other).__get__(env)
+    found = contextlib.nullcontext() if is_same else pytest.raises(Exception, match="other values")
+    with found:
         require_same_programs(env, batch, task)
 
 
@@ -306,15 +280,12 @@ def test_a_table_is_the_array_that_it_stands_for():
 @pytest.mark.parametrize(
     ("body", "reason"),
     [
-        ("np.sqrt(self.state[0], where=self.state[0] > 0)", "without out"),
+        ("np.sqrt(self.state[0], where=self.state[0] > 0)", "where: use numpy.where"),
         ("np.sum(self.state[0][self.state[0] > 0])", "use numpy.where"),
-        ("self.state[0][self.state[0] > 0] + self.state[1]", "with whole arrays"),
-        (
-            "self.state[0][self.state[0] > 0] + self.state[1][self.state[1] > 0]",
-            "different conditions",
-        ),
+        ("np.interp(self.time, TIMES, TIMES**2, period=0.7)", "has a period"),
         ("SHARED.table[self.step_count % 4]", "needs numpy.take"),
-        ("np.einsum('ii...->...', np.array([self.state, self.state]))", "cannot be followed"),
+        ("COUNTS[:, self.step_count % 3][1]", "cannot be followed"),
+        ("self.state[self.step_count % 2]", "a table that is not constant"),
         ("np.maximum.reduce([self.state[0], self.state[1]])", "numpy.array around a list"),
     ],
 )

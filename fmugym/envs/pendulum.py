@@ -166,8 +166,8 @@ class PendulumEnv(FMUEnv):
 def _squared(value: Any) -> Any:
     """Square by the C library's ``pow``, as Gymnasium does; a product differs in a bit at times.
 
-    For arrays numpy has its own loops; ``float_power`` comes nearest.
+    ``**`` multiplies arrays, and so does ``numpy.power`` where one exponent stands for all.
     """
     if isinstance(value, np.ndarray):
-        return np.float_power(value, 2.0).astype(value.dtype)
+        return np.power(value, np.full_like(value, 2.0))
     return value**2

@@ -218,11 +218,7 @@ class _Source:
                 return f"{table}[{place} < 0 ? {place} + {count} : {place}]"
             case "interpolate":
                 return self._interpolation(node, operands[0])
-            case "part" if node.what[0] is np.divmod:  # type: ignore[index]  # a tuple
-                which = np.remainder if node.what[1] else np.floor_divide  # type: ignore[index]
-                return expression(which, operands, letters, self._use)
-        name = getattr(node.what[0] if node.kind == "part" else node.what, "__name__", node.kind)  # type: ignore[index]
-        raise ConfigError(f"numpy.{name} cannot be exported to C")
+        raise ConfigError(f"an operation of kind {node.kind!r} cannot be exported to C")
 
     def _loaded(self, number: int, node: Node) -> str:
         load = self._logic.loads[number]

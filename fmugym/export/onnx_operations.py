@@ -13,7 +13,6 @@ import numpy as np
 
 from fmugym.errors import ConfigError
 from fmugym.export.onnx_nodes import Nodes
-from fmugym.vector.hooks.graph import CLIP
 
 __all__ = ["computed", "interpolated"]
 
@@ -32,10 +31,8 @@ _SAME: Final[Mapping[Any, str]] = {
     np.power: "Pow",
     np.float_power: "Pow",
     np.absolute: "Abs",
-    np.fabs: "Abs",
     np.negative: "Neg",
     np.sqrt: "Sqrt",
-    np.sign: "Sign",
     np.exp: "Exp",
     np.log: "Log",
     np.sin: "Sin",
@@ -44,9 +41,6 @@ _SAME: Final[Mapping[Any, str]] = {
     np.floor: "Floor",
     np.ceil: "Ceil",
     np.rint: "Round",
-    np.reciprocal: "Reciprocal",
-    np.isnan: "IsNaN",
-    np.isinf: "IsInf",
 }
 """Functions that ONNX has, for the same types of operands."""
 
@@ -141,10 +135,6 @@ def _ratio(nodes: Nodes, x: str, one: str) -> str:
     return nodes.add("Div", nodes.add("Add", one, x), nodes.add("Sub", one, x))
 
 
-def _times(factor: float) -> Callable[..., str]:
-    return lambda nodes, dtype, x: nodes.add("Mul", x, nodes.constant(factor, dtype))
-
-
 def _hypot(nodes: Nodes, dtype: np.dtype[Any], a: str, b: str) -> str:
     return nodes.add("Sqrt", nodes.add("Add", nodes.add("Mul", a, a), nodes.add("Mul", b, b)))
 
@@ -162,32 +152,13 @@ def _arctan2(nodes: Nodes, dtype: np.dtype[Any], y: str, x: str) -> str:
     return nodes.add("Where", is_axis, end, angle)
 
 
-def _isfinite(nodes: Nodes, dtype: np.dtype[Any], x: str) -> str:
-    odd = nodes.add("Or", nodes.add("IsNaN", x), nodes.add("IsInf", x))
-    return nodes.add("Not", odd)
-
-
-def _is_nonzero(nodes: Nodes, dtype: np.dtype[Any], x: str) -> str:
-    return nodes.add("Not", nodes.add("Equal", x, nodes.constant(0, dtype)))
-
-
-def _logical(name: str) -> Callable[..., str]:
-    def compose(nodes: Nodes, dtype: np.dtype[Any], *operands: str) -> str:
-        return nodes.add(name, *(_is_nonzero(nodes, dtype, one) for one in operands))
-
-    return compose
-
-
 _COMPOSED: Final[Mapping[Any, Callable[..., str]]] = {
-    np.square: lambda nodes, dtype, x: nodes.add("Mul", x, x),
     np.not_equal: lambda nodes, dtype, a, b: nodes.add("Not", nodes.add("Equal", a, b)),
-    CLIP: lambda nodes, dtype, x, a, b: nodes.add("Min", nodes.add("Max", x, a), b),
     np.remainder: _remainder,
     np.floor_divide: _floor_divide,
     np.fmod: lambda nodes, dtype, a, b: nodes.add("Mod", a, b, fmod=1),
     np.hypot: _hypot,
     np.arctan2: _arctan2,
-    np.isfinite: _isfinite,
     np.tan: lambda nodes, dtype, x: nodes.add("Div", nodes.add("Sin", x), nodes.add("Cos", x)),
     np.sinh: _of_exponentials("Sub"),
     np.cosh: _of_exponentials("Add"),
@@ -201,11 +172,6 @@ _COMPOSED: Final[Mapping[Any, Callable[..., str]]] = {
         "Sub", nodes.add("Exp", x), nodes.constant(1.0, dtype)
     ),
     np.exp2: lambda nodes, dtype, x: nodes.add("Pow", nodes.constant(2.0, dtype), x),
-    **dict.fromkeys([np.degrees, np.rad2deg], _times(180 / math.pi)),
-    **dict.fromkeys([np.radians, np.deg2rad], _times(math.pi / 180)),
-    np.logical_and: _logical("And"),
-    np.logical_or: _logical("Or"),
-    np.logical_not: lambda nodes, dtype, x: nodes.add("Equal", x, nodes.constant(0, dtype)),
 }
 
 

@@ -8,7 +8,6 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.errors import ConfigError
-from fmugym.vector.hooks.graph import CLIP
 
 __all__ = ["HELPERS", "TYPES", "constant", "expression"]
 
@@ -16,16 +15,8 @@ TYPES: Final[Mapping[str, str]] = {
     "d": "double",
     "f": "float",
     "?": "bool",
-    "b": "int8_t",
-    "h": "int16_t",
-    "i": "int32_t",
     "q": "int64_t",
     "l": "int64_t",
-    "B": "uint8_t",
-    "H": "uint16_t",
-    "I": "uint32_t",
-    "Q": "uint64_t",
-    "L": "uint64_t",
 }
 """C's types by numpy's letters."""
 
@@ -53,9 +44,7 @@ _OF_BOOLEANS: Final[Mapping[Any, str]] = {
 }
 _OF_INTEGERS: Final[Mapping[Any, str]] = {
     np.bitwise_and: "&",
-    np.bitwise_or: "|",
     np.bitwise_xor: "^",
-    np.left_shift: "<<",
     np.right_shift: ">>",
 }
 
@@ -66,7 +55,6 @@ _OF_MATH: Final[Mapping[Any, str]] = {
     np.rint: "rint",
     np.fmod: "fmod",
     np.copysign: "copysign",
-    np.fabs: "fabs",
     np.arcsin: "asin",
     np.arccos: "acos",
     np.arctan: "atan",
@@ -76,8 +64,6 @@ _OF_MATH: Final[Mapping[Any, str]] = {
     np.arctanh: "atanh",
     np.power: "pow",
     np.float_power: "pow",
-    np.fmin: "fmin",
-    np.fmax: "fmax",
     np.absolute: "fabs",
 }
 """Functions of the C library for numbers of floating point."""
@@ -86,22 +72,13 @@ _OF_MATH: Final[Mapping[Any, str]] = {
 _OWN: Final[Mapping[Any, str]] = {
     np.minimum: "minimum",
     np.maximum: "maximum",
-    np.sign: "sign",
     np.remainder: "remainder",
     np.floor_divide: "floor_divide",
-    np.square: "square",
-    CLIP: "clip",
 }
 
 HELPERS: Final[Mapping[str, str]] = {
     "minimum": "{T} {name}({T} a, {T} b) {{\n    return (a < b || a != a) ? a : b;\n}}",
     "maximum": "{T} {name}({T} a, {T} b) {{\n    return (a > b || a != a) ? a : b;\n}}",
-    "clip": (
-        "{T} {name}({T} a, {T} low, {T} high) {{\n"
-        "    const {T} b = (a < low) ? low : a;\n    return (b > high) ? high : b;\n}}"
-    ),
-    "sign": "{T} {name}({T} a) {{\n    return ({T})((a > 0) - (a < 0)) + (a != a ? a : 0);\n}}",
-    "square": "{T} {name}({T} a) {{\n    return a * a;\n}}",
     "remainder": (
         "{T} {name}({T} a, {T} b) {{\n    const {T} r = fmod{f}(a, b);\n"
         "    if (r == 0) {{\n        return copysign{f}(0, b);\n    }}\n"
@@ -134,8 +111,6 @@ def constant(value: Any, letter: str) -> str:
     if letter == "?":
         return "true" if value else "false"
     number = int(value)
-    if letter in "QL":
-        return f"UINT64_C({number})"
     if number == -(2**63):  # C has no literal of it
         return f"({constant(number + 1, letter)} - 1)"
     text = str(number) if abs(number) < 2**31 else f"INT64_C({number})"
@@ -184,40 +159,13 @@ def _of_floats(ufunc: Any, operands: Sequence[str], kind: str, use: Any) -> str 
         return f"{use(_OWN[ufunc], kind)}({arguments})"
     if ufunc in _OF_MATH:
         return f"{_OF_MATH[ufunc]}{'f' if kind == 'f' else ''}({arguments})"
-    return _OF_ONE.get(ufunc, {}).get(kind, "").format(operands[0]) or None
+    return f"(-{operands[0]})" if ufunc is np.negative else None
 
 
 def _of_whole_numbers(ufunc: Any, operands: Sequence[str], kind: str, use: Any) -> str | None:
     first = operands[0]
-    if ufunc is np.logical_not or (kind == "?" and ufunc is np.invert):
-        return f"(!{first})"
     if kind == "?":
-        return first if ufunc is np.absolute else None
-    if ufunc in {np.minimum, np.maximum, np.square, np.sign, CLIP}:
+        return f"(!{first})" if ufunc in {np.logical_not, np.invert} else None
+    if ufunc in {np.minimum, np.maximum}:
         return f"{use(_OWN[ufunc], kind)}({', '.join(operands)})"
-    if ufunc is np.absolute:
-        return f"({first} < 0 ? -{first} : {first})"
-    return f"(-{first})" if ufunc is np.negative else f"(~{first})" if ufunc is np.invert else None
-
-
-def _both(text: str, **constants: float) -> dict[str, str]:
-    """An expression for both types; numbers in it have that type."""
-    return {
-        letter: text.format("{0}", **{k: _float(v, letter) for k, v in constants.items()})
-        for letter in "df"
-    }
-
-
-_OF_ONE: Final[Mapping[Any, Mapping[str, str]]] = {
-    np.negative: _both("(-{0})"),
-    np.reciprocal: _both("({one} / {0})", one=1.0),
-    np.degrees: _both("({0} * {k})", k=180.0 / np.pi),
-    np.rad2deg: _both("({0} * {k})", k=180.0 / np.pi),
-    np.radians: _both("({0} * {k})", k=np.pi / 180.0),
-    np.deg2rad: _both("({0} * {k})", k=np.pi / 180.0),
-    np.isfinite: _both("(isfinite({0}) != 0)"),
-    np.isnan: _both("(isnan({0}) != 0)"),
-    np.isinf: _both("(isinf({0}) != 0)"),
-    np.signbit: _both("(signbit({0}) != 0)"),
-    np.logical_not: _both("({0} == 0)"),
-}
+    return f"(-{first})" if ufunc is np.negative else None

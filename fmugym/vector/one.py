@@ -6,7 +6,7 @@ import logging
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, Final, NamedTuple
 
@@ -21,11 +21,11 @@ from fmugym.task.step import ORDER
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.memory import Memory
+from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
-from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.purity import names_in_hooks, unchanged_globals
-from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.streams import given_draws
 from fmugym.vector.views import batched, column
 
@@ -34,7 +34,9 @@ __all__ = ["Player", "player_of"]
 logger = logging.getLogger(__name__)
 
 _SCALES: Final = (1.0, -0.3)
-"""Magnitudes of the states in which programs are compared with hooks."""
+_REACHES: Final = ((0.01, 0.01), (0.3, 1.0))
+"""Where programs and hooks are compared: factors of states, and how far these are from the present
+one. Both batches are of the same size."""
 
 _NUMBERS: Final = (bool, int, float, np.bool_, np.integer, np.floating)
 
@@ -302,18 +304,18 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     """Compile the hooks, and compare the programs with them on states around the present one."""
     if _is_debugged():
         raise UntraceableError("a debugger is attached")
-    states = sample_states(env, _SCALES, states_around(env))
+    near, far = (sample_states(env, _SCALES, states_around(env, reaches)) for reaches in _REACHES)
     with unchanged_globals(env), borrowed(env):
-        _call_hooks(env, column(states, 0))
+        _call_hooks(env, column(near, 0))
     with unchanged_globals(env):
-        task = trace_hooks(env, numbers)
+        with _repeated(env, numbers, len(near.step_count)):
+            task = compile_hooks(env, [near, far], numbers)
         if "_get_inputs" in task.left:  # it would have to read before the FMU steps
             raise UntraceableError("; ".join(task.left.values()))
-        difference = find_difference(env, states, task.left)
-        if difference is not None:
-            raise UntraceableError(difference)
-    with _repeated(env, numbers, len(states.step_count)), suppress(IndexError):
-        require_same(env, states, task)
+        for states in (near, far):
+            difference = find_difference(env, states, task.left)
+            if difference is not None:
+                raise UntraceableError(difference)
     return task
 
 

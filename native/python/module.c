@@ -81,7 +81,6 @@ static PyObject *py_text_with(PyObject *module, PyObject *number) {
 static PyMethodDef functions[] = {
     {"operations", operations, METH_NOARGS, NULL},
     {"evaluate", py_evaluate, METH_VARARGS, NULL},
-    {"is_free_loop", py_is_free_loop, METH_O, NULL},
     {"distributions", distributions, METH_NOARGS, NULL},
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},

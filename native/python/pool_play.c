@@ -27,19 +27,15 @@ bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyT
                       s->count * s->num_observed * sizeof(float));
 }
 
-/* Whether the items of a buffer are of the kind that a letter stands for: d for floats, q for
- * integers, Q for those without sign, ? for Booleans. */
+/* Whether the items of a buffer are of numpy's type with this letter; it has two for int64. */
 static bool has_letter(const Py_buffer *buffer, int letter) {
     const char *format = buffer->format == NULL ? "B" : buffer->format;
-    const char *const letters = letter == 'd'   ? "fde"
-                                : letter == 'q' ? "bhilq"
-                                : letter == 'Q' ? "BHILQ"
-                                                : "?";
 
     if (*format == '@' || *format == '=') {
         format++;
     }
-    return format[0] != '\0' && format[1] == '\0' && strchr(letters, format[0]) != NULL;
+    const bool is_long = *format == 'l' && letter == 'q'; /* of 8 bytes, as the caller sees */
+    return *format != '\0' && format[1] == '\0' && (*format == letter || is_long);
 }
 
 bool take_array_of_actions(const Playing *playing, PyObject *actions, int first, Py_buffer *b) {

@@ -3,62 +3,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* Loops of numpy. Its methods _resolve_dtypes_and_context and _get_strided_loop, which exist from
- * version 1.24 on, hand out this struct in a capsule of this name. */
-
-static const char *const LOOP = "numpy_1.24_ufunc_call_info";
-
-typedef struct {
-    Loop *loop;
-    void *context, *auxiliary;
-    unsigned char needs_python, never_fails;
-} LoopInfo;
-
-/* Whether a loop of numpy can run without the GIL. */
-PyObject *py_is_free_loop(PyObject *module, PyObject *capsule) {
-    const LoopInfo *info = PyCapsule_GetPointer(capsule, LOOP);
-
-    (void)module;
-    return info == NULL ? NULL : PyBool_FromLong(info->loop != NULL && !info->needs_python);
-}
-
-static bool take_sizes(PyObject *sizes, Called *called) {
-    const Py_ssize_t values = PyTuple_Size(sizes);
-    bool sound = values <= CALL_VALUES;
-
-    for (Py_ssize_t i = 0; i < values && sound; i++) {
-        called->sizes[i] = PyLong_AsSsize_t(PyTuple_GetItem(sizes, i));
-        sound = called->sizes[i] >= 0 && called->sizes[i] <= 8;
-    }
-    called->values = (uint16_t)values;
-    return sound;
-}
-
-static bool take_call(PyObject *call, Called *called) {
-    PyObject *capsule, *sizes;
-    int inputs, kept;
-
-    if (!PyArg_ParseTuple(call, "OiO!i;a call is a loop, a number of inputs, sizes and a number",
-                          &capsule, &inputs, &PyTuple_Type, &sizes, &kept)) {
-        return false;
-    }
-    const LoopInfo *info = PyCapsule_GetPointer(capsule, LOOP);
-    if (info == NULL) {
-        return false;
-    }
-    const bool sound = take_sizes(sizes, called) && info->loop != NULL && !info->needs_python &&
-                       inputs > 0 && inputs <= kept && kept < called->values;
-    called->loop = info->loop;
-    called->context = info->context;
-    called->auxiliary = info->auxiliary;
-    called->inputs = (uint16_t)inputs;
-    called->kept = (uint16_t)kept;
-    if (!sound && !PyErr_Occurred()) {
-        PyErr_SetString(PyExc_ValueError, "a loop cannot be called");
-    }
-    return sound;
-}
-
 bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,
                   Py_ssize_t length) {
     const int flags = PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (written ? PyBUF_WRITABLE : 0);
@@ -88,17 +32,6 @@ static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
     return true;
 }
 
-static bool is_rising(const Table *table) {
-    const double *xs = (const double *)(const void *)table->data;
-    const size_t count = table->size == sizeof *xs && table->length >= 4 ? table->length / 2 - 1 : 0;
-    bool is = true;
-
-    for (size_t i = 1; i < count; i++) {
-        is &= xs[i - 1] <= xs[i];
-    }
-    return is;
-}
-
 static bool take_tables(PyProgram *p, PyObject *tables) {
     for (Py_ssize_t i = 0; i < PyTuple_Size(tables); i++) {
         PyObject *table = PyTuple_GetItem(tables, i);
@@ -110,23 +43,13 @@ static bool take_tables(PyProgram *p, PyObject *tables) {
         p->tables[i] = (Table){.data = buffer->buf,
                                .length = (size_t)length,
                                .size = (size_t)buffer->itemsize};
-        p->tables[i].rising = is_rising(&p->tables[i]);
-    }
-    return true;
-}
-
-static bool take_calls(PyProgram *p, PyObject *calls) {
-    for (Py_ssize_t i = 0; i < PyTuple_Size(calls); i++) {
-        if (!take_call(PyTuple_GetItem(calls, i), &p->calls[i])) {
-            return false;
-        }
     }
     return true;
 }
 
 /* Reads how large the arrays of observations must be. */
 static bool measure_seen(PyProgram *p, Py_ssize_t count) {
-    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 4, 2, 1, 8, 4, 2, 1, 1, 2};
+    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 1};
 
     for (size_t i = 0; i < p->program.number_of_slots; i++) {
         const Slot *slot = &p->program.slots[i];
@@ -144,7 +67,7 @@ static bool measure_seen(PyProgram *p, Py_ssize_t count) {
 }
 
 typedef struct {
-    PyObject *calls, *rows, *tables;
+    PyObject *rows, *tables;
     const char *code, *constants, *slots;
     Py_ssize_t code_size, constants_size, slots_size, registers, seen;
     PyObject *results;
@@ -152,10 +75,10 @@ typedef struct {
 
 static bool parse(PyObject *parts, Parts *found) {
     return PyArg_ParseTuple(
-        parts, "y#y#y#O!O!O!nnO!;a program", &found->code, &found->code_size, &found->constants,
-        &found->constants_size, &found->slots, &found->slots_size, &PyTuple_Type, &found->calls,
-        &PyTuple_Type, &found->rows, &PyTuple_Type, &found->tables, &found->registers, &found->seen,
-        &PyTuple_Type, &found->results);
+        parts, "y#y#y#O!O!nnO!;a program", &found->code, &found->code_size, &found->constants,
+        &found->constants_size, &found->slots, &found->slots_size, &PyTuple_Type, &found->rows,
+        &PyTuple_Type, &found->tables, &found->registers, &found->seen, &PyTuple_Type,
+        &found->results);
 }
 
 static bool take_results(Program *program, PyObject *results) {
@@ -173,12 +96,10 @@ static bool take_results(Program *program, PyObject *results) {
 }
 
 static bool allocate(PyProgram *p, const Parts *parts) {
-    const size_t calls = (size_t)PyTuple_Size(parts->calls),
-                 rows = (size_t)PyTuple_Size(parts->rows),
-                 tables = (size_t)PyTuple_Size(parts->tables);
+    const size_t rows = (size_t)PyTuple_Size(parts->rows);
+    const size_t tables = (size_t)PyTuple_Size(parts->tables);
 
     p->buffers = calloc(rows + tables + 1, sizeof *p->buffers);
-    p->calls = calloc(calls + 1, sizeof *p->calls);
     p->rows = calloc(rows + 1, sizeof *p->rows);
     p->tables = calloc(tables + 1, sizeof *p->tables);
     p->filled = malloc(((size_t)parts->constants_size / sizeof(Constant) + 1) * sizeof(Register));
@@ -186,20 +107,17 @@ static bool allocate(PyProgram *p, const Parts *parts) {
         .code = (const Instruction *)(const void *)parts->code,
         .constants = (const Constant *)(const void *)parts->constants,
         .slots = (const Slot *)(const void *)parts->slots,
-        .calls = p->calls,
         .rows = p->rows,
         .tables = p->tables,
         .length = (size_t)parts->code_size / sizeof(Instruction),
         .number_of_constants = (size_t)parts->constants_size / sizeof(Constant),
         .number_of_slots = (size_t)parts->slots_size / sizeof(Slot),
-        .number_of_calls = calls,
         .number_of_rows = rows,
         .number_of_tables = tables,
         .number_of_seen = (size_t)parts->seen,
         .registers = (size_t)parts->registers,
     };
-    if (p->buffers == NULL || p->calls == NULL || p->rows == NULL || p->tables == NULL ||
-        p->filled == NULL) {
+    if (p->buffers == NULL || p->rows == NULL || p->tables == NULL || p->filled == NULL) {
         PyErr_NoMemory();
         return false;
     }
@@ -257,7 +175,7 @@ bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyP
     program->parts = parts;
     if (!parse(parts, &found) || !allocate(program, &found) ||
         !take_rows(program, found.rows, count) || !take_tables(program, found.tables) ||
-        !take_calls(program, found.calls) || !is_sound(program, &found, count, action_elements)) {
+        !is_sound(program, &found, count, action_elements)) {
         return false;
     }
     fill_constants(program);
@@ -270,7 +188,6 @@ void release_program(PyProgram *program) {
         release_buffer(&program->buffers[i]);
     }
     free(program->buffers);
-    free(program->calls);
     free(program->rows);
     free(program->tables);
     free(program->filled);

@@ -13,7 +13,6 @@ typedef struct {
     PyObject *parts;
     Py_buffer *buffers;
     size_t number_of_buffers;
-    Called *calls;
     Row *rows;
     Table *tables;
     char *filled; /* the memory of the constants' registers */
@@ -35,6 +34,5 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
 
 /* Functions of the module */
 PyObject *py_evaluate(PyObject *module, PyObject *args);
-PyObject *py_is_free_loop(PyObject *module, PyObject *capsule);
 
 #endif

@@ -248,7 +248,7 @@ class ProcessPool(SavingPool):
 
     @property
     def rolls_out(self) -> bool:
-        """See ``Pool.rolls_out``; the program in Wine knows no loops of numpy."""
+        """See ``Pool.rolls_out``; the program in Wine runs no hooks."""
         return self.can_play and self._setup.wine is None
 
     def roll_out(self, *arrays: Any) -> int:

@@ -17,7 +17,6 @@ from fmugym import _native
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.native import NativePool
 from fmugym.pool.process.shared_memory import Arrays
-from fmugym.pool.ufuncs import loop_of, source_of
 
 __all__ = ["Departure", "Play", "PlayOfWorkers", "RollingWorker"]
 
@@ -33,7 +32,7 @@ class Play:
     step; then the counts of steps; then other rows.
 
     Attributes:
-        programs: As ``Program.with_rows`` makes them, with the sources of loops.
+        programs: As ``Program.with_rows`` makes them.
         actions: How actions are checked and kept, without the memory.
         copies: Pairs of rows.
         types: Those of the other rows.
@@ -99,9 +98,8 @@ class PlayOfWorkers:
         )
 
     def _portable(self, program: tuple[Any, ...]) -> tuple[Any, ...]:
-        code, constants, slots, calls, rows, *rest = program
-        sources = tuple((source_of(loop), *others) for loop, *others in calls)
-        return code, constants, slots, sources, tuple(map(self._number, rows)), *rest
+        code, constants, slots, rows, *rest = program
+        return code, constants, slots, tuple(map(self._number, rows)), *rest
 
     def _number(self, row: npt.NDArray[Any]) -> int:
         key = _address(row)
@@ -199,6 +197,5 @@ class RollingWorker:
 
 def _local(program: tuple[Any, ...], rows: Rows) -> tuple[Any, ...]:
     """A program of this process."""
-    code, constants, slots, sources, numbers, *rest = program
-    calls = tuple((loop_of(*source), *others) for source, *others in sources)
-    return code, constants, slots, calls, tuple(rows[number] for number in numbers), *rest
+    code, constants, slots, numbers, *rest = program
+    return code, constants, slots, tuple(rows[number] for number in numbers), *rest

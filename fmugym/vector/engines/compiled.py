@@ -23,9 +23,9 @@ from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.memory import Memory
+from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.trace import TracedTask, trace_hooks
+from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import (
     not_finite,
     restricted,
@@ -115,9 +115,7 @@ class CompiledEngine(BatchEngine):
         super()._assign(attributes)
         task: TracedTask | None = None
         try:
-            found = trace_hooks(self.env, self._columns)
-            require_same(self.env, Readings.of(self.env), found)
-            task = found
+            task = compile_hooks(self.env, [Readings.of(self.env)], self._columns)
         except ordinary(Exception) as reason:  # as in find_programs
             logger.info("the hooks cannot be compiled any more: %s", reason)
         finally:

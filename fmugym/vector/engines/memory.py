@@ -13,12 +13,12 @@ from fmugym.env import FMUEnv
 from fmugym.pool.base import MaskArray
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.program import Row
+from fmugym.vector.hooks.program import Row, letter_of
 from fmugym.vector.hooks.trace import TracedTask
 
 __all__ = ["Memory"]
 
-_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3, np.dtype(np.float16): 4}
+_FLOAT_CHECKS = {np.dtype(np.float64): 2, np.dtype(np.float32): 3}
 """The numbers of ``ActionCheck`` in ``native/play.h``: what refuses a NaN."""
 
 
@@ -119,7 +119,7 @@ class Memory:
         flat = [actions.reshape(-1) for actions in self.actions]
         return {
             "shape": self.actions[0].shape[1:],
-            "letter": {"f": "d", "i": "q", "u": "Q", "b": "?"}[dtype.kind],
+            "letter": letter_of(dtype),
             "size": dtype.itemsize,
             "check": check,
             "lowest": low,

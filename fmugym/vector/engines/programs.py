@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from types import MappingProxyType
+from typing import Any
+
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
+from fmugym.task.readings import Readings
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import UntraceableError
+from fmugym.vector.hooks.program import DifferenceError, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 
-__all__ = ["find_programs"]
+__all__ = ["compile_hooks", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
@@ -36,10 +42,7 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
     """
     try:
         _require_playable(env)
-        task = trace_hooks(env)
-        require_same(env, sample_states(env, (1.0,)), task)
-        with suppress(IndexError):  # hooks may look up what is not in their tables
-            require_same(env, sample_states(env, _WILD_SCALES), task)
+        task = compile_hooks(env, [sample_states(env, s) for s in ((1.0,), _WILD_SCALES)])
     except ordinary(Exception) as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
@@ -52,6 +55,35 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
             raise ConfigError(text)
         logger.info("%s. It runs on arrays, the others are compiled", text)
     return task
+
+
+def compile_hooks(
+    env: FMUEnv,
+    batches: Sequence[Readings],
+    attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
+) -> TracedTask:
+    """Trace hooks, and leave those to Python whose programs give other values than they.
+
+    Args:
+        env: A prototype whose hooks work on arrays.
+        batches: What the hooks read where they are compared; only in the first one, they must find
+            all that they look up in their tables.
+        attributes: Those that have one number for each environment, by name.
+
+    Raises:
+        UntraceableError: As ``trace_hooks`` does.
+    """
+    refused: dict[str, str] = {}
+    while True:
+        task = trace_hooks(env, attributes, refused)
+        try:
+            require_same(env, batches[0], task)
+            for batch in batches[1:]:
+                with suppress(IndexError):
+                    require_same(env, batch, task)
+            return task
+        except DifferenceError as difference:
+            refused[difference.hook] = str(difference)
 
 
 def _require_playable(env: FMUEnv) -> None:

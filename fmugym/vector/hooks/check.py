@@ -173,15 +173,20 @@ def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     return visited
 
 
-def states_around(env: FMUEnv) -> list[Visited]:
-    """Draw states around the one that a single environment has now."""
+def states_around(env: FMUEnv, reaches: Sequence[float]) -> list[Visited]:
+    """Draw states around the one that a single environment has now.
+
+    Args:
+        env: The environment.
+        reaches: How far each is from there, relative to the magnitudes of the values.
+    """
     rng, now = np.random.default_rng(0), env._readings
     centres = [np.array(values, np.float64) for values in (now.values, now.values, now.inputs)]
 
     def moved(reach: float) -> Any:
         return tuple(c + reach * (1 + abs(c)) * rng.normal(size=len(c)) for c in centres)
 
-    return [moved(reach) for reach in (0.01, 0.1, 1.0, 1.0)]
+    return [moved(reach) for reach in reaches]
 
 
 def _imagine_states(pool: Pool, rng: np.random.Generator) -> list[Visited]:

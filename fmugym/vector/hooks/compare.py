@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,14 @@ from fmugym.task import spaces as fmu_spaces
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.program import Row, UntraceableError, evaluate, writes_variable
+from fmugym.vector.hooks.graph import TOLERANCES
+from fmugym.vector.hooks.program import (
+    DifferenceError,
+    Row,
+    UntraceableError,
+    evaluate,
+    writes_variable,
+)
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.views import copied
 
@@ -22,7 +29,12 @@ __all__ = ["require_same"]
 
 
 def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
-    """Run programs in C and hooks on arrays, and compare all results to the last bit.
+    """Run programs in C and hooks on arrays, and compare all results.
+
+    They must be equal to the last bit: NaNs are equal, zeros of different sign are not. Where hooks
+    use functions of the C library or multiply matrices, floats may differ by the tolerance of the
+    task, times the largest of all results. Booleans and integers may not: a flag that hangs on
+    such a last bit is no program's.
 
     Args:
         env: The environment with the hooks.
@@ -30,8 +42,8 @@ def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
         task: The programs.
 
     Raises:
-        UntraceableError: If a result differs. NaNs are equal, zeros of different sign are not. The
-            last bits may differ if hooks multiply matrices.
+        DifferenceError: If a result differs.
+        UntraceableError: If another hook than ``_update`` writes a variable.
     """
     own = copied(batch)
     with np.errstate(all="ignore"), borrowed(env, outside=True), reading(env, own):
@@ -164,13 +176,9 @@ class _Comparison:
     def _require_equal(
         self, hook: str, value: npt.NDArray[Any], expected: npt.NDArray[Any]
     ) -> None:
-        same = _nearly_equal if self._task.is_inexact else _equal
-        if not same(value, expected):
-            raise UntraceableError(f"the program gives other values than {hook}")
-
-
-_TOLERANCE: Final = {4: 1e-5, 8: 1e-9}
-"""Relative to the largest value: sums of products may cancel. By bytes of a float."""
+        tolerance = self._task.tolerance
+        if not _equal(value, expected) and not _nearly_equal(value, expected, tolerance):
+            raise DifferenceError(hook)
 
 
 def _equal(value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> bool:
@@ -183,11 +191,10 @@ def _equal(value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> bool:
     return same
 
 
-def _nearly_equal(value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> bool:
-    """Whether arrays are equal but for the order in which sums were rounded."""
-    if value.dtype.kind != "f":
-        return _equal(value, expected)
-    sizes = np.abs(expected[np.isfinite(expected)])
-    tolerance = _TOLERANCE[value.dtype.itemsize]
-    limit = tolerance * float(np.max(sizes, initial=0.0))
-    return bool(np.allclose(value, expected, rtol=tolerance, atol=limit, equal_nan=True))
+def _nearly_equal(value: npt.NDArray[Any], expected: npt.NDArray[Any], tolerance: float) -> bool:
+    """Whether floats differ by a part of the largest one: sums may cancel."""
+    if value.dtype.kind != "f" or tolerance == 0.0:
+        return False
+    part = max(tolerance, TOLERANCES[value.dtype.itemsize])
+    largest = float(np.max(np.abs(expected[np.isfinite(expected)]), initial=0.0))
+    return bool(np.allclose(value, expected, rtol=part, atol=part * largest, equal_nan=True))

@@ -6,28 +6,25 @@ are written, as numpy does along any axis but the one that is contiguous in memo
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
-from fmugym.vector.hooks import nans, products, sorting, tables
-from fmugym.vector.hooks.graph import CLIP, Graph
-from fmugym.vector.hooks.program import UntraceableError, letter_of
+from fmugym.vector.hooks import products, tables
+from fmugym.vector.hooks.graph import Graph
+from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of, operation_of
 from fmugym.vector.hooks.symbols import (
     Symbols,
     as_symbols,
     each,
     graph_of,
     handlers,
-    has_symbols,
     lift,
-    stand_in,
 )
 
-__all__ = ["full_like"]
+__all__ = ["COMPOSED", "full_like"]
 
 # Functions element by element.
 
@@ -36,24 +33,18 @@ def call_ufunc(
     graph: Graph, ufunc: Any, method: str, inputs: tuple[Any, ...], keywords: dict[str, Any]
 ) -> Any:
     """Do what numpy's ``__array_ufunc__`` asks for."""
-    out = keywords.pop("out", None)
-    if ufunc in products.UFUNCS and method == "__call__":
-        result = products.UFUNCS[ufunc](*inputs, **keywords)
-    elif method == "__call__" and ufunc.nout > 1:
-        results = _applied_all(graph, ufunc, inputs, **keywords)
-        return results if out is None else tuple(map(_into_given, out, results))
-    elif method == "__call__":
-        result = _applied(graph, ufunc, inputs, out, **keywords)
+    (out,) = keywords.pop("out", (None,))
+    if ufunc is np.divmod and method == "__call__" and not keywords:
+        return np.floor_divide(*inputs), np.remainder(*inputs)
+    if ufunc is np.matmul and method == "__call__":
+        result = products.matmul(*inputs, **keywords)
+    elif method == "__call__" and ufunc.nout == 1 and ufunc.signature is None:
+        result = _applied(graph, ufunc, inputs, **keywords)
     elif method == "reduce":
         result = _reduced(graph, ufunc, *inputs, **keywords)
-    elif method == "accumulate":
-        result = _accumulated(graph, ufunc, *inputs, **keywords)
     else:
-        raise UntraceableError(f"it uses numpy.{ufunc.__name__}.{method}")
-    return result if out is None else _into_given(out[0], result)
-
-
-def _into_given(out: Any, result: Symbols) -> Any:
+        name = ufunc.__name__ if method == "__call__" else f"{ufunc.__name__}.{method}"
+        raise UntraceableError(f"it uses numpy.{name}")
     return result if out is None else _into(out, result)
 
 
@@ -66,82 +57,133 @@ def _into(out: Any, result: Symbols) -> Any:
     return out
 
 
-def _kind_of(value: Any) -> Any:
+def _kind_of(graph: Graph, value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
     if isinstance(value, Symbols) and value.weak is not None:
         return value.weak
-    return type(value) if type(value) in (int, float) else np.asarray(value).dtype
+    return type(value) if type(value) in (int, float) else as_symbols(graph, value).dtype
 
 
-def _operand(graph: Graph, value: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
+def _type_of(graph: Graph, values: Sequence[Any]) -> np.dtype[Any]:
+    """The type to which numpy converts all of some values."""
+    kinds = [_kind_of(graph, value) for value in values]
+    dtype = np.result_type(*(kind(1) if isinstance(kind, type) else kind for kind in kinds))
+    letter_of(dtype)
+    return dtype
+
+
+def _operand(graph: Graph, value: Any, dtype: np.dtype[Any]) -> Symbols:
     if type(value) in (int, float):
-        return lift(graph, np.asarray(value, dtype)).cells
-    return as_symbols(graph, value).cast(dtype).cells
-
-
-def _symbols_of(graph: Graph, value: Any) -> Any:
-    is_list = isinstance(value, list | tuple)
-    return as_symbols(graph, value) if is_list and has_symbols(value) else value
+        return lift(graph, np.asarray(value, dtype))
+    return as_symbols(graph, value).cast(dtype)
 
 
 def _applied(
     graph: Graph,
     ufunc: Any,
     inputs: tuple[Any, ...],
-    out: Any = None,
     dtype: Any = None,
     casting: Any = "same_kind",
     where: Any = True,
     subok: bool = True,
 ) -> Symbols:
-    inputs = tuple(_symbols_of(graph, value) for value in inputs)
-    *types, result = _types_of(ufunc, inputs, dtype)
-    cells = _operands(graph, inputs, types)
-    combined = each(lambda *operands: graph.apply(ufunc, operands, result), *cells)
-    values = Symbols(graph, combined, result)
-    return values if where is True else _where_else(ufunc, where, values, out)
+    if where is not True:
+        raise UntraceableError(f"it uses numpy.{ufunc.__name__} with where: use numpy.where")
+    *types, result = _types_of(graph, ufunc, inputs, dtype)
+    operands = [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
+    values = _computed(graph, ufunc, operands, result)
+    if values.dtype != result:
+        raise UntraceableError(f"it uses numpy.{ufunc.__name__} of {types[0]}")
+    return values
 
 
-def _types_of(ufunc: Any, inputs: tuple[Any, ...], dtype: Any) -> tuple[np.dtype[Any], ...]:
-    """The types of the loop that numpy would choose, the results last."""
-    kinds = [_kind_of(value) for value in inputs]
-    results = [None] * ufunc.nout
+def _types_of(
+    graph: Graph, ufunc: Any, inputs: tuple[Any, ...], dtype: Any
+) -> tuple[np.dtype[Any], ...]:
+    """The types of the loop that numpy would choose, the result last."""
+    kinds = [_kind_of(graph, value) for value in inputs]
     signature = {} if dtype is None else {"signature": (*(None for _ in inputs), np.dtype(dtype))}
-    types: tuple[np.dtype[Any], ...] = ufunc.resolve_dtypes((*kinds, *results), **signature)
+    types: tuple[np.dtype[Any], ...] = ufunc.resolve_dtypes((*kinds, None), **signature)
     for one in types:
         letter_of(one)
     return types
 
 
-def _operands(
-    graph: Graph, inputs: tuple[Any, ...], types: Sequence[np.dtype[Any]]
-) -> list[npt.NDArray[Any]]:
-    return [_operand(graph, value, t) for value, t in zip(inputs, types, strict=True)]
+def _computed(
+    graph: Graph, ufunc: Any, operands: Sequence[Symbols], result: np.dtype[Any]
+) -> Symbols:
+    """Values of a function by its operation, by that of a wider type, or composed of others."""
+    dtype = operands[0].dtype
+    wider = np.dtype(np.bool_) if ufunc in _LOGICAL else _WIDER.get(dtype, dtype)
+    is_wider = operation_of(ufunc, letter_of(dtype)) is None
+    operation = operation_of(ufunc, letter_of(wider))
+    if is_wider and operation is not None:
+        if is_function(operation):
+            graph.tolerate(dtype)  # numpy computes it with the type that it has
+        wide = [one.cast(wider) for one in operands]
+        kept = wider if result == np.float32 else result
+        return _computed(graph, ufunc, wide, kept).cast(result)
+    if is_wider and ufunc in _MADE_OF:
+        composed: Symbols = _MADE_OF[ufunc](*operands)
+        return composed
+    cells = [one.cells for one in operands]
+    return Symbols(graph, each(lambda *some: graph.apply(ufunc, some, result), *cells), result)
 
 
-def _applied_all(graph: Graph, ufunc: Any, inputs: tuple[Any, ...], **keywords: Any) -> Any:
-    """The results of a function that has several."""
-    if keywords:
-        raise UntraceableError(f"it uses an argument of numpy.{ufunc.__name__}")
-    inputs = tuple(_symbols_of(graph, value) for value in inputs)
-    types = _types_of(ufunc, inputs, None)
-    results = types[ufunc.nin :]
-    cells = _operands(graph, inputs, types[: ufunc.nin])
+_LOGICAL: Final = {np.logical_and, np.logical_or, np.logical_xor, np.logical_not}
 
-    def part(index: int, dtype: np.dtype[Any]) -> Symbols:
-        found = each(lambda *operands: graph.part(ufunc, index, operands, results), *cells)
-        return Symbols(graph, found, dtype)
-
-    return tuple(part(index, dtype) for index, dtype in enumerate(results))
+_WIDER: Final[Mapping[Any, np.dtype[Any]]] = {
+    np.dtype(np.float32): np.dtype(np.float64),
+    np.dtype(np.bool_): np.dtype(np.int64),
+}
 
 
-def _where_else(ufunc: Any, where: Any, values: Symbols, out: Any) -> Symbols:
-    """The values where a condition holds; what was in the output array elsewhere."""
-    if out is None or out[0] is None:
-        raise UntraceableError(f"it uses numpy.{ufunc.__name__} with where, but without out")
-    if not np.can_cast(values.dtype, out[0].dtype, "same_kind"):
-        raise UntraceableError(f"it writes {values.dtype} to an array of {out[0].dtype}")
-    return _where(where, values.cast(out[0].dtype), out[0])
+def _same(x: Any) -> Any:
+    return x
+
+
+def _ratio(x: Any, first: float, second: float) -> Any:
+    """A quotient in the type of some values."""
+    return x.dtype.type(first) / x.dtype.type(second)
+
+
+def _sign(x: Any) -> Any:
+    return np.where(x > 0, 1, np.where(x < 0, -1, x + 0)).astype(x.dtype)
+
+
+def _whole_power(base: Any, exponent: Any) -> Any:
+    """Multiply an integer by itself; a negative power would be an error."""
+    known = {base.graph.value(cell) for cell in exponent.cells.reshape(-1)}
+    (times,) = known if len(known) == 1 else (None,)
+    if times is None or not 0 <= times <= _LARGEST_POWER:
+        raise UntraceableError("it raises integers to a power that is not a small constant")
+    result = np.ones_like(base)
+    for _ in range(times):
+        result = result * base
+    return result
+
+
+_LARGEST_POWER: Final = 64
+
+_MADE_OF: Final[Mapping[Any, Callable[..., Any]]] = {
+    **dict.fromkeys((np.floor, np.ceil, np.trunc, np.conjugate), _same),
+    **dict.fromkeys((np.degrees, np.rad2deg), lambda x: x * _ratio(x, 180.0, np.pi)),
+    **dict.fromkeys((np.radians, np.deg2rad), lambda x: x * _ratio(x, np.pi, 180.0)),
+    import_module("numpy._core._multiarray_umath").clip: lambda x, low, high: np.minimum(
+        high, np.maximum(low, x)
+    ),
+    np.absolute: lambda x: np.where(x < 0, -x, x),
+    np.fabs: abs,
+    np.square: lambda x: x * x,
+    np.reciprocal: lambda x: 1.0 / x,
+    np.isnan: lambda x: x != x,
+    np.isinf: lambda x: (x == x) & (x - x != 0),
+    np.isfinite: lambda x: x - x == 0,
+    np.signbit: lambda x: np.copysign(1.0, x) < 0,
+    np.sign: _sign,
+    np.power: _whole_power,
+}
+"""Functions that others make up, of values without an operation of their own."""
 
 
 def _reduced(
@@ -155,58 +197,30 @@ def _reduced(
     where: Any = True,
 ) -> Symbols:
     """Combine the elements along some axes in their order."""
+    if where is not True or initial not in (None, np._NoValue):
+        raise UntraceableError(f"it uses an argument of numpy.{ufunc.__name__}.reduce")
     symbols = as_symbols(graph, array)
-    sample = ufunc.reduce(np.ones(1, symbols.dtype), dtype=dtype)
+    wanted = ufunc.reduce(np.ones(1, symbols.dtype), dtype=dtype).dtype
     axes = range(symbols.ndim) if axis is None else (axis,) if np.ndim(axis) == 0 else axis
     places = sorted(np.atleast_1d(np.arange(symbols.ndim)[list(axes)]).tolist())
-    order = [*places, *(i for i in range(symbols.ndim) if i not in places)]
-    cells = symbols.cells.transpose(order)
+    cells = np.moveaxis(symbols.cells, places, range(len(places)))
     rest = cells.shape[len(places) :]
-    terms = [symbols.like(row) for row in cells.reshape(-1, *rest)]
-    start = _START.get(ufunc) if initial is None or initial is np._NoValue else initial
-    masks: list[Any] = [True] * len(terms)
-    if where is not True:
-        mask = as_symbols(graph, where)
-        shaped = np.broadcast_to(mask.cells, symbols.shape).transpose(order)
-        masks = [mask.like(row) for row in shaped.reshape(-1, *rest)]
-    total = _folded(ufunc, terms, masks, start, np.dtype(sample.dtype))
-    if not keepdims:
-        return total
+    terms = [symbols.like(row).cast(wanted) for row in cells.reshape(-1, *rest)]
+    if ufunc.identity is not None:
+        terms.insert(0, lift(graph, np.full(rest, ufunc.identity, wanted)))
+    total: Any = _row_of(ufunc, terms)
     lengths = [1 if i in places else n for i, n in enumerate(symbols.shape)]
-    return total.like(total.cells.reshape(lengths))
+    result: Symbols = total.like(total.cells.reshape(lengths)) if keepdims else total
+    return result
 
 
-_START: Final[Mapping[Any, Any]] = {
-    np.add: 0,
-    np.multiply: 1,
-    np.logical_and: True,
-    np.logical_or: False,
-}
-"""What numpy starts a reduction with; others start with the first element."""
-
-
-def _folded(
-    ufunc: Any, terms: list[Symbols], masks: list[Any], start: Any, dtype: np.dtype[Any]
-) -> Symbols:
-    if start is None and not (terms and masks[0] is True):
-        raise ValueError("reduction operation has no identity: it needs a term, or initial")
-    terms = [term.cast(np.bool_ if dtype == np.bool_ else dtype) for term in terms]
-    total: Any = terms[0] if start is None else np.asarray(start, dtype)
-    for term, mask in list(zip(terms, masks, strict=True))[start is None :]:
-        longer = ufunc(total, term)
-        total = longer if mask is True else _where(mask, longer, total)
-    return total if isinstance(total, Symbols) else np.zeros_like(terms[0]) + total
-
-
-def _accumulated(
-    graph: Graph, ufunc: Any, array: Any, axis: Any = 0, dtype: Any = None, **_: Any
-) -> Symbols:
-    symbols = as_symbols(graph, array)
-    wanted = np.dtype(ufunc.reduce(np.ones(1, symbols.dtype), dtype=dtype).dtype)
-    rows = [symbols.like(row).cast(wanted) for row in np.moveaxis(symbols.cells, axis, 0)]
-    for index in range(1, len(rows)):
-        rows[index] = ufunc(rows[index - 1], rows[index])
-    return rows[0].like(np.moveaxis(np.stack([row.cells for row in rows]), 0, axis))
+def _row_of(ufunc: Any, terms: Sequence[Any]) -> Any:
+    if not terms:
+        raise ValueError("reduction operation has no identity: it needs a term")
+    total = terms[0]
+    for term in terms[1:]:
+        total = ufunc(total, term)
+    return total
 
 
 # Functions of arrays.
@@ -219,7 +233,7 @@ def call_function(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]
         return own(*args, **keywords)
     if function in _REARRANGING:
         return _rearranged(function, args, keywords)
-    if function in _COMPOSED:
+    if function in COMPOSED:
         return function._implementation(*args, **keywords)
     raise UntraceableError(f"it uses {function.__module__}.{function.__name__}")
 
@@ -230,9 +244,7 @@ def _rearranged(function: Any, args: tuple[Any, ...], keywords: dict[str, Any]) 
     graph = graph_of(first)
     is_list = isinstance(first, list | tuple)
     parts = [as_symbols(graph, part) for part in first] if is_list else [as_symbols(graph, first)]
-    dtype = parts[0].dtype
-    for part in parts[1:]:
-        dtype = np.promote_types(dtype, part.dtype)
+    dtype = np.result_type(*(part.dtype for part in parts))
     cells = [part.cast(dtype).cells for part in parts]
     result = function(cells if is_list else cells[0], *rest, **keywords)
     if isinstance(result, list | tuple):
@@ -249,39 +261,20 @@ def _broadcast_arrays(*arrays: Any, subok: bool = False) -> Any:
 
 def _where(condition: Any, first: Any, second: Any) -> Symbols:
     graph = graph_of(condition, first, second)
-    dummies = [stand_in(graph, value) for value in (first, second)]
-    dtype = np.where(np.ones(1, np.bool_), *dummies).dtype
-    letter_of(dtype)
+    dtype = _type_of(graph, (first, second))
     chosen = as_symbols(graph, condition).cast(np.bool_)
-    cells = [_operand(graph, _symbols_of(graph, value), dtype) for value in (first, second)]
-    return Symbols(graph, each(graph.choose, chosen.cells, *cells), dtype)
+    values = [_operand(graph, value, dtype) for value in (first, second)]
+    cells = each(graph.choose, chosen.cells, *(one.cells for one in values))
+    return Symbols(graph, cells, dtype)
 
 
 def _select(condlist: Any, choicelist: Any, default: Any = 0) -> Any:
     graph = graph_of(condlist, choicelist, default)
-    values = [*choicelist, default]
-    dtype = np.result_type(*(stand_in(graph, value) for value in values))
+    dtype = _type_of(graph, [*choicelist, default])
     result: Any = as_symbols(graph, default).cast(dtype)
     for condition, choice in zip(reversed(condlist), reversed(choicelist), strict=True):
         result = _where(condition, as_symbols(graph, choice).cast(dtype), result)
     return result
-
-
-def _clip(a: Any, a_min: Any = None, a_max: Any = None, out: Any = None, **keywords: Any) -> Any:
-    low, high = keywords.pop("min", a_min), keywords.pop("max", a_max)
-    graph = graph_of(a, low, high)
-    symbols = as_symbols(graph, a)
-    if keywords:
-        raise UntraceableError("it uses an argument of numpy.clip")
-    if low is None and high is None:
-        result: Any = symbols.copy()
-    elif low is None:
-        result = np.minimum(symbols, high)
-    elif high is None:
-        result = np.maximum(symbols, low)
-    else:
-        result = CLIP(symbols, low, high)
-    return result if out is None else _into(out, result)
 
 
 def _filled(value: Any) -> Callable[..., Symbols]:
@@ -305,93 +298,29 @@ def full_like(a: Any, fill_value: Any, dtype: Any = None, **_: Any) -> Symbols:
 
 
 def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:  # noqa: A002  (numpy's)
-    """The norm of vectors; numpy computes others with its linear algebra."""
-    if axis is None or np.ndim(axis) != 0 or ord not in (None, 2, 1, np.inf):
-        raise UntraceableError("it uses numpy.linalg.norm without one axis")
+    """The length of vectors; numpy computes others with its linear algebra."""
+    if axis is None or np.ndim(axis) != 0 or ord not in (None, 2):
+        raise UntraceableError("it uses numpy.linalg.norm without one axis, or not of lengths")
     symbols = x if x.dtype.kind == "f" else x.astype(np.float64)
-    add: Any = np.add
-    if ord == 1:
-        return add.reduce(np.absolute(symbols), axis=axis, keepdims=keepdims)
-    if ord == np.inf:
-        return np.max(np.absolute(symbols), axis=axis, keepdims=keepdims)
-    return np.sqrt(add.reduce(symbols * symbols, axis=axis, keepdims=keepdims))
-
-
-def _flat(a: Any, axis: Any) -> tuple[Symbols, int]:
-    """Symbols and an axis; without one, numpy takes all elements in a row."""
-    symbols = as_symbols(graph_of(a), a)
-    if axis is not None:
-        return symbols, axis
-    return symbols.like(symbols.cells.ravel()), 0
-
-
-def _accumulating(ufunc: Any) -> Callable[..., Any]:
-    def accumulate(a: Any, axis: Any = None, dtype: Any = None, out: Any = None) -> Any:
-        symbols, axis = _flat(a, axis)
-        return ufunc.accumulate(symbols, axis, dtype, None if out is None else (out,))
-
-    return accumulate
+    return np.sqrt(np.sum(symbols * symbols, axis=axis, keepdims=keepdims))
 
 
 def _arg_extreme(is_better: Any) -> Callable[..., Symbols]:
     """The index of the first extreme value, or of the first NaN."""
 
     def find(a: Any, axis: Any = None, out: Any = None, *, keepdims: Any = False) -> Any:
-        symbols, axis = _flat(a, axis)
-        if out is not None:
-            raise UntraceableError("it writes the place of an extreme value to an array")
-        rows = [symbols.like(row) for row in np.moveaxis(symbols.cells, axis, 0)]
-        best: Any = rows[0]
+        symbols = as_symbols(graph_of(a), a)
+        if out is not None or keepdims is True:
+            raise UntraceableError("it uses an argument of numpy.argmax or numpy.argmin")
+        cells = symbols.cells.ravel() if axis is None else np.moveaxis(symbols.cells, axis, 0)
+        best: Any = symbols.like(cells[0])
         index: Any = np.zeros_like(best, np.intp)
-        for number, row in enumerate(rows[1:], 1):
+        for number, row in enumerate(map(symbols.like, cells[1:]), 1):
             better = (is_better(row, best) | (row != row)) & (best == best)
             best, index = np.where(better, row, best), np.where(better, np.intp(number), index)
-        return np.expand_dims(index, axis) if keepdims is True else index
+        return index
 
     return find
-
-
-def _piecewise(x: Any, condlist: Any, funclist: Any, *args: Any, **kw: Any) -> Any:
-    """Call all functions with all values, where numpy calls each with those that it is for."""
-    value = as_symbols(graph_of(x, condlist), x)
-    is_single = not isinstance(condlist, list | tuple) and np.ndim(condlist) == value.ndim
-    conditions = [condlist] if is_single else list(condlist)
-    if len(funclist) == len(conditions) + 1:
-        others = np.logical_not(functools.reduce(np.logical_or, conditions))
-        conditions = [*conditions, others]
-    result: Any = np.zeros_like(value)
-    for condition, function in zip(conditions, funclist, strict=True):
-        part = function(value, *args, **kw) if callable(function) else function
-        result = _where(condition, as_symbols(value.graph, part).cast(value.dtype), result)
-    return result
-
-
-def _isin(
-    element: Any, test_elements: Any, assume_unique: Any = False, invert: Any = False, **_: Any
-) -> Any:
-    value = as_symbols(graph_of(element), element)
-    flat = np.asarray(test_elements).reshape(-1)
-    if has_symbols(test_elements) or flat.size > _MOST_TESTED:
-        raise UntraceableError("numpy.isin has values to look for that are many or not constant")
-    found: Any = np.zeros_like(value, np.bool_)
-    for one in flat:
-        found = found | (value == one)
-    return np.logical_not(found) if invert else found
-
-
-_MOST_TESTED: Final = 64
-"""The most values that ``numpy.isin`` may look for."""
-
-
-def _putmask(a: Any, mask: Any, values: Any) -> None:
-    if np.ndim(values):
-        raise UntraceableError("it puts several values where a condition holds")
-    _copyto(a, values, where=mask)
-
-
-def _copyto(dst: Any, src: Any, casting: Any = "same_kind", where: Any = True) -> None:
-    graph = graph_of(dst)
-    dst[...] = src if where is True else _where(where, as_symbols(graph, src).cast(dst.dtype), dst)
 
 
 handlers.update(ufunc=call_ufunc, function=call_function)
@@ -399,25 +328,16 @@ handlers.update(ufunc=call_ufunc, function=call_function)
 _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
     **tables.FUNCTIONS,
     **products.FUNCTIONS,
-    **sorting.FUNCTIONS,
-    **nans.FUNCTIONS,
     np.where: _where,
     np.select: _select,
-    np.clip: _clip,
-    np.copyto: _copyto,
-    np.putmask: _putmask,
     np.argmax: _arg_extreme(np.greater),
     np.argmin: _arg_extreme(np.less),
-    np.piecewise: _piecewise,
-    np.isin: _isin,
     np.linalg.norm: _norm,
     np.zeros_like: _filled(0),
     np.empty_like: _filled(0),
     np.ones_like: _filled(1),
     np.full_like: full_like,
     np.broadcast_arrays: _broadcast_arrays,
-    np.cumsum: _accumulating(np.add),
-    np.cumprod: _accumulating(np.multiply),
     np.shape: lambda a: as_symbols(graph_of(a), a).shape,
     np.ndim: lambda a: as_symbols(graph_of(a), a).ndim,
     np.size: lambda a, axis=None: a.size if axis is None else a.shape[axis],
@@ -425,9 +345,6 @@ _OWN: Final[Mapping[Any, Callable[..., Any]]] = {
     np.result_type: lambda *values: np.result_type(
         *(np.empty(0, v.dtype) if isinstance(v, Symbols) else v for v in values)
     ),
-    np.iscomplexobj: lambda x: False,
-    np.isrealobj: lambda x: True,
-    np.real: lambda val: val,
 }
 
 _REARRANGING: Final = frozenset(
@@ -439,18 +356,9 @@ _REARRANGING: Final = frozenset(
 )
 """Functions whose first argument is an array or a list of arrays, and that move elements."""
 
-_COMPOSED: Final = frozenset(
+COMPOSED: Final = frozenset(
     {np.sum, np.prod, np.mean, np.std, np.var, np.any, np.all, np.max, np.min, np.amax, np.amin}
-    | {np.round, np.around, np.ptp, np.diff, np.polyval, np.isclose}
-    | {
-        np.sinc,
-        np.average,
-        getattr(np, "trapezoid", None),
-        np.gradient,
-        np.append,
-        np.angle,
-        np.count_nonzero,
-    }
-    | {np.fix, np.real_if_close}
+    | {np.round, np.around, np.clip, np.ptp, np.diff, np.polyval, np.isclose, np.append}
+    | {np.average, np.fix, np.count_nonzero}
 )
 """Functions that numpy composes of others."""

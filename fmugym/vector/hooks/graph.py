@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Callable, Hashable, Mapping
-from importlib import import_module
+from collections.abc import Callable, Hashable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.vector.hooks.program import UntraceableError, letter_of
+from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of, operation_of
 
-__all__ = ["CLIP", "Cell", "Graph", "Node"]
+__all__ = ["TOLERANCES", "Cell", "Graph", "Node"]
 
 
 class Node(NamedTuple):
@@ -21,7 +18,7 @@ class Node(NamedTuple):
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
-            ``missing``, ``ufunc``, ``part``, ``cast``, ``where``, ``take`` or ``interpolate``.
+            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
         what: The value, the row, the element, the reason, the function or the table.
         operands: The numbers of the nodes that it is computed from.
         dtype: The type of the value.
@@ -52,7 +49,8 @@ class Graph:
 
     Attributes:
         tables: The values to look up.
-        is_inexact: Whether the last bits of results may differ from those of hooks on arrays.
+        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
+            one.
         array_type: The class of symbolic arrays, if it is not ``Symbols``.
     """
 
@@ -62,7 +60,11 @@ class Graph:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self.tables: dict[Hashable, npt.NDArray[Any]] = {}
-        self.is_inexact = False
+        self.tolerance = 0.0
+
+    def tolerate(self, dtype: np.dtype[Any]) -> None:
+        """Note that values of this type are not computed as numpy computes them."""
+        self.tolerance = max(self.tolerance, TOLERANCES[dtype.itemsize])
 
     def node(self, cell: Cell) -> Node:
         """The node of a cell."""
@@ -117,42 +119,24 @@ class Graph:
         return self.compute("where", None, (condition, first, second), dtype, np.where)
 
     def apply(self, ufunc: np.ufunc, cells: tuple[Cell, ...], dtype: np.dtype[Any]) -> Cell:
-        """A function of numpy of values that have the types of one of its loops."""
+        """A function of numpy of values that have the types of one of its loops.
+
+        Raises:
+            UntraceableError: If programs do not have it for these types.
+        """
         if ufunc in _IDENTITIES:
             return cells[0]
-        if ufunc is CLIP and dtype.kind == "f" and all(map(self._is_limit, cells[1:])):
-            value, low, high = cells
-            raised = self.apply(np.maximum, (value, low), dtype)
-            return self.apply(np.minimum, (raised, high), dtype)
-        _require_free(self, ufunc, cells, dtype)
+        letters = {letter_of(self.node(cell).dtype) for cell in cells}
+        operation = operation_of(ufunc, letters.pop()) if len(letters) == 1 else None
+        if operation is None:
+            raise UntraceableError(f"it uses numpy.{ufunc.__name__} of {dtype}")
+        if is_function(operation):
+            self.tolerate(dtype)
         return self.compute("ufunc", ufunc, cells, dtype, ufunc)
-
-    def _is_limit(self, cell: Cell) -> bool:
-        """Whether it is a constant to which ``numpy.clip`` limits as minimum and maximum do.
-
-        Of zeros with different signs and of NaNs, they may choose different ones.
-        """
-        value = self.value(cell)
-        return value is not None and bool(value != 0.0) and not np.isnan(value)
-
-    def part(
-        self,
-        ufunc: np.ufunc,
-        index: int,
-        cells: tuple[Cell, ...],
-        dtypes: tuple[np.dtype[Any], ...],
-    ) -> Cell:
-        """One of the results, whose types these are, of a function with several results."""
-        what = ufunc, index, dtypes
-        return self.compute("part", what, cells, dtypes[index], lambda *v: ufunc(*v)[index])
 
     def patched(self, own: Callable[..., Any], function: Any, args: Any, keywords: Any) -> Any:
         """Call what stands for a function of numpy that does not ask its arguments."""
         return own(self, function, *args, **keywords)
-
-    def find(self, node: Node) -> int | None:
-        """The number of an equal node; None if there is none."""
-        return self._numbers.get(node)
 
     def _number(self, node: Node) -> int:
         number = self._numbers.setdefault(node, len(self.nodes))
@@ -160,70 +144,8 @@ class Graph:
             self.nodes.append(node)
         return number
 
-    def is_always_finite(self, number: int) -> bool:
-        """Whether a value can be neither infinite nor NaN, whatever the program loads.
 
-        The values that a program loads are finite: the pool does not step with other inputs, and
-        an FMU with other outputs has failed. A bound of all magnitudes shows where arithmetic may
-        overflow.
-        """
-        bounds: list[float] = []
-        for node in self.nodes[: number + 1]:
-            bounds.append(self._bound(node, [bounds[operand] for operand in node.operands]))
-        return bounds[number] <= _LARGEST
-
-    def _bound(self, node: Node, bounds: list[float]) -> float:
-        if node.dtype.kind in "biu":
-            return _LARGEST if node.dtype.kind != "b" else 1.0
-        if node.kind == "constant":
-            bits: Any = node.what
-            constant = abs(float(np.frombuffer(bits, node.dtype)[0]))
-            return constant if constant <= _LARGEST else math.inf  # a NaN, too
-        if node.dtype.itemsize < 8:
-            return math.inf
-        if node.kind == "ufunc":
-            return _BOUNDS[node.what](bounds) if node.what in _BOUNDS else math.inf
-        if node.kind == "row":
-            row: Any = node.what
-            return _LARGEST if row[0] in _FINITE_ROWS else math.inf
-        if node.kind == "cast":
-            return bounds[0]
-        return max(bounds[1:]) if node.kind == "where" else math.inf
-
-
-_LARGEST: Final = sys.float_info.max
-
-_FINITE_ROWS: Final = frozenset({"output", "kept", "input", "parameter"})
-
-CLIP: Final[np.ufunc] = import_module("numpy._core._multiarray_umath").clip
-"""What ``numpy.clip`` calls. Numpy 1.26 has it under this name, too."""
+TOLERANCES: Final = {4: 1e-5, 8: 1e-12}
+"""By bytes of a float."""
 
 _IDENTITIES: Final = frozenset({np.positive, np.conjugate})
-
-_BOUNDS: Final[Mapping[Any, Callable[[list[float]], float]]] = {
-    np.add: sum,
-    np.subtract: sum,
-    np.multiply: lambda bounds: bounds[0] * bounds[1],
-    np.square: lambda bounds: bounds[0] * bounds[0],
-    np.negative: max,
-    np.absolute: max,
-    np.fabs: max,
-    np.minimum: max,
-    np.maximum: max,
-}
-"""Bounds of the magnitudes of results."""
-
-
-def _require_free(
-    graph: Graph, ufunc: np.ufunc, cells: tuple[Cell, ...], dtype: np.dtype[Any]
-) -> None:
-    """Refuse loops that may raise an exception: integers to a negative power do."""
-    if ufunc is np.power and dtype.kind == "i" and _may_be_negative(graph, cells[1]):
-        raise UntraceableError("it raises integers to a power that is not a constant")
-
-
-def _may_be_negative(graph: Graph, cell: Cell) -> bool:
-    exponent, node = graph.value(cell), graph.node(cell)
-    if exponent is not None:
-        return bool(exponent < 0)
-    return node.kind != "cast" or graph.nodes[node.operands[0]].dtype.kind not in "ub"

@@ -9,7 +9,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from fmugym.vector.hooks.graph import Graph, Node
-from fmugym.vector.hooks.loops import has_known_sines, loop_of, squares_nearly_exactly
 from fmugym.vector.hooks.program import (
     CONSTANT,
     MOST_REGISTERS,
@@ -20,30 +19,12 @@ from fmugym.vector.hooks.program import (
     Row,
     UntraceableError,
     letter_of,
+    operation_of,
 )
 
 __all__ = ["Store", "compile_graph"]
 
 _MOST_INSTRUCTIONS: Final = 20_000
-
-_OF_FLAGS: Final[dict[Any, str]] = {
-    np.logical_and: "and",
-    np.bitwise_and: "and",
-    np.logical_or: "or",
-    np.bitwise_or: "or",
-    np.logical_xor: "xor",
-    np.bitwise_xor: "xor",
-    np.not_equal: "xor",
-    np.logical_not: "not",
-    np.invert: "not",
-}
-"""Functions of Booleans that the pool computes itself."""
-
-_OF_ANGLES: Final[dict[Any, str]] = {np.sin: "call_sine", np.cos: "call_cosine"}
-"""Functions of which the pool computes most values itself."""
-
-_NAMES: Final[dict[Any, str]] = {np.fabs: "absolute"}
-"""Other names of functions that the pool computes itself."""
 
 
 class Store(NamedTuple):
@@ -104,7 +85,6 @@ class _Compiler:
         self._known: set[int] = set()
         self._constants: list[int] = []
         self._rows: dict[Row, int] = {}
-        self._calls: dict[Hashable, int] = {}
         self._tables: dict[Hashable, int] = {}
         self._slots: list[tuple[int, int, int, int]] = []
 
@@ -127,20 +107,9 @@ class _Compiler:
             return
         if node.kind == "missing":
             raise UntraceableError(str(node.what))
-        operation, extra = self._operation(node)
-        if operation == "call_cosine":
-            self._add_sibling(node, np.sin)
-        self._steps.append(_Step(operation, extra, number, node.operands))
-        if operation == "call_sine":
-            self._add_sibling(node, np.cos)
+        self._steps.append(_Step(*self._operation(node), number, node.operands))
         if len(self._steps) > _MOST_INSTRUCTIONS:
             raise UntraceableError(f"it has more than {_MOST_INSTRUCTIONS} operations")
-
-    def _add_sibling(self, node: Node, ufunc: np.ufunc) -> None:
-        """Put the sine and the cosine of an angle side by side: the pool computes both at once."""
-        number = self._graph.find(node._replace(what=ufunc))
-        if number is not None and number not in self._known:
-            self.evaluate(number)
 
     def observes_output(self, store: Store) -> bool:
         """Whether it stores an output of the FMU as a float32, as most observations do."""
@@ -203,57 +172,10 @@ class _Compiler:
                 return node.kind, self._place(self._tables, what)
             case "where":
                 return f"where {node.dtype.itemsize}", 0
-            case "scalar_power":
-                return f"scalar_power {letter_of(node.dtype)}", 0
-            case "cast":
-                source, target = self._letters(node)[0], letter_of(node.dtype)
-                return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(target)
-            case "part":
-                ufunc, index, results = what
-                return "call", self._call(node, ufunc, results, index)
-        return self._function(node, what)
-
-    def _letters(self, node: Node) -> list[str]:
-        return [letter_of(self._graph.nodes[operand].dtype) for operand in node.operands]
-
-    def _function(self, node: Node, ufunc: np.ufunc) -> tuple[str, int]:
-        letters = self._letters(node)
-        if set(letters) == {"?"} and ufunc in _OF_FLAGS:
-            return _OF_FLAGS[ufunc], 0
-        name = f"{_NAMES.get(ufunc, ufunc.__name__)} {letters[0]}"
-        if len(set(letters)) == 1 and name in OPERATIONS:
-            return name, 0
-        call = self._call(node, ufunc, (node.dtype,), 0)
-        return self._quick_name(node, ufunc), call
-
-    def _call(
-        self, node: Node, ufunc: np.ufunc, results: tuple[np.dtype[Any], ...], index: int
-    ) -> int:
-        """The number of a call of one of numpy's loops that keeps one of its results."""
-        if len(node.operands) > 3:
-            raise UntraceableError(f"numpy.{ufunc.__name__} has more than three arguments")
-        types = *(self._graph.nodes[operand].dtype for operand in node.operands), *results
-        loop_of(ufunc, types)
-        return self._place(self._calls, (ufunc, types, self._constant(node), index))
-
-    def _constant(self, node: Node) -> tuple[bool, ...]:
-        return tuple(self._graph.nodes[operand].kind == "constant" for operand in node.operands)
-
-    def _quick_name(self, node: Node, ufunc: np.ufunc) -> str:
-        """The operation that calls a loop: one that needs no call for most values, if there is."""
-        if set(self._letters(node)) == {"d"}:
-            if ufunc is np.remainder:
-                return "call_remainder"
-            if ufunc in _OF_ANGLES and has_known_sines():
-                return _OF_ANGLES[ufunc]
-        return "call_square" if self._is_square(node, ufunc) else "call"
-
-    def _is_square(self, node: Node, ufunc: np.ufunc) -> bool:
-        if ufunc is not np.float_power or self._constant(node) != (False, True):
-            return False
-        bits: Any = self._graph.nodes[node.operands[1]].what
-        is_two = node.dtype == np.float64 and bits == np.float64(2.0).tobytes()
-        return is_two and squares_nearly_exactly()
+        source = letter_of(self._graph.nodes[node.operands[0]].dtype)
+        if node.kind == "cast":
+            return "cast", TYPES.index(source) * len(TYPES) + TYPES.index(letter_of(node.dtype))
+        return str(operation_of(what, source)), 0
 
     def program(self, results: Sequence[int], seen: int) -> Program:
         """Place all values in registers."""
@@ -268,13 +190,11 @@ class _Compiler:
             code,
             self._constants_in(registers),
             np.array(self._slots, SLOT),
-            tuple(_call(*call) for call in self._calls),  # type: ignore[misc]  # mypy does not follow *call
             tuple(self._rows),
             tuple(self._graph.tables[key] for key in self._tables),
             max(registers.values(), default=-1) + 1,
             seen,
             tuple(registers[node] for node in results),
-            all(map(self._graph.is_always_finite, results)),
         )
 
     def _registers(self, results: Sequence[int]) -> dict[int, int]:
@@ -307,16 +227,3 @@ class _Compiler:
         if sys.byteorder == "little":
             return constants
         raise UntraceableError("this processor stores numbers in another order")
-
-
-def _call(
-    ufunc: np.ufunc, types: tuple[np.dtype[Any], ...], constant: tuple[bool, ...], index: int
-) -> tuple[Any, int, tuple[int, ...], int]:
-    """A loop and its strides. Constants have none, as numbers in hooks on arrays.
-
-    Loops may do something else then: ``numpy.power`` squares if the exponent is 2.
-    """
-    inputs = len(constant)
-    sizes = [0 if same else t.itemsize for t, same in zip(types, constant, strict=False)]
-    sizes += [t.itemsize for t in types[inputs:]]
-    return loop_of(ufunc, types), inputs, tuple(sizes), inputs + index

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.vector.hooks import nans, sorting, tables
-from fmugym.vector.hooks.functions import full_like
+from fmugym.vector.hooks import tables
+from fmugym.vector.hooks.functions import COMPOSED, full_like
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.symbols import LANES, as_symbols, has_symbols, lift
 
@@ -84,11 +84,9 @@ _OVERRIDING: Final[Mapping[str, Any]] = {
     **dict.fromkeys(("zeros", "ones", "full", "empty"), _made),
     **dict.fromkeys(("linspace", "arange"), _counted),
     **{function.__name__: _looked_up for function in tables.FUNCTIONS},
-    **dict.fromkeys(("sum", "prod", "mean", "std", "var", "any", "all", "max", "min"), _of_list),
-    **dict.fromkeys(("amax", "amin", "cumsum", "cumprod", "diff", "ptp", "moveaxis"), _of_list),
-    **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll"), _of_list),
-    **dict.fromkeys((one.__name__ for one in (*sorting.FUNCTIONS, *nans.FUNCTIONS)), _of_list),
-    **dict.fromkeys(("argmax", "argmin", "average", "dot", "cross", "inner"), _of_list),
+    **{function.__name__: _of_list for function in COMPOSED},
+    **dict.fromkeys(("transpose", "reshape", "ravel", "flip", "roll", "moveaxis"), _of_list),
+    **dict.fromkeys(("argmax", "argmin", "dot", "cross", "inner"), _of_list),
 }
 """What each function does with symbols, by its name."""
 

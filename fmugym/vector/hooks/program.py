@@ -1,12 +1,13 @@
 """Programs: hooks in the form that the native pool runs.
 
 A program is a list of instructions on typed registers, each for 128 environments at a time. The
-native pool runs it in the same pass as the FMU's step. What IEEE 754 settles is computed by the
-pool itself, everything else by the inner loops of numpy's own functions.
+native pool runs it in the same pass as the FMU's step. What IEEE 754 settles equals numpy to the
+last bit. Functions such as sines and powers are those of the C library.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -19,32 +20,44 @@ from fmugym.pool.extension import has_native_pool
 __all__ = [
     "OPERATIONS",
     "TYPES",
+    "DifferenceError",
     "Program",
     "UntraceableError",
     "evaluate",
+    "is_function",
     "letter_of",
+    "operation_of",
     "writes_variable",
 ]
 
+_OF_EACH_TYPE: Final = (
+    *("add", "subtract", "multiply", "negative", "minimum", "maximum"),
+    *("less", "less_equal", "greater", "greater_equal", "equal", "not_equal"),
+)
+
+_FUNCTIONS: Final = (
+    *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh"),
+    *("arcsinh", "arccosh", "arctanh", "exp", "exp2", "expm1", "log", "log2", "log10", "log1p"),
+    *("cbrt", "arctan2", "hypot", "power"),
+)
+"""Those of the C library, whose last bits may differ from numpy's."""
+
 OPERATIONS: Final = (
     *("load_row", "load_action", "load_previous_action", "load_active", "load_stopped"),
-    *("store_row", "store_seen", "store_floats", "call", "call_square", "call_remainder"),
-    *("call_sine", "call_cosine"),
-    *("cast", "take", "interpolate"),
-    *("add d", "subtract d", "multiply d", "divide d", "square d", "negative d", "absolute d"),
-    *("sqrt d", "minimum d", "maximum d"),
-    *("less d", "less_equal d", "greater d", "greater_equal d", "equal d", "not_equal d"),
-    *("add f", "subtract f", "multiply f", "divide f", "square f", "negative f", "absolute f"),
-    *("sqrt f", "minimum f", "maximum f"),
-    *("add q", "subtract q", "multiply q", "negative q"),
-    *("less q", "less_equal q", "greater q", "greater_equal q", "equal q", "not_equal q"),
-    *("and", "or", "xor", "not", "where 8", "where 4", "where 2", "where 1"),
-    *("scalar_power d", "scalar_power f"),
+    *("store_row", "store_seen", "store_floats", "cast", "take", "interpolate"),
+    *(f"{name} {letter}" for letter in "dfq" for name in _OF_EACH_TYPE),
+    *(f"{name} {letter}" for name in ("divide", "absolute", "sqrt") for letter in "df"),
+    *("floor d", "ceil d", "trunc d", "rint d"),
+    *("bitwise_and q", "bitwise_xor q", "right_shift q"),
+    *("and", "or", "xor", "not", "where 8", "where 4", "where 1"),
+    *(f"{name} d" for name in _FUNCTIONS),
+    *("power f", "fmod d", "copysign d"),
+    *(f"{name} {letter}" for letter in "dq" for name in ("remainder", "floor_divide")),
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
-TYPES: Final = "dfqihbQIHB?e"
-"""The types of values: letters of numpy, in the order of ``EACH_TYPE`` of ``native/program.h``."""
+TYPES: Final = "dfq?"
+"""The types of values: letters of numpy, in the order of ``VALUE_DOUBLE`` and so on there."""
 
 MOST_REGISTERS: Final = 256
 """The native pool has this many registers for each program."""
@@ -82,13 +95,24 @@ class UntraceableError(Exception):
     """A hook does what a program cannot do."""
 
 
-_LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
-"""On systems where two of numpy's types have the same layout, both are equal to one of these."""
+class DifferenceError(UntraceableError):
+    """The program of a hook gives other values than the hook.
+
+    Args:
+        hook: Its name.
+    """
+
+    def __init__(self, hook: str) -> None:
+        super().__init__(f"the program gives other values than {hook}")
+        self.hook = hook
 
 
 def writes_variable(name: str) -> str:
     """Say why hooks cannot be compiled if another one than ``_update`` writes a variable."""
     return f"a hook writes the episode variable {name!r}, which only _update may do"
+
+
+_LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
 
 
 def letter_of(dtype: npt.DTypeLike) -> str:
@@ -101,6 +125,29 @@ def letter_of(dtype: npt.DTypeLike) -> str:
     if letter is None:
         raise UntraceableError(f"it computes with {np.dtype(dtype)}")
     return letter
+
+
+_OF_FLAGS: Final = {
+    **dict.fromkeys(("logical_and", "bitwise_and", "multiply", "minimum"), "and"),
+    **dict.fromkeys(("logical_or", "bitwise_or", "add", "maximum"), "or"),
+    **dict.fromkeys(("logical_xor", "bitwise_xor", "not_equal"), "xor"),
+    **dict.fromkeys(("logical_not", "invert"), "not"),
+}
+"""The operations that functions of numpy are for Booleans."""
+
+
+@functools.cache
+def operation_of(ufunc: np.ufunc, letter: str) -> str | None:
+    """The operation that computes a function of numpy of values of one type, if there is one."""
+    if letter == "?":
+        return _OF_FLAGS.get(ufunc.__name__)
+    name = "power" if ufunc is np.float_power else ufunc.__name__
+    return f"{name} {letter}" if f"{name} {letter}" in OPERATIONS else None
+
+
+def is_function(operation: str) -> bool:
+    """Whether an operation is a function of the C library."""
+    return operation.partition(" ")[0] in _FUNCTIONS
 
 
 Row = tuple[Hashable, ...]
@@ -116,26 +163,21 @@ class Program:
             means depends on the operation; see ``native/program.h``.
         constants: Registers that keep a value; of type ``CONSTANT``.
         slots: Elements of observations that are stored; of type ``SLOT``.
-        calls: Loops of numpy: the capsule, the number of inputs, bytes of each input and output,
-            and the number of the output that is kept, counted from the first input.
         rows: The rows that are loaded or stored.
         tables: Values to look up.
         registers: How many registers there are.
         seen: How many arrays the slots refer to.
         results: The registers of the results.
-        is_always_finite: Whether no result can be infinite or NaN.
     """
 
     code: npt.NDArray[np.uint16]
     constants: npt.NDArray[Any]
     slots: npt.NDArray[Any]
-    calls: tuple[tuple[Any, int, tuple[int, ...], int], ...]
     rows: tuple[Row, ...]
     tables: tuple[npt.NDArray[Any], ...]
     registers: int
     seen: int
     results: tuple[int, ...]
-    is_always_finite: bool
 
     def loads(self, kind: str) -> bool:
         """Whether the program loads or stores rows, or runs operations, of this kind."""
@@ -148,7 +190,7 @@ class Program:
         rows = tuple(map(find, self.rows))
         parts = self.code.tobytes(), self.constants.tobytes(), self.slots.tobytes()
         counts = self.registers, self.seen, self.results
-        return (*parts, self.calls, rows, self.tables, *counts)
+        return (*parts, rows, self.tables, *counts)
 
 
 def evaluate(

@@ -32,7 +32,6 @@ __all__ = [
     "same_cells",
     "same_for_all",
     "spread",
-    "stand_in",
     "writeable",
 ]
 
@@ -56,7 +55,7 @@ _KEPT: Final = frozenset(
     | {"__radd__", "__rand__", "__rdivmod__", "__rfloordiv__", "__rlshift__", "__rmod__"}
     | {"__rmul__", "__ror__", "__rpow__", "__rrshift__", "__rshift__", "__rsub__", "__rtruediv__"}
     | {"__rxor__", "__sub__", "__truediv__", "__xor__", "__matmul__", "__rmatmul__", "dtype"}
-    | {"sum", "prod", "min", "max", "any", "all", "clip", "var", "std", "astype"}
+    | {"sum", "prod", "min", "max", "any", "all", "clip", "mean", "var", "std", "astype"}
     | {"conj", "conjugate", "itemsize"}
 )
 """What of ``numpy.ndarray`` works here, because it ends in one of the three methods of numpy."""
@@ -162,8 +161,7 @@ class Symbols(np.ndarray[Any, Any]):
         if not has_symbols(key):
             return self.like(self.cells[key])
         if _is_mask(key):
-            place, mask = self._masked(key)
-            return Selected(self.like(place), mask)
+            raise UntraceableError("it uses the values that a condition selects: use numpy.where")
         return handlers["index"](self, key)
 
     def __setitem__(self, key: Any, value: Any) -> None:
@@ -176,9 +174,10 @@ class Symbols(np.ndarray[Any, Any]):
         if not _is_mask(key):
             raise UntraceableError("it assigns to elements that a value selects")
         place, mask = self._masked(key)
-        chosen: Any = np.where(
-            mask, _to_assign(self._graph, value, mask, self.dtype), self.like(place)
-        )
+        if np.size(value) != 1:
+            raise UntraceableError("it assigns several values to elements that a condition selects")
+        new = as_symbols(self._graph, value).cast(self.dtype)
+        chosen: Any = np.where(mask, new.like(new.cells.reshape(())), self.like(place))
         place[...] = chosen.cells
 
     def _masked(self, key: Any) -> tuple[npt.NDArray[Any], Symbols]:
@@ -200,16 +199,6 @@ class Symbols(np.ndarray[Any, Any]):
 
     def _take(self, indices: Any, axis: Any = None, **_: Any) -> Any:
         return np.take(self, indices, axis)
-
-    def _mean(self, axis: Any = None, dtype: Any = None, out: Any = None, **keywords: Any) -> Any:
-        """Compute a mean; numpy sums numbers of 16 bits with 32 bits."""
-        is_half = self.dtype == np.float16 and dtype is None
-        wanted = np.float32 if is_half else dtype
-        mean = np.ndarray.mean(self, axis, wanted, out, **keywords)
-        return as_symbols(self._graph, mean).cast(np.float16) if is_half else mean
-
-    def _sort(self, axis: int = -1, *args: Any, **keywords: Any) -> None:
-        self[...] = np.sort(self, axis, *args, **keywords)
 
     def _round(self, decimals: int = 0, out: Any = None) -> Any:
         if self.dtype.kind in "iu" and decimals >= 0 and out is None:
@@ -264,11 +253,6 @@ _METHODS: Final[Mapping[str, Any]] = {
     "fill": Symbols._fill,
     "dot": lambda self, b, out=None: np.dot(self, b, out),
     "argmax": lambda self, *args, **keywords: np.argmax(self, *args, **keywords),
-    "argsort": lambda self, *args, **keywords: np.argsort(self, *args, **keywords),
-    "cumsum": lambda self, *args, **keywords: np.cumsum(self, *args, **keywords),
-    "cumprod": lambda self, *args, **keywords: np.cumprod(self, *args, **keywords),
-    "mean": Symbols._mean,
-    "sort": Symbols._sort,
     "argmin": lambda self, *args, **keywords: np.argmin(self, *args, **keywords),
     "searchsorted": lambda self, *args, **keywords: np.searchsorted(self, *args, **keywords),
     "item": Symbols._item,
@@ -290,51 +274,6 @@ def _is_mask(key: Any) -> bool:
     if not isinstance(last, Symbols) or last.dtype != np.bool_:
         return False
     return all(isinstance(other, int | slice) or other is Ellipsis for other in others)
-
-
-class Selected(np.lib.mixins.NDArrayOperatorsMixin):
-    """The elements of an array where a condition holds: ``x[x > 0]``.
-
-    How many there are differs between the calls of a hook. So hooks may only compute with them,
-    element by element, and assign them to where the same condition holds.
-
-    Args:
-        values: The array.
-        mask: The condition.
-    """
-
-    def __init__(self, values: Symbols, mask: Symbols) -> None:
-        self._values, self._mask = values, mask
-
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **keywords: Any) -> Any:
-        targets = keywords.pop("out", ())  # of an operator such as +=: the selection itself
-        if method != "__call__" or keywords or any(one is not self for one in targets):
-            self._refuse()
-        return Selected(ufunc(*(self.of(one, self._mask) for one in inputs)), self._mask)
-
-    @classmethod
-    def of(cls, value: Any, mask: Symbols) -> Any:
-        """The whole array to which a selection by this mask belongs, or a single value."""
-        if isinstance(value, cls):
-            if [c.node for c in value._mask.cells.flat] != [c.node for c in mask.cells.flat]:
-                raise UntraceableError("it mixes values that different conditions select")
-            return value._values
-        if np.size(value) != 1:
-            raise UntraceableError("it mixes values that a condition selects with whole arrays")
-        return value
-
-    def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise UntraceableError("it uses the values that a condition selects: use numpy.where")
-
-    __array__ = __bool__ = __len__ = __iter__ = __getitem__ = __float__ = __int__ = _refuse
-    __getattr__ = __array_function__ = _refuse
-
-
-def _to_assign(graph: Graph, value: Any, mask: Symbols, dtype: Any) -> Symbols:
-    """What to assign where a condition holds."""
-    is_single = not isinstance(value, Selected)
-    new = as_symbols(graph, Selected.of(value, mask)).cast(dtype)
-    return new.like(new.cells.reshape(())) if is_single else new
 
 
 def each(function: Callable[..., Cell], *cells: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -384,21 +323,9 @@ def as_symbols(graph: Graph, value: Any) -> Symbols:
         parts = [as_symbols(graph, part) for part in value]
         if len({part.shape for part in parts}) > 1:
             raise UntraceableError("it makes an array of parts of different shapes")
-        dtype = parts[0].dtype
-        for part in parts[1:]:
-            dtype = np.promote_types(dtype, part.dtype)
-        cells = [part.cast(dtype).cells for part in parts]
-        return Symbols(graph, np.stack(cells), dtype)
+        dtype = np.result_type(*(part.dtype for part in parts))
+        return Symbols(graph, np.stack([part.cast(dtype).cells for part in parts]), dtype)
     return lift(graph, np.asarray(value))
-
-
-def stand_in(graph: Graph, value: Any) -> Any:
-    """A number or array of the same type, of which numpy makes the same type of result."""
-    if type(value) in (int, float, bool):
-        return value
-    if isinstance(value, Symbols) and value.weak is not None:
-        return value.weak(1)
-    return np.ones(1, as_symbols(graph, value).dtype)
 
 
 def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:

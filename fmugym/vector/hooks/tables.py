@@ -22,7 +22,6 @@ from fmugym.vector.hooks.symbols import (
     handlers,
     has_symbols,
     lift,
-    stand_in,
 )
 
 __all__ = [
@@ -39,11 +38,6 @@ __all__ = [
 
 _MOST_VALUES: Final = 4096
 """The most elements of a table."""
-
-_MOST_CHOICES: Final = 64
-"""The most values that are not constant among which an index chooses."""
-
-_INTEGER: Final = np.dtype(np.int64)
 
 
 class Table(np.ndarray[Any, Any]):
@@ -81,83 +75,41 @@ def is_table(value: Any) -> bool:
 
 
 def look_up(table: Symbols, key: Any) -> Symbols:
-    """Index an array with values, as numpy does: integers for some axes, slices for the others."""
-    keys = _expanded(key if isinstance(key, tuple) else (key,), table.ndim)
-    chosen = [axis for axis, part in enumerate(keys) if not isinstance(part, slice)]
-    sliced = table.cells[tuple(k if isinstance(k, slice) else slice(None) for k in keys)]
-    moved = np.moveaxis(sliced, chosen, range(len(chosen)))
-    lengths, rest = moved.shape[: len(chosen)], moved.shape[len(chosen) :]
-    index = _flat_index(table.graph, [keys[axis] for axis in chosen], lengths)
-    columns = moved.reshape(math.prod(lengths), -1)
-    parts = [_column(table, columns[:, i], index.cells) for i in range(columns.shape[1])]
-    found = np.stack(parts, axis=-1).reshape((*index.shape, *rest))
-    is_one_block = chosen == list(range(chosen[0], chosen[0] + len(chosen)))
-    if is_one_block:  # otherwise numpy leaves the axes of the index in front
-        axes = range(index.ndim)
-        found = np.moveaxis(found, axes, range(chosen[0], chosen[0] + index.ndim))
-    return table.like(found)
-
-
-def _expanded(keys: tuple[Any, ...], ndim: int) -> list[Any]:
-    """A key for each axis: a slice or integers."""
-    places = [place for place, key in enumerate(keys) if key is Ellipsis]
-    missing = [slice(None)] * (ndim - len(keys) + len(places))
-    at = places[0] if places else len(keys)
-    expanded = [*keys[:at], *missing, *keys[at + 1 :]]
-    if len(expanded) != ndim or not all(map(_is_integer_or_slice, expanded)):
+    """Index a constant array with integers for its first axes, as numpy does."""
+    graph, constants = table.graph, _known(table.graph, table)
+    parts = key if isinstance(key, tuple) else (key,)
+    if len(parts) > constants.ndim or not all(map(_are_integers, parts)):
         raise UntraceableError("it indexes an array with values in a way that cannot be followed")
-    return expanded
+    keys = [as_symbols(graph, part) for part in parts]
+    lengths, rest = constants.shape[: len(keys)], constants.shape[len(keys) :]
+    index = _flat_index(graph, keys, lengths)
+    columns = np.ascontiguousarray(constants.reshape(math.prod(lengths), -1).T)
+    found = [each(lambda cell, c=column: _taken(graph, cell, c), index.cells) for column in columns]
+    return table.like(np.stack(found, axis=-1).reshape((*index.shape, *rest)))
 
 
-def _is_integer_or_slice(key: Any) -> bool:
-    if isinstance(key, slice):
-        return not has_symbols([key.start, key.stop, key.step])
-    return key is not None and not isinstance(key, bool) and _kind_of(key) in "iu"
+def _are_integers(key: Any) -> bool:
+    return (
+        key is not None and (key if isinstance(key, Symbols) else np.asarray(key)).dtype.kind == "i"
+    )
 
 
-def _kind_of(key: Any) -> str:
-    return key.dtype.kind if isinstance(key, Symbols) else np.asarray(key).dtype.kind
-
-
-def _flat_index(graph: Graph, keys: Sequence[Any], lengths: Sequence[int]) -> Symbols:
+def _flat_index(graph: Graph, keys: Sequence[Symbols], lengths: Sequence[int]) -> Symbols:
     """The number of the element in the order of memory. A key outside of its axis is an error."""
     if len(keys) == 1:
-        return as_symbols(graph, keys[0]).cast(_INTEGER)
+        return keys[0]
     strides = [math.prod(lengths[axis + 1 :]) for axis in range(len(lengths))]
-    offsets = [
-        look_up(lift(graph, np.arange(length) * stride), as_symbols(graph, key).cast(_INTEGER))
+    offsets: list[Any] = [
+        look_up(lift(graph, np.arange(length) * stride), key)
         for key, length, stride in zip(keys, lengths, strides, strict=True)
     ]
-    flat: Any = offsets[0]
-    for offset in offsets[1:]:
-        flat = flat + offset
-    return flat  # type: ignore[no-any-return]  # numpy's stubs
-
-
-def _column(table: Symbols, column: npt.NDArray[Any], index: npt.NDArray[Any]) -> Any:
-    graph = table.graph
-    values = [graph.value(cell) for cell in column]
-    if any(value is None for value in values):
-        return each(lambda cell: _chosen(graph, cell, list(column)), index)
-    constants = np.array(values, table.dtype)
-    return each(lambda cell: _taken(graph, cell, constants), index)
+    flat: Symbols = sum(offsets[1:], offsets[0])
+    return flat
 
 
 def _taken(graph: Graph, index: Cell, constants: npt.NDArray[Any]) -> Cell:
     number = _place_table(graph, constants)
     return graph.compute("take", number, (index,), constants.dtype, constants.__getitem__)
-
-
-def _chosen(graph: Graph, index: Cell, cells: Sequence[Cell]) -> Cell:
-    """One of some values; an index outside of their number is an error when the program runs."""
-    if len(cells) > _MOST_CHOICES:
-        raise UntraceableError(f"an index chooses between more than {_MOST_CHOICES} values")
-    place = _taken(graph, index, np.arange(len(cells)))
-    result = cells[0]
-    for number, cell in enumerate(cells[1:], 1):
-        operands = place, graph.constant(number, _INTEGER)
-        result = graph.choose(graph.apply(np.equal, operands, np.dtype(np.bool_)), cell, result)
-    return result
 
 
 def _place_table(graph: Graph, table: npt.NDArray[Any]) -> Any:
@@ -171,38 +123,9 @@ def _take(a: Any, indices: Any, axis: Any = None, out: Any = None, mode: Any = "
     table = as_symbols(graph, a)
     if not has_symbols(indices):
         return table.like(np.take(table.cells, indices, axis))
-    if out is not None or mode != "raise":
+    if out is not None or mode != "raise" or axis not in (None, 0):
         raise UntraceableError("it uses an argument of numpy.take")
-    index = as_symbols(graph, indices)
-    if axis is None:
-        return look_up(table.like(table.cells.ravel()), index)
-    return look_up(table, (slice(None),) * (axis % table.ndim) + (index,))
-
-
-def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Any:
-    graph = graph_of(arr, indices)
-    table, index = as_symbols(graph, arr), as_symbols(graph, indices).cast(_INTEGER)
-    if axis is None:
-        return look_up(table.like(table.cells.ravel()), index)
-    columns = list(np.moveaxis(table.cells, axis, 0))
-    rows = [
-        each(lambda at, *cells: _chosen(graph, at, cells), row, *columns)
-        for row in np.moveaxis(index.cells, axis, 0)
-    ]
-    return table.like(np.moveaxis(np.stack(rows), 0, axis))
-
-
-def _choose(a: Any, choices: Any, out: Any = None, mode: Any = "raise") -> Any:
-    if out is not None or mode != "raise":
-        raise UntraceableError("it uses an argument of numpy.choose")
-    graph = graph_of(a, choices)
-    parts = [as_symbols(graph, choice) for choice in choices]
-    dtype = np.result_type(*(stand_in(graph, choice) for choice in choices))
-    index = as_symbols(graph, a).cast(_INTEGER)
-    checked: Any = np.where(index < 0, len(parts), index)  # numpy.choose knows no negative index
-    cells = [part.cast(dtype).cells for part in parts]
-    chosen = each(lambda at, *values: _chosen(graph, at, values), checked.cells, *cells)
-    return Symbols(graph, chosen, dtype)
+    return look_up(table if axis == 0 else table.like(table.cells.ravel()), indices)
 
 
 # Searching
@@ -227,40 +150,31 @@ def _searchsorted(a: Any, v: Any, side: Any = "left", sorter: Any = None) -> Any
     return np.where(value != value, len(table), place)  # a NaN belongs behind all numbers
 
 
-def _digitize(x: Any, bins: Any, right: bool = False) -> Any:
-    edges = np.asarray(bins)
-    side = "left" if right else "right"
-    if len(edges) > 1 and edges[0] > edges[-1]:
-        other = "right" if right else "left"
-        return len(edges) - _searchsorted(edges[::-1], x, other)
-    return _searchsorted(edges, x, side)
-
-
 # Interpolation
 
 
 def _interp(
     x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
 ) -> Symbols:
-    graph = graph_of(x, xp, fp, left, right, period)
-    xp, fp, left, right, period = (_known(graph, part) for part in (xp, fp, left, right, period))
-    xs, ys = (np.asarray(part, np.float64) for part in (xp, fp))
+    graph = graph_of(x, xp, fp, left, right)
+    xs, ys = (np.asarray(_known(graph, part), np.float64) for part in (xp, fp))
     if xs.ndim != 1 or xs.shape != ys.shape or not xs.size:
         raise ValueError("fp and xp are not of the same length")
-    if period is not None:
-        x, xs, ys, left, right = (*_repeated(x, xs, ys, abs(period)), None, None)
-    ends = [ys[0] if left is None else left, ys[-1] if right is None else right]
-    number = _place_table(graph, np.concatenate([xs, ys, np.array(ends, np.float64)]))
-    floats = as_symbols(graph, x).cast(np.float64)
+    if period is not None or not np.all(xs[:-1] <= xs[1:]):
+        raise UntraceableError("numpy.interp has a period, or coordinates that fall")
+    sides = ys[0] if left is None else left, ys[-1] if right is None else right
+    ends = [_known(graph, side) for side in sides]
+    table = np.concatenate([xs, ys, np.array(ends, np.float64)])
+    number = _place_table(graph, table)
+    floats, double = as_symbols(graph, x).cast(np.float64), np.dtype(np.float64)
 
     def fold(values: Any) -> Any:
-        return np.interp(values, xs, ys, left, right)
+        return np.interp(values, xs, ys, *ends)
 
     cells = each(
-        lambda cell: graph.compute("interpolate", number, (cell,), np.dtype(np.float64), fold),
-        floats.cells,
+        lambda cell: graph.compute("interpolate", number, (cell,), double, fold), floats.cells
     )
-    return Symbols(graph, cells, np.float64)
+    return Symbols(graph, cells, double)
 
 
 def _known(graph: Graph, part: Any) -> Any:
@@ -270,27 +184,15 @@ def _known(graph: Graph, part: Any) -> Any:
     symbols = as_symbols(graph, part)
     values = [graph.value(cell) for cell in symbols.cells.reshape(-1)]
     if any(value is None for value in values):
-        raise UntraceableError("numpy.interp has a table that is not constant")
+        raise UntraceableError("it looks values up in a table that is not constant")
     return np.array(values, symbols.dtype).reshape(symbols.shape)
-
-
-def _repeated(x: Any, xs: Any, ys: Any, period: float) -> tuple[Any, Any, Any]:
-    """The argument and the table of ``numpy.interp`` for values that repeat."""
-    xs = xs % period
-    order = np.argsort(xs)
-    xs, ys = xs[order], ys[order]
-    longer = np.concatenate([xs[-1:] - period, xs, xs[:1] + period])
-    return x % period, longer, np.concatenate([ys[-1:], ys, ys[:1]])
 
 
 handlers.update(index=look_up)
 
 FUNCTIONS: Final[Mapping[Any, Any]] = {
     np.take: _take,
-    np.take_along_axis: _take_along_axis,
-    np.choose: _choose,
     np.searchsorted: _searchsorted,
-    np.digitize: _digitize,
     np.interp: _interp,
 }
 """The functions of numpy that look values up."""

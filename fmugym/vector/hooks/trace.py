@@ -25,7 +25,7 @@ from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
-from fmugym.vector.hooks.program import Program, UntraceableError, letter_of
+from fmugym.vector.hooks.program import TYPES, Program, UntraceableError, letter_of
 from fmugym.vector.hooks.results import type_of_variable
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
@@ -80,8 +80,8 @@ class TracedTask:
         updated: The names of the variables that ``_update`` writes.
         left: The hooks that cannot be traced, and why. They run on arrays; no other hook needs
             what they return.
-        is_inexact: Whether the last bits may differ from those of hooks on arrays, because there
-            are products of matrices.
+        tolerance: How far results may differ from those of hooks on arrays, relative to the largest
+            one: 0 if there are no functions of the C library and no products of matrices.
     """
 
     inputs: Program
@@ -90,7 +90,7 @@ class TracedTask:
     variables: Mapping[str, np.dtype[Any]]
     updated: tuple[str, ...]
     left: Mapping[str, str]
-    is_inexact: bool = False
+    tolerance: float = 0.0
 
     def loads(self, kind: str) -> bool:
         """Whether one of the programs loads values of this kind."""
@@ -98,13 +98,16 @@ class TracedTask:
 
 
 def trace_hooks(
-    env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({})
+    env: FMUEnv,
+    attributes: Mapping[str, npt.NDArray[Any]] = MappingProxyType({}),
+    refused: Mapping[str, str] = MappingProxyType({}),
 ) -> TracedTask:
     """Trace the hooks of an environment.
 
     Args:
         env: A prototype whose actions make an array.
         attributes: Those that have one number for each environment, by name.
+        refused: Hooks that are not to be traced, and why.
 
     Raises:
         UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
@@ -112,8 +115,10 @@ def trace_hooks(
     """
     if env._pool_tells:
         raise UntraceableError("the pool tells infos of its own")
+    if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
+        raise UntraceableError(f"its actions are {env.action_space.dtype}")
     with exclusive(), borrowed(env, outside=True), tables_in(env), reading(env, Readings.of(env)):
-        return Tracer(env, attributes).task()
+        return Tracer(env, attributes, refused).task()
 
 
 class Tracer:
@@ -122,10 +127,16 @@ class Tracer:
     Args:
         env: The prototype.
         attributes: Those that have one number for each environment.
+        refused: Hooks that are not to be traced, and why.
     """
 
-    def __init__(self, env: FMUEnv, attributes: Mapping[str, npt.NDArray[Any]]) -> None:
-        self._env, self._attributes = env, attributes
+    def __init__(
+        self,
+        env: FMUEnv,
+        attributes: Mapping[str, npt.NDArray[Any]],
+        refused: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        self._env, self._attributes, self._refused = env, attributes, refused
         self._graph = Graph()
         self._contents = Contents(env)
         self._left: dict[str, str] = {}
@@ -149,7 +160,7 @@ class Tracer:
     def _traced(self) -> TracedTask:
         self._left = {}
         inputs = self._trace_inputs()
-        has_inexact_inputs = self._graph.is_inexact
+        tolerance = self._graph.tolerance
         self._begin(judging=True)
         stores, updated = self._trace_update()
         done = int(self._call("_is_done", self._flag_node))
@@ -162,7 +173,7 @@ class Tracer:
         seen, more = self._trace_seen()
         judgement = compile_graph(self._graph, stores + more, results, len(seen))
         parts = inputs, judgement, tuple(seen), dict(self._variables), updated, self._left
-        return TracedTask(*parts, has_inexact_inputs or self._graph.is_inexact)
+        return TracedTask(*parts, max(tolerance, self._graph.tolerance))
 
     def _begin(self, judging: bool) -> None:
         self._graph = Graph()
@@ -176,6 +187,8 @@ class Tracer:
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
         """Call a hook, and make nodes of what it returns."""
+        if name in self._refused:
+            raise UntraceableError(self._refused[name])
         with in_hook(self._env, name):
             with numpy_of(self._graph), np.errstate(all="ignore"):
                 value = getattr(self._env, name)()
