@@ -74,7 +74,7 @@ def _ratio(quota: str, period: str) -> float:
     """What both are worth; no limit if they are not positive numbers, as ``max`` and ``-1``."""
     try:
         values = int(quota), int(period)
-    except ValueError:
+    except ordinary(ValueError):
         return math.inf
     return values[0] / values[1] if min(values) > 0 else math.inf
 
