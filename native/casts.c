@@ -17,6 +17,7 @@
             CAST_LOOP(VALUE_FLOAT, From, float)                                                    \
             CAST_LOOP(VALUE_INTEGER, From, int64_t)                                                \
             CAST_LOOP(VALUE_FLAG, From, bool)                                                      \
+            CAST_LOOP(VALUE_BYTE, From, int8_t)                                                    \
         }                                                                                          \
         break;
 
@@ -28,5 +29,6 @@ WIDE void operation_cast(uint16_t types, const void *from, size_t blocks, void *
         CASTS_FROM(VALUE_FLOAT, float)
         CASTS_FROM(VALUE_INTEGER, int64_t)
         CASTS_FROM(VALUE_FLAG, bool)
+        CASTS_FROM(VALUE_BYTE, int8_t)
     }
 }

@@ -13,6 +13,13 @@
     }                                                                                              \
     break
 
+#define OF_ONE(operation, function)                                                                \
+    case operation:                                                                                \
+        EACH(double, function(x[j]))
+#define OF_TWO(operation, function)                                                                \
+    case operation:                                                                                \
+        EACH(double, function(x[j], y[j]))
+
 /* The remainder of numpy has the sign of the divisor. */
 static double remainder_of(double x, double y) {
     const double rest = fmod(x, y);
@@ -54,62 +61,35 @@ static int64_t floor_divide_whole(int64_t x, int64_t y) {
 void operation_call(uint16_t operation, const void *first, const void *second, size_t count,
                     void *to) {
     switch (operation) {
-    case SIN:
-        EACH(double, sin(x[j]));
-    case COS:
-        EACH(double, cos(x[j]));
-    case TAN:
-        EACH(double, tan(x[j]));
-    case ARCSIN:
-        EACH(double, asin(x[j]));
-    case ARCCOS:
-        EACH(double, acos(x[j]));
-    case ARCTAN:
-        EACH(double, atan(x[j]));
-    case SINH:
-        EACH(double, sinh(x[j]));
-    case COSH:
-        EACH(double, cosh(x[j]));
-    case TANH:
-        EACH(double, tanh(x[j]));
-    case ARCSINH:
-        EACH(double, asinh(x[j]));
-    case ARCCOSH:
-        EACH(double, acosh(x[j]));
-    case ARCTANH:
-        EACH(double, atanh(x[j]));
-    case EXP:
-        EACH(double, exp(x[j]));
-    case EXP2:
-        EACH(double, exp2(x[j]));
-    case EXPM1:
-        EACH(double, expm1(x[j]));
-    case LOG:
-        EACH(double, log(x[j]));
-    case LOG2:
-        EACH(double, log2(x[j]));
-    case LOG10:
-        EACH(double, log10(x[j]));
-    case LOG1P:
-        EACH(double, log1p(x[j]));
-    case CBRT:
-        EACH(double, cbrt(x[j]));
-    case ARCTAN2:
-        EACH(double, atan2(x[j], y[j]));
-    case HYPOT:
-        EACH(double, hypot(x[j], y[j]));
-    case POWER:
-        EACH(double, pow(x[j], y[j]));
+        OF_ONE(SIN, sin);
+        OF_ONE(COS, cos);
+        OF_ONE(TAN, tan);
+        OF_ONE(ARCSIN, asin);
+        OF_ONE(ARCCOS, acos);
+        OF_ONE(ARCTAN, atan);
+        OF_ONE(SINH, sinh);
+        OF_ONE(COSH, cosh);
+        OF_ONE(TANH, tanh);
+        OF_ONE(ARCSINH, asinh);
+        OF_ONE(ARCCOSH, acosh);
+        OF_ONE(ARCTANH, atanh);
+        OF_ONE(EXP, exp);
+        OF_ONE(EXP2, exp2);
+        OF_ONE(EXPM1, expm1);
+        OF_ONE(LOG, log);
+        OF_ONE(LOG2, log2);
+        OF_ONE(LOG10, log10);
+        OF_ONE(LOG1P, log1p);
+        OF_ONE(CBRT, cbrt);
+        OF_TWO(ARCTAN2, atan2);
+        OF_TWO(HYPOT, hypot);
+        OF_TWO(POWER, pow);
+        OF_TWO(FMOD, fmod);
+        OF_TWO(COPYSIGN, copysign);
+        OF_TWO(REMAINDER, remainder_of);
+        OF_TWO(FLOOR_DIVIDE, floor_divide);
     case POWER_F:
         EACH(float, powf(x[j], y[j]));
-    case FMOD:
-        EACH(double, fmod(x[j], y[j]));
-    case COPYSIGN:
-        EACH(double, copysign(x[j], y[j]));
-    case REMAINDER:
-        EACH(double, remainder_of(x[j], y[j]));
-    case FLOOR_DIVIDE:
-        EACH(double, floor_divide(x[j], y[j]));
     case REMAINDER_Q:
         EACH(int64_t, remainder_of_whole(x[j], y[j]));
     default:

@@ -93,7 +93,7 @@ static void load_stopped(const Evaluation *e, uint8_t *to) {
     }
 }
 
-static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 1};
+static const uint8_t size_of_type[VALUE_TYPES] = {8, 4, 8, 1, 1};
 
 /* The first loop looks whether there is any such value; nearly always there is none. */
 #define NOTE_NOT_FINITE(Type, name, Whole, absolute, most)                                         \

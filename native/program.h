@@ -105,9 +105,9 @@ typedef enum { EACH_OPERATION(NUMBER_IT) NUMBER_OF_OPERATIONS } Operation;
 
 extern const char *const operation_names[NUMBER_OF_OPERATIONS];
 
-/* TYPES in fmugym/vector/hooks/program.py lists them in the same order: d, f, q and Booleans. A
- * cast's extra is from * VALUE_TYPES + to. */
-enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_TYPES };
+/* TYPES in fmugym/vector/hooks/program.py lists them in the same order: d, f, q, Booleans, and the
+ * bytes of actions that are switches. A cast's extra is from * VALUE_TYPES + to. */
+enum { VALUE_DOUBLE, VALUE_FLOAT, VALUE_INTEGER, VALUE_FLAG, VALUE_BYTE, VALUE_TYPES };
 
 enum { MOST_SEEN = 64 /* maximum number of arrays that a program stores observations in */ };
 

@@ -217,12 +217,13 @@ SPACES = {
     "int64": gym.spaces.Box(-5, 5, (2,), np.int64),
     "discrete": gym.spaces.Discrete(4, start=-1),
     "multi": gym.spaces.MultiDiscrete([3, 5]),
+    "binary": gym.spaces.MultiBinary(3),
 }
 OTHERS = {
     "float16": gym.spaces.Box(-1.0, 1.0, (2,), np.float16),
     "int32": gym.spaces.Box(-5, 5, (2,), np.int32),
     "uint8": gym.spaces.Box(0, 255, (2,), np.uint8),
-    "int8": gym.spaces.MultiBinary(3),
+    "int16": gym.spaces.Box(-5, 5, (2,), np.int16),
 }
 
 

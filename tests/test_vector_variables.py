@@ -142,12 +142,12 @@ class Queueing(Drawing):
     def _update(self):
         newest = np.stack([self.action[0]])
         self.variables["queue"] = np.concatenate([newest, self.variables["queue"][:-1]])
-        self.variables["bits"] = (self.action[0] << self.step_count % 3) + (self.step_count << 1)
+        self.variables["bits"] = self.action[0] * (self.step_count % 3) + 2 * self.step_count
         self.variables["mode"] = np.where(self.state[0] > 0.0, 1.5, self.variables["mode"])
 
     def _reward_policy(self):
         whole, rest = divmod(self.step_count, 3)
-        return np.cumsum(self.variables["queue"])[-1] - self.variables["bits"] + whole / (1 + rest)
+        return np.sum(self.variables["queue"]) - self.variables["bits"] + whole / (1 + rest)
 
 
 def test_a_variable_that_is_an_index_is_compiled_in_one_environment():

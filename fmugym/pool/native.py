@@ -477,7 +477,7 @@ class NativePool(SavingPool):
             programs: From the actions to the inputs; from the outputs to done, truncated, reward.
                 See ``Program.with_rows``.
             actions: How actions are checked and kept: the shape of one action; the letter of its
-                type (d, f, q or ?) and the bytes of an element; the check (0 none, 1 the range
+                type (d, f, q, ? or b) and the bytes of an element; the check (0 none, 1 the range
                 from lowest to highest, 2 and 3 no NaN of float64 and float32); the memory for the
                 actions of this step and of the one before (or None), flat, environments first;
                 what counts as the action of a new episode.

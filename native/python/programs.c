@@ -49,7 +49,7 @@ static bool take_tables(PyProgram *p, PyObject *tables) {
 
 /* Reads how large the arrays of observations must be. */
 static bool measure_seen(PyProgram *p, Py_ssize_t count) {
-    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 1};
+    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 1, 1};
 
     for (size_t i = 0; i < p->program.number_of_slots; i++) {
         const Slot *slot = &p->program.slots[i];

@@ -115,15 +115,15 @@ def _computed(
     """Values of a function by its operation, by that of a wider type, or composed of others."""
     dtype = operands[0].dtype
     wider = np.dtype(np.bool_) if ufunc in _LOGICAL else _WIDER.get(dtype, dtype)
-    is_wider = operation_of(ufunc, letter_of(dtype)) is None
+    is_missing = operation_of(ufunc, letter_of(dtype)) is None
     operation = operation_of(ufunc, letter_of(wider))
-    if is_wider and operation is not None:
+    if is_missing and operation is not None:
         if is_function(operation):
             graph.tolerate(dtype)  # numpy computes it with the type that it has
         wide = [one.cast(wider) for one in operands]
         kept = wider if result == np.float32 else result
         return _computed(graph, ufunc, wide, kept).cast(result)
-    if is_wider and ufunc in _MADE_OF:
+    if is_missing and ufunc in _MADE_OF:
         composed: Symbols = _MADE_OF[ufunc](*operands)
         return composed
     cells = [one.cells for one in operands]

@@ -124,7 +124,7 @@ class Graph:
         Raises:
             UntraceableError: If programs do not have it for these types.
         """
-        if ufunc in _IDENTITIES:
+        if ufunc is np.positive:
             return cells[0]
         letters = {letter_of(self.node(cell).dtype) for cell in cells}
         operation = operation_of(ufunc, letters.pop()) if len(letters) == 1 else None
@@ -147,5 +147,3 @@ class Graph:
 
 TOLERANCES: Final = {4: 1e-5, 8: 1e-12}
 """By bytes of a float."""
-
-_IDENTITIES: Final = frozenset({np.positive, np.conjugate})

@@ -56,8 +56,11 @@ OPERATIONS: Final = (
 )
 """The operations in the order of ``enum Operation`` of ``native/program.h``."""
 
-TYPES: Final = "dfq?"
-"""The types of values: letters of numpy, in the order of ``VALUE_DOUBLE`` and so on there."""
+TYPES: Final = "dfq?b"
+"""The types of values: letters of numpy, in the order of ``VALUE_DOUBLE`` and so on there.
+
+There is no arithmetic with int8, the type of ``MultiBinary``: such values are only converted.
+"""
 
 MOST_REGISTERS: Final = 256
 """The native pool has this many registers for each program."""

@@ -197,20 +197,11 @@ class Symbols(np.ndarray[Any, Any]):
     def _fill(self, value: Any) -> None:
         self[...] = value
 
-    def _take(self, indices: Any, axis: Any = None, **_: Any) -> Any:
-        return np.take(self, indices, axis)
-
     def _round(self, decimals: int = 0, out: Any = None) -> Any:
-        if self.dtype.kind in "iu" and decimals >= 0 and out is None:
-            return self.copy()
-        if self.dtype.kind in "iub" or out is not None:
-            raise UntraceableError("it rounds integers")
-        if decimals == 0:
-            return np.rint(self)
-        factor = 10.0 ** abs(decimals)
-        if decimals < 0:
-            return np.rint(self / factor) * factor
-        return np.rint(self * factor) / factor
+        if self.dtype.kind != "f" or decimals < 0 or out is not None:
+            raise UntraceableError("it rounds integers, or to tens")
+        factor = 10.0**decimals
+        return np.rint(self * factor) / factor if decimals else np.rint(self)
 
     def _item(self, *_: Any) -> Any:
         raise UntraceableError("it turns a value into a number of Python")
@@ -240,21 +231,20 @@ def _moving(name: str) -> Callable[..., Symbols]:
     return lambda self, *args, **keywords: self.like(getattr(self.cells, name)(*args, **keywords))
 
 
+def _calling(name: str) -> Callable[..., Any]:
+    return lambda self, *args, **keywords: getattr(np, name)(self, *args, **keywords)
+
+
 _METHODS: Final[Mapping[str, Any]] = {
     **{name: _of_cells(name) for name in ("shape", "ndim", "size")},
     **{name: _moving(name) for name in ("reshape", "ravel", "flatten", "transpose", "repeat")},
     **{name: _moving(name) for name in ("swapaxes", "squeeze")},
     "T": property(lambda self: self.like(self.cells.T)),
-    "real": property(lambda self: self),
     "copy": Symbols._copy,
     "__copy__": Symbols._copy,
-    "take": Symbols._take,
+    **{name: _calling(name) for name in ("take", "dot", "argmax", "argmin")},
     "round": Symbols._round,
     "fill": Symbols._fill,
-    "dot": lambda self, b, out=None: np.dot(self, b, out),
-    "argmax": lambda self, *args, **keywords: np.argmax(self, *args, **keywords),
-    "argmin": lambda self, *args, **keywords: np.argmin(self, *args, **keywords),
-    "searchsorted": lambda self, *args, **keywords: np.searchsorted(self, *args, **keywords),
     "item": Symbols._item,
     "tolist": Symbols._item,
 }

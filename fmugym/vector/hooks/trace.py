@@ -92,10 +92,6 @@ class TracedTask:
     left: Mapping[str, str]
     tolerance: float = 0.0
 
-    def loads(self, kind: str) -> bool:
-        """Whether one of the programs loads values of this kind."""
-        return self.inputs.loads(kind) or self.judgement.loads(kind)
-
 
 def trace_hooks(
     env: FMUEnv,
