@@ -318,8 +318,9 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
-        if self._player is not None:
-            result = None if self._ended else self._step_compiled(action)
+        player = self._player
+        if player is not None:
+            result = None if self._ended else self._step_compiled(player, action)
             if result is not None:
                 return result
             self._keep_readings()
@@ -346,9 +347,8 @@ class FMUEnv(Constructed):
             self._note_for_picture(result[1])
         return result
 
-    def _step_compiled(self, action: Any) -> Result | None:
+    def _step_compiled(self, player: Any, action: Any) -> Result | None:
         """Let the pool do the whole step; None if Python must do it."""
-        player = self._player
         if self._readings is not player.readings and not player.take_over(self):
             return None
         try:
@@ -361,20 +361,16 @@ class FMUEnv(Constructed):
             raise
         if result is None:
             return None
-        return self._completed(result) if result else self._judged_again()
-
-    def _completed(self, result: Result) -> Result:
-        """Add what the pool does not do to the result of a step."""
-        if self._player.left:
-            completed = self._with_hooks_left(*result)
-            if completed is None:
-                return self._judged_again()
-            result = completed
+        if result and player.left:
+            result = self._with_hooks_left(*result)
+        if not result:
+            return self._judged_again()
         if result[2] or result[3]:
             self._ended = True
         if self.render_mode is not None:
             self._note_for_picture(result[1])
-        return result
+        step: Result = result
+        return step
 
     def _with_hooks_left(
         self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: dict[str, Any]

@@ -84,7 +84,7 @@ void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
 }
 
-bool play_refuses(const Turn *turn, double *inputs) {
+bool play_makes_inputs(Turn *turn, double *inputs) {
     const Play *play = turn->play;
     const size_t number = play->number_of_inputs * play->count, bytes = number * sizeof *inputs;
     Source source = source_of(turn);
@@ -99,8 +99,11 @@ bool play_refuses(const Turn *turn, double *inputs) {
     for (size_t i = 0; i < number; i++) {
         notes.outside |= !(fabs(play->input_rows[i]) <= DBL_MAX);
     }
-    memcpy(play->input_rows, inputs, bytes);
-    return notes.outside;
+    turn->has_inputs = !notes.outside;
+    if (notes.outside) {
+        memcpy(play->input_rows, inputs, bytes);
+    }
+    return turn->has_inputs;
 }
 
 static void take_actions(const Turn *turn, size_t begin, size_t count) {
@@ -134,8 +137,10 @@ void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scr
     if (play->actions.current != NULL) {
         take_actions(turn, begin, count);
     }
-    const Source source = source_of(turn);
-    program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
+    if (!turn->has_inputs) {
+        const Source source = source_of(turn);
+        program_run(&play->inputs, &source, begin, count, &scratch->inputs, &notes);
+    }
     if (play->reads_kept) {
         play_keep_outputs(play, 0, play->number_of_outputs, begin, count);
     }

@@ -84,6 +84,7 @@ typedef struct {
 typedef struct {
     const Play *play;
     const char *actions;
+    bool has_inputs; /* whether they are made already */
     double *rewards;
     uint8_t *terminated, *truncated;
     char *const *seen; /* the arrays of the observations and infos that the judgement stores */
@@ -98,9 +99,9 @@ typedef struct {
 /* Whether an action is out of range or NaN. */
 bool play_has_bad_action(const Turn *turn);
 
-/* Whether the actions lead to inputs that are not finite. The inputs stay as they are; there is memory
- * for a copy of them. */
-bool play_refuses(const Turn *turn, double *inputs);
+/* Makes the inputs before anything else of a step, which then has them. If they are not finite, returns
+ * false and leaves them as they were; there is memory for a copy of them. */
+bool play_makes_inputs(Turn *turn, double *inputs);
 
 /* Scratch memory of one thread. */
 typedef struct {

@@ -295,7 +295,9 @@ def test_bundled_tasks_with_observations_of_their_own(env_id, mode, outside):
     results = played(ours, mode, 420)
     assert not outside
     for first, second in zip(results, played(theirs, mode, 420), strict=True):
-        for mine, other in zip(first[:-1], second[:-1], strict=True):
-            require_equal(mine, other)
+        for mine, other in zip(
+            first[:-1], second[:-1], strict=True
+        ):  # a square may differ in a bit
+            np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9)
         require_same_infos(first[-1], second[-1])
     assert outside

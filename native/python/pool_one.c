@@ -7,10 +7,18 @@
 
 static const char *const ONE = "fmugym._native.one";
 
+/* An attribute that the programs were made of. */
+typedef struct {
+    PyObject *name;
+    const void *value; /* the address of the object; NULL if there must not be the attribute */
+} Watched;
+
 /* The result of prepare_one. The turn is used inside of the pool only. */
 typedef struct {
     PyObject *playing; /* the capsule that prepare_play has made */
-    PyObject *watched, *observe, *inform;
+    PyObject *names, *observe, *inform;
+    Watched *watched; /* their names are those of the tuple */
+    size_t number_of_watched;
     double *inputs; /* memory for those of the pool */
     PyTurn turn;
 } One;
@@ -20,9 +28,10 @@ static void one_free(One *one) {
         release_turn(playing_of(one->playing), &one->turn);
     }
     Py_XDECREF(one->playing);
-    Py_XDECREF(one->watched);
+    Py_XDECREF(one->names);
     Py_XDECREF(one->observe);
     Py_XDECREF(one->inform);
+    free(one->watched);
     free(one->inputs);
     free(one);
 }
@@ -31,16 +40,35 @@ static void one_dealloc(PyObject *capsule) {
     one_free(PyCapsule_GetPointer(capsule, ONE));
 }
 
+static bool take_watched(One *one) {
+    one->watched = calloc((size_t)PyTuple_Size(one->names) + 1, sizeof *one->watched);
+    if (one->watched == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (Py_ssize_t i = 0; i < PyTuple_Size(one->names); i++) {
+        Watched *w = &one->watched[one->number_of_watched++];
+        PyObject *address = NULL;
+        if (!PyArg_ParseTuple(PyTuple_GetItem(one->names, i), "O|O;a name and an address", &w->name,
+                              &address)) {
+            return false;
+        }
+        w->value = address == NULL ? NULL : PyLong_AsVoidPtr(address);
+    }
+    return !PyErr_Occurred();
+}
+
 static bool fill(PyPool *self, One *one, PyObject *args) {
     const Playing *playing = playing_of(one->playing);
     Py_buffer *b = one->turn.buffers;
     PyObject *seen, *rewards, *terminated, *truncated;
 
     if (!PyArg_ParseTuple(args, "OOOOO!OO:prepare_one", &seen, &rewards, &terminated, &truncated,
-                          &PyTuple_Type, &one->watched, &one->observe, &one->inform)) {
+                          &PyTuple_Type, &one->names, &one->observe, &one->inform)) {
+        one->names = one->observe = one->inform = NULL; /* not ours yet */
         return false;
     }
-    Py_INCREF(one->watched);
+    Py_INCREF(one->names);
     Py_INCREF(one->observe);
     Py_INCREF(one->inform);
     if (self->pool.settings.count != 1) {
@@ -52,7 +80,7 @@ static bool fill(PyPool *self, One *one, PyObject *args) {
         PyErr_NoMemory();
         return false;
     }
-    if (!take_observations(self, playing, seen, &one->turn) ||
+    if (!take_watched(one) || !take_observations(self, playing, seen, &one->turn) ||
         !take_bytes(rewards, &b[REWARDS], PyBUF_WRITABLE, sizeof(double)) ||
         !take_bytes(terminated, &b[TERMINATED], PyBUF_WRITABLE, 1) ||
         !take_bytes(truncated, &b[TRUNCATED], PyBUF_WRITABLE, 1)) {
@@ -88,13 +116,12 @@ PyObject *py_prepare_one(PyObject *object, PyObject *args) {
 }
 
 /* Whether the environment still has the attributes that the programs were made of. */
-static bool is_as_before(PyObject *watched, PyObject *attributes) {
+static bool is_as_before(const One *one, PyObject *attributes) {
     bool same = true;
 
-    for (Py_ssize_t i = 0; i < PyTuple_Size(watched) && same; i++) {
-        PyObject *one = PyTuple_GetItem(watched, i);
-        const void *value = PyDict_GetItemWithError(attributes, PyTuple_GetItem(one, 0));
-        same = value == (PyTuple_Size(one) > 1 ? PyLong_AsVoidPtr(PyTuple_GetItem(one, 1)) : NULL);
+    for (size_t i = 0; i < one->number_of_watched && same; i++) {
+        const Watched *w = &one->watched[i];
+        same = PyDict_GetItemWithError(attributes, w->name) == w->value;
     }
     PyErr_Clear();
     return same;
@@ -135,7 +162,7 @@ static void do_one(PyPool *self, bool alone, void *context) {
 
     t->turn.actions = s->actions;
     t->call.alone = alone;
-    s->is_refused = play_has_bad_action(&t->turn) || play_refuses(&t->turn, s->one->inputs);
+    s->is_refused = play_has_bad_action(&t->turn) || !play_makes_inputs(&t->turn, s->one->inputs);
     if (!s->is_refused) {
         s->is_troubled = pool_play(&self->pool, &t->call, &t->ends) > 0 || t->ends.outside;
     }
@@ -143,14 +170,23 @@ static void do_one(PyPool *self, bool alone, void *context) {
 
 static PyObject *result_of(const One *one) {
     const Turn *turn = &one->turn.turn;
-    PyObject *observation = PyObject_CallNoArgs(one->observe), *info = NULL;
+    PyObject *result = PyTuple_New(5), *observation = PyObject_CallNoArgs(one->observe);
+    PyObject *info = one->inform == Py_None ? PyDict_New() : PyObject_CallNoArgs(one->inform);
+    PyObject *reward = PyFloat_FromDouble(*turn->rewards);
 
-    if (observation != NULL) {
-        info = one->inform == Py_None ? PyDict_New() : PyObject_CallNoArgs(one->inform);
+    if (result == NULL || observation == NULL || info == NULL || reward == NULL) {
+        Py_XDECREF(result);
+        Py_XDECREF(observation);
+        Py_XDECREF(info);
+        Py_XDECREF(reward);
+        return NULL;
     }
-    return Py_BuildValue("NdNNN", observation, *turn->rewards,
-                         PyBool_FromLong(*turn->terminated), PyBool_FromLong(*turn->truncated),
-                         info);
+    PyTuple_SetItem(result, 0, observation);
+    PyTuple_SetItem(result, 1, reward);
+    PyTuple_SetItem(result, 2, PyBool_FromLong(*turn->terminated));
+    PyTuple_SetItem(result, 3, PyBool_FromLong(*turn->truncated));
+    PyTuple_SetItem(result, 4, info);
+    return result;
 }
 
 static PyObject *step_with(PyPool *self, One *one, PyObject *action) {
@@ -189,7 +225,7 @@ PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
     }
     PyObject *capsule = Py_NewRef(self->one);
     One *one = PyCapsule_GetPointer(capsule, ONE);
-    if (is_as_before(one->watched, args[1])) {
+    if (is_as_before(one, args[1])) {
         result = step_with(self, one, args[0]);
     } else {
         result = Py_NewRef(Py_None);
