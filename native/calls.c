@@ -114,11 +114,6 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside) {
     return troubled;
 }
 
-bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values) {
-    return start->count <= pool->start_width &&
-           instance_knows_start(pool, &pool->instances[index], start, values);
-}
-
 /* Reads variables of one instance into a column of values. */
 static Status read_instance(Pool *pool, Instance *me, const Access *access, double *memory,
                             double *column) {
@@ -187,7 +182,7 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     return failed;
 }
 
-size_t pool_unbundle(Pool *pool, const States *states, size_t count) {
+size_t pool_restore_states(Pool *pool, const State *states, size_t count) {
     const Call call = {.turn = NULL};
     Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};
 

@@ -137,7 +137,7 @@ typedef struct Snapshot {
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t type, reference, place; /* place: see Element */
+    uint32_t type, reference, place, unused; /* place: see Element */
 } RecordedStart;
 
 /* The episodes of all instances so far; see records.h. */
@@ -283,9 +283,6 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
 /* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
 size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside);
-
-/* For one instance; see initial_states.h. */
-bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values);
 
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);

@@ -12,8 +12,7 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     const size_t index = index_of(task->pool, me);
 
     if (task->states != NULL) {
-        const size_t number = (size_t)task->states->sources[place];
-        return instance_unbundle(task->pool, me, task->states, number);
+        return instance_take_state(task->pool, me, task->states[place]);
     }
     health_count_steps(task->pool, me);
     record_drop(task->pool, index);

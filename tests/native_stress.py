@@ -30,7 +30,6 @@ from exchange_tools import exchange_fmu
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
-from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.task.values import LateDict
@@ -241,26 +240,19 @@ class Subject:
             self.pool.restore(self.snapshot, self.mask())
 
     def bundle(self):
-        """Serialize the states of some, as far as the FMU can."""
+        """Save the states of some, as far as the FMU can, or the records of their episodes."""
         indices = np.flatnonzero(self.mask())
         with contextlib.suppress(ValueError):
-            data, ends, steps, times = self.pool.serialize_states(indices)
-            outputs = np.zeros((len(self.outputs), len(indices)))
-            self.bundled = Bundle(outputs, steps, times, data, ends)
+            self.bundled = self.pool.save_states(indices, bool(self.rng.integers(2)))
             counts["bundled"] += 1
 
     def unbundle(self):
         """Restore them in others."""
         bundled = self.bundled  # another thread may replace it
-        if bundled is not None and len(bundled):
+        if bundled:
             indices = self.rng.permutation(self.n)[: int(self.rng.integers(1, self.n + 1))]
             sources = self.rng.integers(len(bundled), size=len(indices))
-            self.pool.deserialize_states(bundled, sources, indices)
-
-    def record(self):
-        record = self.pool.record_of(int(self.rng.integers(self.n)))
-        if record is not None:
-            self.pool.replace_record(int(self.rng.integers(self.n)), record)
+            self.pool.restore_states([bundled[source] for source in sources], indices)
 
     def write(self):
         self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
@@ -312,7 +304,7 @@ ACTIONS = (
         "health",
     ),
     *("costs", "close"),
-    *("bundle", "unbundle", "unbundle", "record", "write", "roll_out", "roll_out"),
+    *("bundle", "unbundle", "unbundle", "write", "roll_out", "roll_out"),
 )
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -37,7 +37,7 @@ from fmugym.pool.base import (
     available_processors,
     names_of,
 )
-from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.callbacks import Receiver
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
@@ -45,19 +45,17 @@ from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
-from fmugym.pool.saving import SavingPool, Serialized
+from fmugym.pool.saving import SavingPool
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
     listing,
     manner_of,
-    record_from,
     solving_settings,
     table_of,
     variable_settings,
 )
-from fmugym.pool.spec import start_variables
 from fmugym.pool.systems import system_settings
 from fmugym.signals import ordinary
 from fmugym.systems.description import SystemDescription
@@ -311,10 +309,6 @@ class NativePool(SavingPool):
         found = rows.reshape(len(seeded), len(others), self.num_instances)
         return found if is_adjoint else found.swapaxes(0, 1)
 
-    def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
-        """See ``AttendedPool.knows_start``."""
-        return self._open_pool().knows_start(index, self._access(variables), values.tobytes())
-
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""
         values = np.ascontiguousarray(values, np.float64)
@@ -322,35 +316,16 @@ class NativePool(SavingPool):
         if failed >= 0:
             raise SimulationError(self.failure(failed))
 
-    def serialize_states(self, indices: IndexArray) -> Serialized:
-        """See ``SavingPool.serialize_states``."""
-        ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
-        start_times = np.empty(len(indices))
-        chosen = np.ascontiguousarray(indices)
-        data = self._open_pool().bundle(chosen, ends, steps, start_times)
-        if isinstance(data, int):
-            raise SimulationError(self.failure(data))
-        return data, ends, steps, start_times
+    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+        """See ``SavingPool.save_states``."""
+        states = self._open_pool().save_states(np.ascontiguousarray(indices), records)
+        if isinstance(states, int):
+            raise SimulationError(self.failure(states))
+        return states
 
-    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        """See ``SavingPool.deserialize_states``."""
-        pool = self._open_pool()
-        sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
-        parts = bundle.data, bundle.ends, bundle.steps, bundle.start_times, bundle.outputs
-        pool.unbundle(indices, sources, *parts)
-
-    def record_of(self, index: int) -> Record | None:
-        """See ``SavingPool.record_of``."""
-        found = self._open_pool().record_of(index)
-        if found is None:
-            return None
-        return record_from(self._fmu.description, self._spec, *found)
-
-    def replace_record(self, index: int, record: Record) -> None:
-        """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variable, record.names, record.texts))
-        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
-        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
+    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+        """See ``SavingPool.restore_states``."""
+        self._open_pool().restore_states(states, np.ascontiguousarray(indices))
 
     def _count_steps(self) -> None:
         if self._close.alive:

@@ -28,7 +28,7 @@ MOST_BYTES: Final = 2**30
 _LARGEST: Final = 2**28
 """The largest size of one state, in bytes."""
 
-_MAGIC: Final = b"fmugym initial state 1\n"
+_MAGIC: Final = b"fmugym initial state 2\n"
 _DIGEST: Final = hashlib.sha256().digest_size
 
 _READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)

@@ -112,13 +112,13 @@ class Snapshot:
 
     @property
     def _content(self) -> tuple[Any, ...]:
-        return self._scope, _content(self._columns), self._bundle.content
+        return self._scope, _content(self._columns), self._bundle.states
 
     def __eq__(self, other: object) -> bool:
         return self._content == other._content if isinstance(other, Snapshot) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash((tuple(self._scope.items()), self._bundle.content))
+        return hash((tuple(self._scope.items()), self._bundle.states))
 
     def __repr__(self) -> str:
         return f"Snapshot({len(self)} environment(s), method={str(self.method)!r})"

@@ -102,7 +102,8 @@ class Warmed:
     @property
     def size(self) -> int:
         """About how many bytes it takes."""
-        return len(self.state.data) + sum(np.asarray(v).nbytes for v in self.variables.values())
+        values = self.variables.values()
+        return len(self.state.states[0]) + sum(np.asarray(value).nbytes for value in values)
 
 
 class _Memory:
@@ -323,36 +324,30 @@ class WarmUps:
     def _sizes(self) -> list[int]:
         return [int(np.prod(shape)) for shape in self._shapes.values()]
 
-    def _files(self, pool_width: int) -> StateFiles | None:
+    def _files(self) -> StateFiles | None:
         prefix = self._prefix or ""
-        width = pool_width + 1 + len(self._env._interface.inputs) + sum(self._sizes)
+        width = len(self._env._interface.inputs) + sum(self._sizes)
         return StateFiles(prefix, width) if prefix else None
 
     def _read(self, key: bytes) -> Warmed | None:
-        spec, count = self._env._spec, len(self._env._interface.inputs)
-        files = self._files(len(spec.outputs))
+        files = self._files()
         found = None if files is None else files.find(key.hex()[:32])
         if found is None:
             return None
-        numbers = np.frombuffer(found.numbers)
-        outputs, start, rest = np.split(numbers, [len(spec.outputs), len(spec.outputs) + 1])
-        inputs, rest = np.split(rest, [count])
-        parts = np.split(rest, np.cumsum(self._sizes)[:-1]) if self._sizes else []
+        ends = np.cumsum([len(self._env._interface.inputs), *self._sizes])[:-1]
+        inputs, *parts = np.split(np.frombuffer(found.numbers), ends)
         shapes = self._shapes.items()
         variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
-        steps, ends = np.array([self._warm_up.steps * spec.substeps]), np.array([len(found.data)])
-        state = Bundle(outputs[:, None].copy(), steps, start, found.data, ends)
-        warmed = Warmed(state, inputs, variables)
+        warmed = Warmed(Bundle((found.data,)), inputs, variables)
         _memory.keep(key, warmed)
         return warmed
 
     def _write(self, key: bytes, warmed: Warmed) -> None:
-        files = self._files(len(warmed.state.outputs))
+        files = self._files()
         if files is not None:
-            state = warmed.state
-            values = [state.outputs, state.start_times, warmed.inputs, *warmed.variables.values()]
+            values = [warmed.inputs, *warmed.variables.values()]
             numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
-            files.keep(key.hex()[:32], KeptState(numbers.tobytes(), warmed.state.data))
+            files.keep(key.hex()[:32], KeptState(numbers.tobytes(), warmed.state.states[0]))
 
 
 def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:

@@ -175,8 +175,8 @@ class _Perturbation:
         self._bundle: Bundle = Bundle.of_all(bundles)
         self._columns: Columns = stacked(columns)
         spec = self._envs._prototype._spec
-        pairs = zip(self._bundle.steps.tolist(), self._bundle.start_times.tolist(), strict=True)
-        self._times = np.array([spec.communication_point(*pair) for pair in pairs])
+        heads = self._bundle.heads
+        self._times = np.array([spec.communication_point(h.steps, h.start_time) for h in heads])
         return np.array(x), np.array(y)
 
     def _scales(self, x: FloatArray) -> FloatArray:

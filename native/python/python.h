@@ -101,12 +101,9 @@ PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t n
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_costs(PyObject *object, PyObject *unused);
-PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_save_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_keep_records(PyObject *object, PyObject *unused);
-PyObject *py_replace_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_record_of(PyObject *object, PyObject *index);
 PyObject *py_uses_states(PyObject *object, PyObject *unused);
 
 PyObject *py_save(PyObject *object, PyObject *unused);
