@@ -100,8 +100,11 @@ def draws(*rows):
 
 
 DRAWS = draws(0)
-TOLD = "drawn", "_drawn", *LateDict.parts(lambda _, drawn, mask: {"drawn": drawn * mask}, None)
-"""What a reset tells of the episodes that it starts."""
+
+
+def tell(drawn, mask):
+    """What a reset tells of the episodes that it starts."""
+    return {"drawn": LateDict.of(lambda: {"drawn": drawn * mask}), "_drawn": mask}
 
 
 class ReceiverError(Exception):
@@ -192,7 +195,7 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (tuple, 0, (), self.results(), TOLD),
+                "results": (tuple, 0, (), self.results(), tell),
             },
         )
 

@@ -482,9 +482,8 @@ class NativePool(SavingPool):
                 tuple; the forms of observations and of infos, each the number of an array, or a
                 tuple of names and forms; the shape and type of each array: float32 observations, or
                 those that the second program stores, then rewards, terminated and truncated of a
-                step, and mask and drawn values (draws, N) of a reset; and the parts of a reset's
-                infos: the names of the drawn values and of the mask, and what ``LateDict.parts``
-                returns.
+                step, and mask and drawn values (draws, N) of a reset; and a function of drawn values
+                and a mask, which returns what infos tell of the episodes that start.
 
         Returns:
             A function of actions and drawn values (draws, N). It does a step and fills the drawn

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -95,7 +96,7 @@ class CompiledEngine(BatchEngine):
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
-        told = "drawn", "_drawn", *LateDict.parts(_told, plan)
+        tell = partial(_start_infos, plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -103,7 +104,7 @@ class CompiledEngine(BatchEngine):
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            self._surroundings(task) | {"results": (StepResult, *layout.form, arrays, told)},
+            self._surroundings(task) | {"results": (StepResult, *layout.form, arrays, tell)},
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:
