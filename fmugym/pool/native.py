@@ -482,7 +482,7 @@ class NativePool(SavingPool):
                 tuple; the forms of observations and of infos, each the number of an array, or a
                 tuple of names and forms; the shape and type of each array: float32 observations, or
                 those that the second program stores, then rewards, terminated and truncated of a
-                step, and mask and drawn values (draws, N) of a reset; and a function of drawn values
+                step, mask and drawn values (draws, N) of a reset; and a function of drawn values
                 and a mask, which returns what infos tell of the episodes that start.
 
         Returns:
