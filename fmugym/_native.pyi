@@ -394,20 +394,9 @@ class Pool:
         terminated: Array,
         truncated: Array,
         drawn: Array,
-        left_out: Array = ...,
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
-
-    def exchange_play(self, other: Any, /) -> Any:
-        """Put what was prepared before in the place of what is prepared now.
-
-        Args:
-            other: What an earlier call has returned, or None.
-
-        Returns:
-            What is prepared now.
-        """
 
     def write(self, access: Access, values: Array, /) -> int:
         """Set variables of all instances between two steps.

@@ -282,7 +282,7 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
 /* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside);
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
 
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);

@@ -82,7 +82,7 @@ class Pilot(NamedTuple):
         """Choose the next action, as the agent would write it, shape (M,).
 
         Args:
-            env: Its readings may be arrays or symbols.
+            env: Its readings are arrays.
             state: What the controller remembers.
 
         Returns:

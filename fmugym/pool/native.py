@@ -505,24 +505,12 @@ class NativePool(SavingPool):
         Args:
             arrays: Actions, observations, rewards, terminated and truncated as for the function
                 that ``prepare_play`` returns, each with a first axis for the steps; and memory for
-                drawn values, which are not drawn; and a mask of instances to leave out, shape
-                (N,), or nothing. Their inputs may change.
+                drawn values, which are not drawn.
 
         Returns:
             How many instances or numbers were in trouble; if there are any, not all steps are done.
         """
         return self._open_pool().rollout(*arrays)
-
-    def exchange_play(self, other: Any) -> Any:
-        """Put what was prepared before in the place of what is prepared now.
-
-        Args:
-            other: What an earlier call of this method has returned, or None.
-
-        Returns:
-            What ``prepare_play`` has prepared; None if there is nothing.
-        """
-        return self._open_pool().exchange_play(other)
 
     def prepare_single(self, **groups: Any) -> SingleCalls:
         """Prepare a pool of one instance to do whole steps of a single environment.

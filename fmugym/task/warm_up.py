@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, Final
@@ -25,16 +24,12 @@ from fmugym.pool.states import KeptState, StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
-from fmugym.task.waiting import STEPS_BEFORE
 from fmugym.trial.known import state_files
 
 __all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
-
-_COMPILER: Final = "fmugym.vector.warming"
-"""It lies above this room, and it takes a while to import."""
 
 _WARNING: Final = int(Status.WARNING)  # which is compared in less time
 
@@ -45,7 +40,7 @@ class WarmUp(ABC):
     """What happens in a warm-up.
 
     Its methods read the environment as hooks do. The readings are arrays with M environments on the
-    last axis, also in a single environment, or symbols. ``step_count`` rises to 0.
+    last axis, also in a single environment. ``step_count`` rises to 0.
 
     Attributes:
         steps: How many steps it has.
@@ -151,9 +146,6 @@ class WarmUps:
         self._scope = b""
         self._keys: dict[int, bytes] = {}
         self._has_told = False
-        self._in_pass: Any = None
-        self._prepared_for: Pool | None = None
-        self._left = STEPS_BEFORE
 
     # States that are known
 
@@ -246,24 +238,11 @@ class WarmUps:
         """
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
-        compiled = self._compiled(pool, len(indices))
-        run = self._run_in_python if compiled is None else compiled.run
-        variables = run(pool, readings, indices, skip)
-        for index in indices[pool.statuses[indices] > _WARNING].tolist():
-            raise failed_reset(self._located(pool, index))
+        variables = self._play(pool, readings, indices, skip)
         self._keep(pool, variables, indices)
         return variables
 
-    def _compiled(self, pool: Pool, count: int) -> Any:
-        """What does warm-ups in the pool's pass; None until that is worth its time, or for good."""
-        if self._left > 0:
-            self._left -= count * self._warm_up.steps
-        elif self._prepared_for is not pool:
-            self._prepared_for = pool
-            self._in_pass = import_module(_COMPILER).compiled(self._env, self._warm_up, pool)
-        return self._in_pass
-
-    def _run_in_python(
+    def _play(
         self,
         pool: Pool,
         readings: Readings,

@@ -111,7 +111,6 @@ static PyMethodDef methods[] = {
     FAST("play_before", py_play_before),
     FAST("play_after", py_play_after),
     FAST("rollout", py_rollout),
-    {"exchange_play", py_exchange_play, METH_O, NULL},
     {"prepare_single", (PyCFunction)(void (*)(void))py_prepare_single,
      METH_VARARGS | METH_KEYWORDS, NULL},
     FAST("step_single", py_step_single),

@@ -113,7 +113,6 @@ PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_seed(PyObject *module, PyObject *args);
 
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
-PyObject *py_exchange_play(PyObject *object, PyObject *other);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset_by(PyObject *object, PyObject *options);
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
