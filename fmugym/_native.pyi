@@ -432,5 +432,3 @@ class Pool:
         They are ``step``, ``reset``, ``step_or_reset`` and ``play``.
         """
 
-    def uses_states(self) -> bool:
-        """Whether resets restore saved initial states, as far as is known by now."""

@@ -130,8 +130,8 @@ static void free_states(Pool *pool, Instance *me) {
         instance_free_state(pool, me, &pool->spares[index]);
     }
     for (Snapshot *snapshot = pool->snapshots; snapshot != NULL; snapshot = snapshot->next) {
-        if (snapshot->generations[index] == me->generation) {
-            instance_free_state(pool, me, &snapshot->states[index]);
+        if (snapshot->kept[index].generation == me->generation) {
+            instance_free_state(pool, me, &snapshot->kept[index].state);
         }
     }
 }

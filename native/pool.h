@@ -125,13 +125,18 @@ typedef struct {
 /* Threads that work on neighbouring instances must not write to the same cache line. */
 _Static_assert(sizeof(void *) != 8 || sizeof(Instance) == CACHE_LINE, "an instance fills a line");
 
+/* The state of an instance in the FMU's memory. */
+typedef struct {
+    void *state; /* NULL if it is gone */
+    int64_t steps;
+    double start_time;
+    uint32_t generation; /* that of the instance */
+} Kept;
+
 typedef struct Snapshot {
     struct Snapshot *next; /* next in the list of the pool's snapshots */
     Atomic abandoned;      /* whether the pool must free it */
-    void **states;
-    int64_t *steps;
-    double *start_times;
-    uint32_t *generations;
+    Kept kept[];           /* of each instance */
 } Snapshot;
 
 /* A value that was set before initialization. */
@@ -292,11 +297,10 @@ ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 /* Sets variables between two steps. Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values);
 
-/* Snapshots. A new snapshot belongs to the pool that saves its states in it. */
+/* Snapshots. A new snapshot belongs to the pool that saves its states in it; before, it can be freed
+ * as any memory. */
 
 Snapshot *snapshot_new(size_t count); /* NULL if memory runs out */
-/* Only for a snapshot that belongs to no pool. */
-void snapshot_free(Snapshot *snapshot);
 /* Returns the index of the first instance that fails, or -1. Afterwards the snapshot has been
  * freed or belongs to the pool. */
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);

@@ -16,12 +16,13 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     }
     health_count_steps(task->pool, me);
     record_drop(task->pool, index);
-    const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
+    const Kept *kept = &task->snapshot->kept[index];
+    const Status status = instance_restore(task->pool, me, kept->state);
     if (status > STATUS_WARNING) {
         return status;
     }
-    me->start_time = task->snapshot->start_times[index];
-    instance_count_from(me, task->snapshot->steps[index]);
+    me->start_time = kept->start_time;
+    instance_count_from(me, kept->steps);
     return instance_read_outputs(task->pool, me, scratch);
 }
 

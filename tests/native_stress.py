@@ -284,7 +284,7 @@ class Subject:
         self.pool.health()
 
     def costs(self):
-        return self.pool.costs, self.pool.uses_states
+        return self.pool.costs
 
     def close(self):
         if self.rng.random() < 0.05:

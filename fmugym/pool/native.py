@@ -559,11 +559,6 @@ class NativePool(SavingPool):
         """
         return self._reset_of_play
 
-    @property
-    def uses_states(self) -> bool:
-        """Whether resets restore saved initial states, as far as known so far."""
-        return self._pool.uses_states()
-
 
 def prepare(
     pool: _native.Pool,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,9 +15,14 @@ from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
 from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
-from fmugym.task.snapshot import Columns
+from fmugym.task.snapshot import Column, Columns
 
-__all__ = ["columns_of", "learn", "native_value", "place_columns", "require_saving"]
+__all__ = ["READ", "columns_of", "learn", "place_columns", "read_columns", "require_saving"]
+
+_NUMBERS: Final = ("_values", "previous_state", "inputs")
+
+READ: Final = (*_NUMBERS, "action", "previous_action", "step_count", "done", "after_end")
+"""The attributes that hooks read, but for mappings."""
 
 
 def require_saving(pool: Pool) -> None:
@@ -39,24 +44,28 @@ def columns_of(env: Constructed) -> Columns:
     """
     attributes = plain_attributes(vars(env), env._own_names)
     streams, seeds = _stream_of(env)
-    return {
-        "values": np.array([env._values]),
-        "previous_state": np.array([env.previous_state]),
-        "inputs": np.array([env.inputs], np.float64),
-        "action": [copy.deepcopy(env.action)],
-        "previous_action": [copy.deepcopy(env.previous_action)],
-        "step_count": np.array([env.step_count]),
-        "done": np.array([env.done]),
-        "after_end": np.array([env.after_end]),
+    return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
         "ended": np.array([env._ended]),
-        "parameters": {name: [value] for name, value in env.parameters.items()},
-        "texts": {name: [env.out[name]] for name in env.out.strings},
-        "variables": {name: [copy.deepcopy(v)] for name, v in env.variables.items()},
         "streams": streams,
         "seeds": seeds,
         "pictured": [(env._last_reward, env._return)],
         "attributes": [changed(attributes, env._as_constructed)],
     }
+
+
+def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
+    """Copy what hooks read, of one environment or of several.
+
+    Args:
+        env: The environment, or the prototype of several.
+        column: Copies a value, or those of several environments.
+    """
+    columns: Columns = {name.lstrip("_"): column(getattr(env, name)) for name in READ}
+    texts = {name: env.out[name] for name in env.out.strings}
+    groups = {"parameters": env.parameters, "variables": env.variables, "texts": texts}
+    for kind, values in groups.items():
+        columns[kind] = {name: column(value) for name, value in values.items()}
+    return columns
 
 
 def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
@@ -74,20 +83,19 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
     learn(columns.get("texts", {}))
-    values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
-    env._values = values
-    env.state = values[: env._output_count]
-    env.previous_state = tuple(np.asarray(columns["previous_state"][place], np.float64).tolist())
-    env.inputs = tuple(np.asarray(columns["inputs"][place], np.float64).tolist())
-    env.action = native_value(columns["action"], place)
-    env.previous_action = native_value(columns["previous_action"], place)
+    for name in _NUMBERS:
+        numbers = np.asarray(columns[name.lstrip("_")][place], np.float64)
+        setattr(env, name, tuple(numbers.tolist()))
+    env.state = env._values[: env._output_count]
+    env.action = _native_value(columns["action"], place)
+    env.previous_action = _native_value(columns["previous_action"], place)
     env.step_count = int(columns["step_count"][place])
     env.done = bool(columns["done"][place])
     env.after_end = bool(columns["after_end"][place])
-    parameters = {name: native_value(c, place) for name, c in columns["parameters"].items()}
+    parameters = {name: _native_value(c, place) for name, c in columns["parameters"].items()}
     env.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
     env.variables.update(
-        {name: native_value(column, place) for name, column in columns["variables"].items()}
+        {name: _native_value(column, place) for name, column in columns["variables"].items()}
     )
     pictured, attributes = columns["pictured"], columns["attributes"]
     env._last_reward, env._return = (None, 0.0) if pictured is None else pictured[place]
@@ -102,7 +110,7 @@ def learn(texts: Mapping[str, Any]) -> None:
         numbers_of(column)
 
 
-def native_value(column: Any, place: int) -> Any:
+def _native_value(column: Any, place: int) -> Any:
     """One value of a column as the hooks of a single environment read it."""
     value = column[place]
     if isinstance(column, list):

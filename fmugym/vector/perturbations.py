@@ -229,7 +229,8 @@ class _Perturbation:
         if len(starting):
             self._start_at(trials)
             self._require_fine("a start", starting)
-            columns["values"][starting] = self._pool.outputs.T[starting]
+            for index in starting.tolist():
+                columns["values"][index] = self._pool.outputs[:, index].copy()
         before = self._pool.read(self._x).T
         self._require_states(before[starting], trials.states[starting])
         self._engine.place(columns, self._everywhere, self._everywhere)

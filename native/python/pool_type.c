@@ -132,7 +132,6 @@ static PyMethodDef methods[] = {
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},
     {"costs", py_costs, METH_NOARGS, NULL},
-    {"uses_states", py_uses_states, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

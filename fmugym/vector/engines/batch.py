@@ -347,7 +347,7 @@ class BatchEngine(Engine):
 
     def columns(self, indices: IndexArray) -> Columns:
         """See ``Engine.columns``."""
-        return columns_of(self.env, self.env.parameters, indices) | {
+        return columns_of(self.env, indices) | {
             "ended": self.ended[indices],
             **dict(zip(("streams", "seeds"), self._streams.taken(indices), strict=True)),
         }
