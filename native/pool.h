@@ -183,8 +183,6 @@ typedef struct Pool {
     char *names;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
-    void **spares;   /* for each instance, a state whose memory is used again, or NULL */
-    Atomic wasteful; /* whether the FMU makes a new state instead of overwriting one */
     Records *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];

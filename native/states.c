@@ -8,23 +8,7 @@
 #include "records.h"
 #include "steps.h"
 
-static const size_t SPARES_LIMIT = (size_t)64 << 20; /* bytes of states kept for reuse, in all */
-
 /* Saving */
-
-/* Overwrites the last state of the instance, as FMI allows. An FMU that makes a new state instead
- * would leak memory, so its states are freed from then on. */
-static Status save_over(Pool *pool, Instance *me, void **spare) {
-    void *before = *spare;
-    const Status status = pool->settings.fmi->get_state(me->library, me->component, spare);
-
-    floats_restore_if_seen(&pool->floats);
-    if (before != NULL && *spare != before) {
-        atomic_set(&pool->wasteful, 1);
-    }
-    return status > STATUS_WARNING ? instance_fail(pool, me, "saving the FMU state", status)
-                                   : status;
-}
 
 /* Returns the new bytes, or NULL if memory runs out. */
 static char *add(Bytes *all, size_t size) {
@@ -78,34 +62,32 @@ static Status save_record(Pool *pool, Instance *me, StateHead head, Bytes *all) 
     return STATUS_OK;
 }
 
-static Status append(Pool *pool, Instance *me, StateHead head, size_t size, Bytes *all) {
-    const size_t index = index_of(pool, me);
-    char *to = add_state(pool, index, head, size, all);
+static Status serialize(Pool *pool, Instance *me, void *state, StateHead head, Bytes *all) {
+    const Fmi *fmi = pool->settings.fmi;
+    const size_t size = fmi->state_size(me->library, me->component, state);
 
+    floats_restore_if_seen(&pool->floats);
+    if (size == 0) {
+        return instance_refuse(me, "the FMU state has no bytes");
+    }
+    head.kind = KIND_STATE;
+    char *to = add_state(pool, index_of(pool, me), head, size, all);
     if (to == NULL) {
         return instance_refuse(me, "out of memory");
     }
-    const Status status = pool->settings.fmi->serialize(me->library, me->component,
-                                                        pool->spares[index], to, size);
+    const Status status = fmi->serialize(me->library, me->component, state, to, size);
     floats_restore_if_seen(&pool->floats);
     return status > STATUS_WARNING ? instance_fail(pool, me, "serializing the FMU state", status)
                                    : status;
 }
 
 static Status save_state(Pool *pool, Instance *me, StateHead head, Bytes *all) {
-    void **spare = &pool->spares[index_of(pool, me)];
-    Status status = save_over(pool, me, spare);
+    void *state;
+    Status status = instance_save(pool, me, &state);
 
-    if (status > STATUS_WARNING) {
-        return status;
-    }
-    const size_t size = pool->settings.fmi->state_size(me->library, me->component, *spare);
-    floats_restore_if_seen(&pool->floats);
-    head.kind = KIND_STATE;
-    status = size == 0 ? instance_refuse(me, "the FMU state has no bytes")
-                       : append(pool, me, head, size, all);
-    if (size > SPARES_LIMIT / pool->settings.count || atomic_get(&pool->wasteful)) {
-        instance_free_state(pool, me, spare);
+    if (status <= STATUS_WARNING) {
+        status = serialize(pool, me, state, head, all);
+        instance_free_state(pool, me, &state);
     }
     return status;
 }

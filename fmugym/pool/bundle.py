@@ -12,8 +12,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import numbers_of
-
 __all__ = ["Bundle", "Copies", "Head", "SaveMethod", "ended_state", "head_of", "outputs_of"]
 
 FloatArray = npt.NDArray[np.float64]
@@ -99,13 +97,11 @@ class Bundle:
     Attributes:
         states: One for each; see ``Head``.
         replays: Whether they are records, or nothing where an episode had ended.
-        texts: Those that Strings begin with, which another process may not know.
         copies: Copies of the states, besides the records. They are no part of a pickle.
     """
 
     states: tuple[bytes, ...]
     replays: bool = False
-    texts: tuple[str, ...] = ()
     copies: Copies | None = None
 
     @property
@@ -116,7 +112,7 @@ class Bundle:
         return SaveMethod.REPLAY if self.copies is None else SaveMethod.COPY
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _unpickled, (self.states, self.replays, self.texts)
+        return Bundle, (self.states, self.replays)
 
     def __len__(self) -> int:
         return len(self.states)
@@ -136,10 +132,4 @@ class Bundle:
     @classmethod
     def of_all(cls, bundles: Sequence[Bundle]) -> Bundle:
         """Put bundles of one pool together."""
-        texts = tuple(text for bundle in bundles for text in bundle.texts)
-        return cls(sum((b.states for b in bundles), ()), bundles[0].replays, texts)
-
-
-def _unpickled(states: tuple[bytes, ...], replays: bool, texts: tuple[str, ...]) -> Bundle:
-    numbers_of(texts)  # this process now knows them
-    return Bundle(states, replays, texts)
+        return cls(sum((b.states for b in bundles), ()), bundles[0].replays)

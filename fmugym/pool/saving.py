@@ -69,13 +69,7 @@ class SavingPool(AttendedPool):
         """See ``Pool.save_instances``."""
         replays = self.save_method is not SaveMethod.STATE
         states = tuple(self.save_states(indices, replays))
-        texts = self._texts(states) if replays and self._form[0].strings else ()
-        return Bundle(states, replays, texts, self._copies(indices))
-
-    def _texts(self, states: Sequence[bytes]) -> tuple[str, ...]:
-        variables = [v for record in self._records(states) for v in record.variables]
-        texts = (text for v in variables if v.kind == "string" for text, _ in v.items)
-        return tuple(dict.fromkeys(texts))
+        return Bundle(states, replays, self._copies(indices))
 
     def _records(self, states: Sequence[bytes]) -> list[Record]:
         """The records among states."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
@@ -17,7 +16,7 @@ from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.snapshot import Column, Columns
 
-__all__ = ["READ", "columns_of", "learn", "place_columns", "read_columns", "require_saving"]
+__all__ = ["READ", "columns_of", "place_columns", "read_columns", "require_saving"]
 
 _NUMBERS: Final = ("_values", "previous_state", "inputs")
 
@@ -82,7 +81,6 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
-    learn(columns.get("texts", {}))
     for name in _NUMBERS:
         numbers = np.asarray(columns[name.lstrip("_")][place], np.float64)
         setattr(env, name, tuple(numbers.tolist()))
@@ -102,12 +100,6 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
     env._was_reset, env._ended = True, bool(columns["ended"][place])
-
-
-def learn(texts: Mapping[str, Any]) -> None:
-    """Let this process know the texts of Strings that another one has met."""
-    for column in texts.values():
-        numbers_of(column)
 
 
 def _native_value(column: Any, place: int) -> Any:

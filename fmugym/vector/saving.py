@@ -12,7 +12,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
-from fmugym.task.saving import READ, learn, read_columns
+from fmugym.task.saving import READ, read_columns
 from fmugym.task.snapshot import Columns, Snapshot
 
 __all__ = [
@@ -102,7 +102,6 @@ def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
 
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
-    learn(columns.get("texts", {}))
     for name in READ:
         place_column(getattr(env, name), columns[name.lstrip("_")], sources, which)
 
