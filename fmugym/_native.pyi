@@ -431,4 +431,3 @@ class Pool:
 
         They are ``step``, ``reset``, ``step_or_reset`` and ``play``.
         """
-

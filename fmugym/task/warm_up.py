@@ -20,7 +20,7 @@ from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.patience import failed_reset
-from fmugym.pool.states import KeptState, StateFiles, essence
+from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
@@ -48,7 +48,6 @@ class WarmUp(ABC):
         depends_on: The episode variables on which it depends.
         writes: The episode variables that it writes.
         digest: Tells it from others that lead to other states.
-        starts: The numbers that its controllers remember, at the beginning.
     """
 
     steps: int
@@ -56,24 +55,18 @@ class WarmUp(ABC):
     depends_on: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     digest: str = ""
-    starts: tuple[float, ...] = ()
 
     @abstractmethod
-    def decide(self, env: Any, state: Sequence[Any]) -> tuple[Mapping[int, Any], tuple[Any, ...]]:
-        """Choose actions.
+    def begin(self, count: int) -> None:
+        """Prepare for the warm-up of some environments.
 
         Args:
-            env: The environment.
-            state: What the controllers remember, in the order of ``starts``.
-
-        Returns:
-            The elements of the action that are chosen, by their places, and what the controllers
-            remember then.
+            count: M.
         """
 
     @abstractmethod
     def inputs(self, env: Any) -> Any:
-        """Return the FMU's inputs that follow from the action, numbers or of shape (M,)."""
+        """Choose the action, and return the FMU's inputs that follow, numbers or of shape (M,)."""
 
     @abstractmethod
     def update(self, env: Any) -> None:
@@ -250,15 +243,11 @@ class WarmUps:
         skip: npt.NDArray[np.bool_],
     ) -> dict[str, Any]:
         count, warm_up = len(indices), self._warm_up
-        state = tuple(np.full(count, start) for start in warm_up.starts)
+        warm_up.begin(count)
         with reading(self._env, readings), np.errstate(all="ignore"):
             env: Any = self._env
             for step in range(-warm_up.steps, 0):
                 env.step_count = np.full(count, step)
-                chosen, state = warm_up.decide(env, state)
-                env.previous_action, env.action = env.action, np.array(env.action)
-                for place, value in chosen.items():
-                    env.action[place if env.action.ndim > 1 else ...] = value
                 self._step(pool, indices, skip)
                 env.step_count = np.full(count, step + 1)
                 warm_up.update(env)
@@ -304,20 +293,19 @@ class WarmUps:
         return [int(np.prod(shape)) for shape in self._shapes.values()]
 
     def _files(self) -> StateFiles | None:
-        prefix = self._prefix or ""
-        width = len(self._env._interface.inputs) + sum(self._sizes)
-        return StateFiles(prefix, width) if prefix else None
+        return StateFiles(self._prefix) if self._prefix else None
 
     def _read(self, key: bytes) -> Warmed | None:
         files = self._files()
         found = None if files is None else files.find(key.hex()[:32])
-        if found is None:
+        ends = np.cumsum([len(self._env._interface.inputs), *self._sizes])
+        numbers = 8 * int(ends[-1])
+        if found is None or len(found) <= numbers:
             return None
-        ends = np.cumsum([len(self._env._interface.inputs), *self._sizes])[:-1]
-        inputs, *parts = np.split(np.frombuffer(found.numbers), ends)
+        inputs, *parts = np.split(np.frombuffer(found[:numbers]), ends[:-1])
         shapes = self._shapes.items()
         variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
-        warmed = Warmed(Bundle((found.data,)), inputs, variables)
+        warmed = Warmed(Bundle((found[numbers:],)), inputs, variables)
         _memory.keep(key, warmed)
         return warmed
 
@@ -326,7 +314,7 @@ class WarmUps:
         if files is not None:
             values = [warmed.inputs, *warmed.variables.values()]
             numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
-            files.keep(key.hex()[:32], KeptState(numbers.tobytes(), warmed.state.states[0]))
+            files.keep(key.hex()[:32], numbers.tobytes() + warmed.state.states[0])
 
 
 def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:

@@ -213,7 +213,7 @@ class BatchEngine(Engine):
         try:
             observations = self._observe()
             self._require_finite_start(observations, mask)
-            return observations, self._infos(mask) | drawn_info(plan, drawn, mask)
+            return observations, self._infos(mask) | drawn_info(plan, drawn, mask.copy())
         finally:
             self.env._in_hooks = False
             self.note_starts(mask)
@@ -228,7 +228,7 @@ class BatchEngine(Engine):
             )
 
     def _begin(self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
-        """Draw and start episodes; return the values, shape (draws, M)."""
+        """Draw and start episodes; return the values, shape (draws, N)."""
         drawn = self._streams.draw(plan, indices)
         values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
@@ -238,7 +238,9 @@ class BatchEngine(Engine):
             self._forget(indices, plan)
         else:
             self._begin_with_warm_up(warm_ups, indices, plan, values)
-        return drawn
+        drawn_by_all = np.zeros((len(drawn), self._n))
+        drawn_by_all[:, indices] = drawn
+        return drawn_by_all
 
     def _reset_pool(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, values: FloatArray
@@ -422,7 +424,7 @@ class BatchEngine(Engine):
                 return self._evaluate(observed, None)
             env.step_count[resetting] = 0
             result = self._evaluate(observed, resetting)
-            result.infos.update(drawn_info(env._plan, drawn, resetting))
+            result.infos.update(drawn_info(env._plan, drawn, resetting.copy()))
             return result
         finally:
             env._in_hooks = False

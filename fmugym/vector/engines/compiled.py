@@ -16,11 +16,8 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
 from fmugym.signals import ordinary
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
-from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
-from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.layout import Layout
@@ -28,10 +25,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import Row
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
-from fmugym.vector.infos import (
-    not_finite,
-    restricted,
-)
+from fmugym.vector.infos import drawn_info, not_finite, restricted
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine"]
@@ -96,7 +90,7 @@ class CompiledEngine(BatchEngine):
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
-        tell = partial(_start_infos, plan)
+        tell = partial(drawn_info, plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             (task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)),
@@ -243,7 +237,7 @@ class CompiledEngine(BatchEngine):
         drawn = self._draw_ahead(mask) if self._draws_ahead else np.empty(self._drawn_shape)
         self.has_moved = True
         troubled, self.any_ended = self._start(mask, seen, drawn)
-        infos = _start_infos(self.env._plan, drawn, mask)
+        infos = drawn_info(self.env._plan, drawn, mask)
         if self._divided is not None:
             seen, told = self._divided(seen)
             infos = restricted(told, mask) | infos
@@ -332,7 +326,7 @@ class CompiledEngine(BatchEngine):
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
         if resetting is not None:
-            result.infos.update(_start_infos(self.env._plan, drawn, resetting))
+            result.infos.update(drawn_info(self.env._plan, drawn, resetting))
         if troubled or self._left:
             return self._completed(result, troubled, resetting, started)
         return result
@@ -503,11 +497,3 @@ class CompiledEngine(BatchEngine):
 
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
-
-
-def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
-
-
-def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(plan.shown(drawn), mask)
