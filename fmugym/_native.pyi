@@ -175,6 +175,7 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
+    records: bool
     start_outputs: bytes | None
 
 class Variables(TypedDict):
@@ -422,9 +423,6 @@ class Pool:
         Returns:
             How many of the instances have a status worse than a warning.
         """
-
-    def keep_records(self) -> None:
-        """Keep the start values and the inputs of all episodes, from the next reset on."""
 
     def costs(self) -> tuple[float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.

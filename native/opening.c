@@ -61,7 +61,7 @@ static bool allocate(Pool *pool) {
                                  sizeof *pool->first_outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
            pool->chosen != NULL && pool->starts != NULL && pool->start_ids != NULL &&
-           pool->first_outputs != NULL;
+           pool->first_outputs != NULL && (!s->records || records_open(pool));
 }
 
 static void prepare_instance(Pool *pool, size_t index) {

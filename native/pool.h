@@ -44,6 +44,7 @@ typedef struct {
     bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
+    bool records; /* whether it keeps the inputs of episodes; see records.h */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;

@@ -54,9 +54,6 @@ static void free_records(Records *r) {
 bool records_open(Pool *pool) {
     const size_t count = pool->settings.count;
 
-    if (pool->records != NULL) {
-        return true;
-    }
     Records *r = make_records(count, pool->settings.inputs->count);
     if (r != NULL && (r->starts == NULL || r->rows == NULL)) {
         free_records(r);

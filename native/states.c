@@ -92,6 +92,10 @@ static Status save_state(Pool *pool, Instance *me, StateHead head, Bytes *all) {
     return status;
 }
 
+static bool serializes(const Pool *pool) {
+    return pool->settings.can_save && pool->settings.fmi->serialize != NULL;
+}
+
 static Status save_instance(Pool *pool, Instance *me, bool records, Bytes *all) {
     const size_t index = index_of(pool, me);
     const StateHead head = {KIND_ENDED, me->steps, me->start_time, 0, 0};
@@ -102,11 +106,11 @@ static Status save_instance(Pool *pool, Instance *me, bool records, Bytes *all) 
         return add_state(pool, index, head, 0, all) == NULL ? instance_refuse(me, "out of memory")
                                                             : STATUS_OK;
     }
-    return records ? save_record(pool, me, head, all) : save_state(pool, me, head, all);
-}
-
-bool pool_serializes(const Pool *pool) {
-    return pool->settings.can_save && pool->settings.fmi->serialize != NULL;
+    if (records) {
+        return save_record(pool, me, head, all);
+    }
+    return serializes(pool) ? save_state(pool, me, head, all)
+                            : instance_refuse(me, "the FMU cannot serialize its state");
 }
 
 ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, bool records,
@@ -154,7 +158,7 @@ bool state_is_sound(const Pool *pool, State state) {
     const StateHead head = head_of(state);
     const size_t rest = state.size - before;
     return head.kind == KIND_ENDED    ? rest == 0
-           : head.kind == KIND_STATE  ? rest > 0 && pool_serializes(pool)
+           : head.kind == KIND_STATE  ? rest > 0 && serializes(pool)
            : head.kind == KIND_RECORD ? record_fits(pool, head.starts, head.rows, rest)
                                       : false;
 }

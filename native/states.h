@@ -31,9 +31,6 @@ typedef struct {
     size_t size, room;
 } Bytes;
 
-/* Whether the FMU can serialize its state. */
-bool pool_serializes(const Pool *pool);
-
 /* Appends the states of instances, or their records, and sets where each of them ends. Returns the
  * index of the first instance that fails, or -1. */
 ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, bool records,

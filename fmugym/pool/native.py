@@ -45,7 +45,7 @@ from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.remote import Hosts
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
-from fmugym.pool.saving import SavingPool
+from fmugym.pool.saving import SavingPool, keeps_records
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
@@ -134,8 +134,7 @@ class NativePool(SavingPool):
             fmu.close()
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
-        if self._prepare_saving(fmu.description, spec):
-            self._pool.keep_records()
+        self._prepare_saving(fmu.description, spec)
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self.watched(self._pool.reset)
@@ -164,7 +163,10 @@ class NativePool(SavingPool):
                         ),
                     },
                 ),
-                experiment=cast("_native.Experiment", experiment_settings(spec)),
+                experiment=cast(
+                    "_native.Experiment",
+                    experiment_settings(spec, records=keeps_records(description, spec)),
+                ),
                 variables=cast(
                     "_native.Variables",
                     variable_settings(spec)
@@ -231,7 +233,7 @@ class NativePool(SavingPool):
         return self._result
 
     def save(self) -> _native.Snapshot:
-        """See ``Pool.save``."""
+        """See ``SavingPool.save``."""
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
@@ -247,7 +249,7 @@ class NativePool(SavingPool):
     def restore(
         self, snapshot: _native.Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``."""
+        """See ``SavingPool.restore``."""
         pool = self._open_pool()
         if not isinstance(snapshot, _native.Snapshot):
             raise SimulationError("the snapshot was taken from another pool")

@@ -16,14 +16,19 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.attendant import AttendedPool
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
 from fmugym.pool.settings import Record, record_in
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
-__all__ = ["SavingPool", "offered_method"]
+__all__ = ["SavingPool", "keeps_records", "offered_method"]
 
 logger = logging.getLogger(__name__)
+
+
+def keeps_records(description: ModelDescription, spec: PoolSpec) -> bool:
+    """Whether a pool must keep the inputs of its episodes."""
+    return spec.records or offered_method(description, spec) is not SaveMethod.STATE
 
 
 def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
@@ -47,11 +52,10 @@ class SavingPool(AttendedPool):
     _offered = SaveMethod.REPLAY
     _ask_for_method: Callable[[], SaveMethod] | None = None
 
-    def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> bool:
-        """Take over what saving needs; returns whether the pool must keep records."""
+    def _prepare_saving(self, description: ModelDescription, spec: PoolSpec) -> None:
+        """Take over what saving needs."""
         self._form = description, spec
         self._offered = offered_method(description, spec)
-        return spec.records or self._offered is not SaveMethod.STATE
 
     def save_by(self, ask_for_method: Callable[[], SaveMethod]) -> None:
         """Let the first call that saves or restores ask which method works."""
@@ -119,6 +123,34 @@ class SavingPool(AttendedPool):
         """
 
     # Copies
+
+    @abstractmethod
+    def save(self) -> Any:
+        """Copy the FMU states and times of all instances.
+
+        Returns:
+            A snapshot for ``restore`` of the same pool. It is freed with its last reference.
+
+        Raises:
+            SimulationError: If the FMU offers no state, or an instance cannot save it now.
+        """
+
+    @abstractmethod
+    def restore(
+        self, snapshot: Any, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """Return instances to a snapshot.
+
+        Args:
+            snapshot: From ``save``.
+            mask: Which instances, shape (N,); None for all.
+
+        Returns:
+            As ``reset``.
+
+        Raises:
+            SimulationError: If the snapshot is of another pool, or an instance was replaced since.
+        """
 
     def _copy_all(self) -> Any:
         """Copy all states as ``save`` does, but in a way that lets instances be replaced."""

@@ -139,7 +139,7 @@ def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
     }
 
 
-def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
+def experiment_settings(spec: PoolSpec, *, records: bool = False) -> dict[str, Any]:
     """How instances are initialized and stepped, and how episodes begin."""
     method = spec.whole_reset_method
     return {
@@ -154,6 +154,7 @@ def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
         "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
         "reloads": method == ResetMethod.LIBRARY,
         "one_initialization": spec.one_initialization,
+        "records": records,
         "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
     }
 

@@ -3,7 +3,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "../records.h"
 #include "../states.h"
 #include "python.h"
 
@@ -52,15 +51,6 @@ static void do_save(PyPool *self, bool alone, void *context) {
     s->failed = pool_save_states(&self->pool, s->indices, s->count, s->records, &s->all, s->ends);
 }
 
-static bool can_save(const PyPool *self, bool records) {
-    const bool able = records || pool_serializes(&self->pool);
-
-    if (!able) {
-        PyErr_SetString(PyExc_ValueError, "the FMU cannot serialize its state");
-    }
-    return able;
-}
-
 static bool take_saving(PyPool *self, PyObject *const *args, Saving *s) {
     s->records = args[1] == Py_True;
     s->indices = copy_of(args[0], "the indices", ANY_LENGTH, &s->count);
@@ -68,8 +58,7 @@ static bool take_saving(PyPool *self, PyObject *const *args, Saving *s) {
     if (s->indices != NULL && s->ends == NULL) {
         PyErr_NoMemory();
     }
-    return s->ends != NULL && are_instances(self, s->indices, s->count) &&
-           can_save(self, s->records);
+    return s->ends != NULL && are_instances(self, s->indices, s->count);
 }
 
 static PyObject *list_of(const Saving *s) {
@@ -185,24 +174,4 @@ PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t 
     free(r.states);
     free(r.indices);
     return result;
-}
-
-/* Records */
-
-static void do_keep(PyPool *self, bool alone, void *context) {
-    (void)alone;
-    *(bool *)context = records_open(&self->pool);
-}
-
-PyObject *py_keep_records(PyObject *object, PyObject *unused) {
-    bool done = false;
-
-    (void)unused;
-    if (!perform((PyPool *)object, ALWAYS_SHORT, do_keep, &done)) {
-        return NULL;
-    }
-    if (!done) {
-        return PyErr_NoMemory();
-    }
-    Py_RETURN_NONE;
 }

@@ -128,7 +128,6 @@ static PyMethodDef methods[] = {
     {"failure", py_failure, METH_O, NULL},
     FAST("save_states", py_save_states),
     FAST("restore_states", py_restore_states),
-    {"keep_records", py_keep_records, METH_NOARGS, NULL},
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},
     {"costs", py_costs, METH_NOARGS, NULL},

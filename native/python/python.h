@@ -103,7 +103,6 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_save_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_keep_records(PyObject *object, PyObject *unused);
 
 PyObject *py_save(PyObject *object, PyObject *unused);
 PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

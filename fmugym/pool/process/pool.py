@@ -297,7 +297,7 @@ class ProcessPool(SavingPool):
             self._step(skip)
 
     def save(self) -> SnapshotOfWorkers:
-        """See ``Pool.save``."""
+        """See ``SavingPool.save``."""
         with self._lock:
             self._require_present()
             snapshot = self._states.save()
@@ -307,7 +307,7 @@ class ProcessPool(SavingPool):
     def restore(
         self, snapshot: SnapshotOfWorkers, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``; a state is lost with the process that saved it."""
+        """See ``SavingPool.restore``; a state is lost with the process that saved it."""
         mask = self._as_mask(mask)
         self._states.require_own(snapshot)
         with self._lock:

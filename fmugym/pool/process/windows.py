@@ -19,12 +19,12 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.pool.bundle import IndexArray, SaveMethod
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
-from fmugym.pool.saving import offered_method
+from fmugym.pool.saving import keeps_records
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
@@ -220,14 +220,13 @@ class ProgramCoding:
         writer.integers(description.fmi_major_version, manner_of(description, spec))
         _write_solving(writer, solving_settings(description, spec))
         _write_library(writer, library_settings(description, spec, place), setup.log_level)
-        experiment = experiment_settings(spec)
+        experiment = experiment_settings(spec, records=keeps_records(description, spec))
         _write_experiment(writer, experiment)
         writer.access(spec.inputs, description.fmi_major_version)
         writer.access(spec.outputs, description.fmi_major_version)
         _write_variables(writer, variable_settings(spec))
         writer.block(experiment["start_outputs"] or b"")
         writer.integers(setup.block.stop - setup.block.start, setup.threads)
-        writer.flags(spec.records or offered_method(description, spec) is not SaveMethod.STATE)
         self._write_memory(writer, setup)
 
     def _write_memory(self, writer: _Writer, setup: Setup) -> None:
@@ -370,7 +369,7 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
     writer.optional(experiment["tolerance"])
     writer.numbers(experiment["time_step"])
     writer.integers(*(experiment[name] for name in ("substeps", "warm_up_steps", "retries")))
-    names = ("restores", "rebuilds", "reloads", "one_initialization")
+    names = ("restores", "rebuilds", "reloads", "one_initialization", "records")
     writer.flags(*(experiment[name] for name in names))
 
 

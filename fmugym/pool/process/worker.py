@@ -279,13 +279,13 @@ class BlockWorker:
         return self._growth.after(int(np.count_nonzero(mask)))
 
     def save(self) -> int:
-        """See ``Pool.save``; the snapshot stays here, and its number is returned."""
+        """See ``SavingPool.save``; the snapshot stays here, and its number is returned."""
         number = next(self._numbers)
         self._snapshots[number] = self._pool.save()
         return number
 
     def restore(self, number: int, mask: MaskArray | None) -> None:
-        """See ``Pool.restore``."""
+        """See ``SavingPool.restore``."""
         self._pool.restore(self._snapshots[number], mask)
         self._publish()
 
