@@ -6,7 +6,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, Final
@@ -26,7 +26,7 @@ from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.trial.known import state_files
 
-__all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
+__all__ = ["WarmUp", "WarmUps", "rows_of_one"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
@@ -73,54 +73,34 @@ class WarmUp(ABC):
         """Write the episode variables that the warm-up changes, when the FMU has stepped."""
 
 
-@dataclass(frozen=True)
-class Warmed:
-    """What a warm-up has led to.
-
-    Attributes:
-        state: The FMU's state.
-        inputs: Its inputs, shape (k_in,).
-        variables: The episode variables that the warm-up writes, by name.
-    """
-
-    state: Bundle
-    inputs: FloatArray
-    variables: Mapping[str, Any]
-
-    @property
-    def size(self) -> int:
-        """About how many bytes it takes."""
-        values = self.variables.values()
-        return len(self.state.states[0]) + sum(np.asarray(value).nbytes for value in values)
-
-
 class _Memory:
     """Warmed-up states of all environments of this process by key."""
 
     def __init__(self) -> None:
-        self._states: OrderedDict[bytes, Warmed] = OrderedDict()
+        self._states: OrderedDict[bytes, bytes] = OrderedDict()
         self._lock, self._size = Lock(), 0
 
-    def find(self, key: bytes) -> Warmed | None:
+    def find(self, key: bytes) -> bytes | None:
         with self._lock:
             if key in self._states:
                 self._states.move_to_end(key)
             return self._states.get(key)
 
-    def keep(self, key: bytes, warmed: Warmed) -> None:
+    def keep(self, key: bytes, warmed: bytes) -> None:
         with self._lock:
-            if key in self._states or warmed.size > _MOST_BYTES:
+            if key in self._states or len(warmed) > _MOST_BYTES:
                 return
             self._states[key] = warmed
-            self._size += warmed.size
+            self._size += len(warmed)
             while self._size > _MOST_BYTES:
-                self._size -= self._states.popitem(last=False)[1].size
+                self._size -= len(self._states.popitem(last=False)[1])
 
 
 _memory: Final = _Memory()
 
-Found = dict[int, Warmed]
-"""By the index of an environment, the state that its warm-up leads to."""
+Found = dict[int, bytes]
+"""By the index of an environment, what its warm-up leads to: the inputs and the episode variables
+that it writes, all float64, and the FMU's state."""
 
 
 class WarmUps:
@@ -199,18 +179,40 @@ class WarmUps:
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
-    def restore(self, pool: Pool, found: Found) -> None:
+    def restore(self, pool: Pool, found: Found) -> list[tuple[dict[str, Any], IndexArray]]:
         """Bring FMUs to states that were found.
+
+        Returns:
+            The episode variables that warm-ups have written, each time with the environments.
 
         Raises:
             SimulationError: If an FMU refuses.
         """
-        for warmed, indices in grouped(found):
-            sources = np.zeros(len(indices), np.int64)
-            statuses = pool.restore_instances(warmed.state, sources, indices)
-            for index in indices[statuses[indices] > _WARNING].tolist():
-                raise failed_reset(self._located(pool, index))
-            pool.inputs[:, indices] = warmed.inputs[:, None]
+        groups: dict[bytes, list[int]] = {}
+        for index, warmed in found.items():
+            groups.setdefault(warmed, []).append(index)
+        pairs = [(warmed, np.array(indices)) for warmed, indices in groups.items()]
+        return [(self._restored(pool, *pair), pair[1]) for pair in pairs]
+
+    def _restored(self, pool: Pool, warmed: bytes, indices: IndexArray) -> dict[str, Any]:
+        size, ends = self._size_of_numbers, np.cumsum([len(pool.inputs), *self._sizes])
+        inputs, *parts = np.split(np.frombuffer(warmed[:size]), ends[:-1])
+        bundle, sources = Bundle((warmed[size:],)), np.zeros(len(indices), np.int64)
+        statuses = pool.restore_instances(bundle, sources, indices)
+        for index in indices[statuses[indices] > _WARNING].tolist():
+            raise failed_reset(self._located(pool, index))
+        pool.inputs[:, indices] = inputs[:, None]
+        shapes = self._shapes.items()
+        return {name: p.reshape(shape) for (name, shape), p in zip(shapes, parts, strict=True)}
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [int(np.prod(shape)) for shape in self._shapes.values()]
+
+    @property
+    def _size_of_numbers(self) -> int:
+        """How many bytes stand before the FMU's state."""
+        return 8 * (len(self._env._interface.inputs) + sum(self._sizes))
 
     # Warm-ups
 
@@ -280,49 +282,20 @@ class WarmUps:
             key = self._keys.pop(index, None)
             if key is None:
                 continue
-            state = pool.save_instances(np.array([index]))
-            variables = {name: np.array(row[..., place]) for name, row in rows.items()}
-            warmed = Warmed(state, pool.inputs[:, index].copy(), variables)
-            _memory.keep(key, warmed)
-            self._write(key, warmed)
+            values = pool.inputs[:, index], *(row[..., place] for row in rows.values())
+            numbers = b"".join(np.asarray(value, np.float64).tobytes() for value in values)
+            (state,) = pool.save_instances(np.array([index])).states
+            _memory.keep(key, numbers + state)
+            if self._prefix:
+                StateFiles(self._prefix).keep(key.hex()[:32], numbers + state)
 
-    # On disk
-
-    @property
-    def _sizes(self) -> list[int]:
-        return [int(np.prod(shape)) for shape in self._shapes.values()]
-
-    def _files(self) -> StateFiles | None:
-        return StateFiles(self._prefix) if self._prefix else None
-
-    def _read(self, key: bytes) -> Warmed | None:
-        files = self._files()
-        found = None if files is None else files.find(key.hex()[:32])
-        ends = np.cumsum([len(self._env._interface.inputs), *self._sizes])
-        numbers = 8 * int(ends[-1])
-        if found is None or len(found) <= numbers:
+    def _read(self, key: bytes) -> bytes | None:
+        """Find a state on disk."""
+        found = StateFiles(self._prefix).find(key.hex()[:32]) if self._prefix else None
+        if found is None or len(found) <= self._size_of_numbers:
             return None
-        inputs, *parts = np.split(np.frombuffer(found[:numbers]), ends[:-1])
-        shapes = self._shapes.items()
-        variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
-        warmed = Warmed(Bundle((found[numbers:],)), inputs, variables)
-        _memory.keep(key, warmed)
-        return warmed
-
-    def _write(self, key: bytes, warmed: Warmed) -> None:
-        files = self._files()
-        if files is not None:
-            values = [warmed.inputs, *warmed.variables.values()]
-            numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
-            files.keep(key.hex()[:32], numbers.tobytes() + warmed.state.states[0])
-
-
-def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:
-    """The states that were found, each with its environments."""
-    groups: dict[int, tuple[Warmed, list[int]]] = {}
-    for index, warmed in found.items():
-        groups.setdefault(id(warmed), (warmed, []))[1].append(index)
-    return [(warmed, np.array(indices)) for warmed, indices in groups.values()]
+        _memory.keep(key, found)
+        return found
 
 
 def rows_of_one(env: Any) -> Readings:

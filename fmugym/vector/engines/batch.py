@@ -27,7 +27,7 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.task.warm_up import WarmUps, grouped
+from fmugym.task.warm_up import WarmUps
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
@@ -261,10 +261,8 @@ class BatchEngine(Engine):
             found = warm_ups.find(pool, plan.model_variables, values, rows, left)
             first = warm_ups.distinct(index for index in left if index not in found)
             self._warm_up(warm_ups, np.array(first, np.intp), plan, values)
-            warm_ups.restore(pool, found)
-            for warmed, where in grouped(found):
-                columns = [np.asarray(value)[..., None] for value in warmed.variables.values()]
-                self._place(warmed.variables, columns, where)
+            for variables, where in warm_ups.restore(pool, found):
+                self._place(variables, [v[..., None] for v in variables.values()], where)
             left = [index for index in left if index not in found and index not in first]
         env.previous_state[:, indices] = env.state[:, indices]
 
