@@ -4,7 +4,7 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TypedDict, final
 
 import numpy.typing as npt
@@ -165,6 +165,7 @@ class Experiment(TypedDict):
     rebuilds: bool
     reloads: bool
     one_initialization: bool
+    records: bool
     start_outputs: bytes | None
 
 class Variables(TypedDict):
@@ -329,9 +330,6 @@ class Pool:
             The instance that refuses, or -1.
         """
 
-    def knows_start(self, index: int, start: Access, values: bytes, /) -> bool:
-        """Whether a reset with these start values (float64) restores a state."""
-
     def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
         """Tell what failed last.
 
@@ -355,20 +353,9 @@ class Pool:
         terminated: Array,
         truncated: Array,
         drawn: Array,
-        left_out: Array = ...,
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
-
-    def exchange_play(self, other: Any, /) -> Any:
-        """Put what was prepared before in the place of what is prepared now.
-
-        Args:
-            other: What an earlier call has returned, or None.
-
-        Returns:
-            What is prepared now.
-        """
 
     def write(self, access: Access, values: Array, /) -> int:
         """Set variables of all instances between two steps.
@@ -377,62 +364,26 @@ class Pool:
             The index of an instance that failed, or -1.
         """
 
-    def bundle(
-        self, indices: Array, ends: Array, steps: Array, start_times: Array, /
-    ) -> bytes | int:
-        """Serialize the states of M instances.
+    def save_states(self, indices: Array, records: bool, /) -> list[bytes] | int:
+        """Save the states of M instances, or the records of their episodes.
 
         Args:
             indices: The instances, int64, shape (M,).
-            ends: Filled with where each state ends, int64, shape (M,).
-            steps: Filled with the communication steps of each, int64, shape (M,).
-            start_times: Filled with the first communication point of each, float64, shape (M,).
+            records: Whether to save records.
 
         Returns:
-            The states one after the other, or the index of an instance that failed.
+            The states, or the index of an instance that failed.
         """
 
-    def unbundle(
-        self,
-        indices: Array,
-        sources: Array,
-        data: bytes,
-        ends: Array,
-        steps: Array,
-        start_times: Array,
-        outputs: Array,
-        /,
-    ) -> int:
-        """Restore serialized states; instance ``indices[i]`` gets the one at ``sources[i]``.
+    def restore_states(self, states: Sequence[bytes], indices: Array, /) -> int:
+        """Restore a state in each of M instances; see ``SavingPool.restore_states``.
 
         Returns:
             How many of the instances have a status worse than a warning.
         """
-
-    def keep_records(self) -> None:
-        """Keep the start values and the inputs of all episodes, from the next reset on."""
-
-    def record_of(
-        self, index: int, /
-    ) -> tuple[tuple[tuple[int, int, int, float], ...], int, bytes] | None:
-        """The start values, number of steps, and inputs of an episode.
-
-        A start value is a type, value reference, place in an array, and value.
-
-        Returns:
-            None if the episode is not known as a whole.
-        """
-
-    def replace_record(
-        self, index: int, start: Access, starts: bytes, inputs: bytes, steps: int, /
-    ) -> None:
-        """Let an episode count as the one with these start values and inputs."""
 
     def costs(self) -> tuple[float, float, float, float]:
         """The measured ns per instance of some methods; 0 if unknown.
 
         They are ``step``, ``reset``, ``step_or_reset`` and ``play``.
         """
-
-    def uses_states(self) -> bool:
-        """Whether resets restore saved initial states, as far as is known by now."""

@@ -244,8 +244,7 @@ class FMUEnv(Constructed):
             self._reset_pool(pool, plan, episode)
         self._begin_episode(episode)
         if found:
-            warm_ups.restore(pool, found)
-            variables = found[0].variables
+            ((variables, _),) = warm_ups.restore(pool, found)
         else:
             written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
             variables = {name: row[..., 0] for name, row in written.items()}

@@ -77,10 +77,9 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends) {
     return troubled;
 }
 
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside) {
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside) {
     const size_t runs = (pool->settings.count + ROLLOUT_RUN - 1) / ROLLOUT_RUN;
-    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon,
-                 .left_out = left_out};
+    Task task = {.pool = pool, .call = call, .operation = ROLLOUT, .horizon = horizon};
     const size_t troubled = schedule_run(&task, runs);
 
     *outside = atomic_get(&task.outside) != 0;
@@ -112,11 +111,6 @@ size_t pool_start(Pool *pool, const Call *call, bool *outside) {
         write_all_observations(pool, call->observations);
     }
     return troubled;
-}
-
-bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values) {
-    return start->count <= pool->start_width &&
-           instance_knows_start(pool, &pool->instances[index], start, values);
 }
 
 /* Reads variables of one instance into a column of values. */
@@ -187,7 +181,7 @@ ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values) {
     return failed;
 }
 
-size_t pool_unbundle(Pool *pool, const States *states, size_t count) {
+size_t pool_restore_states(Pool *pool, const State *states, size_t count) {
     const Call call = {.turn = NULL};
     Task task = {.pool = pool, .call = &call, .operation = RESTORE, .states = states};
 

@@ -245,8 +245,3 @@ Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratc
     }
     return status;
 }
-
-bool instance_knows_start(Pool *pool, Instance *me, const Access *start, const double *values) {
-    return me->saved != NULL && me->phase != PHASE_DEAD && states_are_of_use(pool, me) &&
-           starts_as_before(pool, me, start, values);
-}

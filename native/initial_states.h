@@ -5,9 +5,6 @@
 
 #include "steps.h"
 
-/* Whether a reset with these start values restores a state. */
-bool instance_knows_start(Pool *pool, Instance *me, const Access *start, const double *values);
-
 Status instance_reset(Pool *pool, Instance *me, const Call *call, Scratch scratch);
 
 #endif

@@ -126,12 +126,9 @@ static void free_states(Pool *pool, Instance *me) {
     const size_t index = index_of(pool, me);
 
     instance_free_state(pool, me, &me->saved);
-    if (pool->spares != NULL) {
-        instance_free_state(pool, me, &pool->spares[index]);
-    }
     for (Snapshot *snapshot = pool->snapshots; snapshot != NULL; snapshot = snapshot->next) {
-        if (snapshot->generations[index] == me->generation) {
-            instance_free_state(pool, me, &snapshot->states[index]);
+        if (snapshot->kept[index].generation == me->generation) {
+            instance_free_state(pool, me, &snapshot->kept[index].state);
         }
     }
 }

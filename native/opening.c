@@ -55,14 +55,13 @@ static bool allocate(Pool *pool) {
     pool->instances = at_cache_line(pool->instance_memory);
     pool->names = calloc(s->count, LOG_NAME);
     pool->chosen = calloc(s->count + 1, sizeof *pool->chosen);
-    pool->spares = calloc(s->count, sizeof *pool->spares);
     pool->starts = calloc(1, sizeof *pool->starts); /* the width is still 0 */
     pool->start_ids = calloc(s->count, sizeof *pool->start_ids);
     pool->first_outputs = calloc(s->restores ? s->count * s->outputs->count + 1 : 1,
                                  sizeof *pool->first_outputs);
     return pool->libraries != NULL && pool->instances != NULL && pool->names != NULL &&
-           pool->chosen != NULL && pool->spares != NULL && pool->starts != NULL &&
-           pool->start_ids != NULL && pool->first_outputs != NULL;
+           pool->chosen != NULL && pool->starts != NULL && pool->start_ids != NULL &&
+           pool->first_outputs != NULL && (!s->records || records_open(pool));
 }
 
 static void prepare_instance(Pool *pool, size_t index) {
@@ -167,7 +166,6 @@ void pool_close(Pool *pool) {
     free(pool->first_outputs);
     free(pool->names);
     free(pool->chosen);
-    free(pool->spares);
     records_close(pool);
     unlink_pool(pool);
 }

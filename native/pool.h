@@ -44,6 +44,7 @@ typedef struct {
     bool returns;  /* whether parts of a system return to earlier states of theirs */
     bool one_initialization; /* whether only one instance in the process may be made, initialized,
                               * reset or freed at a time */
+    bool records; /* whether it keeps the inputs of episodes; see records.h */
     int64_t retries; /* of a discarded step, as 2, 4, 8 ... smaller ones; only where it can save */
     Experiment experiment;
     double time_step;
@@ -125,19 +126,24 @@ typedef struct {
 /* Threads that work on neighbouring instances must not write to the same cache line. */
 _Static_assert(sizeof(void *) != 8 || sizeof(Instance) == CACHE_LINE, "an instance fills a line");
 
+/* The state of an instance in the FMU's memory. */
+typedef struct {
+    void *state; /* NULL if it is gone */
+    int64_t steps;
+    double start_time;
+    uint32_t generation; /* that of the instance */
+} Kept;
+
 typedef struct Snapshot {
     struct Snapshot *next; /* next in the list of the pool's snapshots */
     Atomic abandoned;      /* whether the pool must free it */
-    void **states;
-    int64_t *steps;
-    double *start_times;
-    uint32_t *generations;
+    Kept kept[];           /* of each instance */
 } Snapshot;
 
 /* A value that was set before initialization. */
 typedef struct {
     double value;
-    uint32_t type, reference, place; /* place: see Element */
+    uint32_t type, reference, place, unused; /* place: see Element */
 } RecordedStart;
 
 /* The episodes of all instances so far; see records.h. */
@@ -178,8 +184,6 @@ typedef struct Pool {
     char *names;
     uint32_t *chosen; /* the indices of a call's instances */
     Snapshot *snapshots;
-    void **spares;   /* for each instance, a state whose memory is used again, or NULL */
-    Atomic wasteful; /* whether the FMU makes a new state instead of overwriting one */
     Records *records; /* NULL if they are not kept */
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
@@ -282,10 +286,7 @@ size_t pool_play_after(Pool *pool, const Call *call, Ends *ends);
 size_t pool_start(Pool *pool, const Call *call, bool *outside);
 
 /* Plays so many steps with all environments, as the arrays of the turn say; see rollouts.h. */
-size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, Mask left_out, bool *outside);
-
-/* For one instance; see initial_states.h. */
-bool pool_knows_start(Pool *pool, size_t index, const Access *start, const double *values);
+size_t pool_rollout(Pool *pool, const Call *call, size_t horizon, bool *outside);
 
 /* How many initializations all pools of this process have begun. */
 uint64_t number_of_initializations(void);
@@ -295,11 +296,10 @@ ptrdiff_t pool_read(Pool *pool, const Access *access, double *values);
 /* Sets variables between two steps. Returns the index of the first instance that fails, or -1. */
 ptrdiff_t pool_write(Pool *pool, const Access *access, const double *values);
 
-/* Snapshots. A new snapshot belongs to the pool that saves its states in it. */
+/* Snapshots. A new snapshot belongs to the pool that saves its states in it; before, it can be freed
+ * as any memory. */
 
 Snapshot *snapshot_new(size_t count); /* NULL if memory runs out */
-/* Only for a snapshot that belongs to no pool. */
-void snapshot_free(Snapshot *snapshot);
 /* Returns the index of the first instance that fails, or -1. Afterwards the snapshot has been
  * freed or belongs to the pool. */
 ptrdiff_t pool_save(Pool *pool, Snapshot *snapshot);

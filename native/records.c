@@ -54,9 +54,6 @@ static void free_records(Records *r) {
 bool records_open(Pool *pool) {
     const size_t count = pool->settings.count;
 
-    if (pool->records != NULL) {
-        return true;
-    }
     Records *r = make_records(count, pool->settings.inputs->count);
     if (r != NULL && (r->starts == NULL || r->rows == NULL)) {
         free_records(r);
@@ -80,24 +77,31 @@ static void note_starts(RecordedStart *values, const Access *start, const double
     for (size_t i = 0; i < start->count; i++) {
         const Element *variable = &start->variables[i];
         values[i] = (RecordedStart){starts[i], start->types[i], variable->reference,
-                                    variable->place};
+                                    variable->place, 0};
     }
+}
+
+/* The memory for the start values of an instance; NULL if there is none. */
+static RecordedStart *room_for_starts(Records *r, size_t index, size_t count) {
+    Starts *own = &r->starts[index];
+
+    if (own->count != count || own->values == NULL) {
+        free(own->values);
+        own->values = calloc(count + 1, sizeof *own->values);
+        own->count = count;
+    }
+    r->rows[index] = own->values == NULL ? NOT_WHOLE : 0;
+    return own->values;
 }
 
 void record_begin(Pool *pool, size_t index, const Access *start, const double *starts) {
     if (pool->records == NULL) {
         return;
     }
-    Starts *own = &pool->records->starts[index];
-    if (own->count != start->count || own->values == NULL) {
-        free(own->values);
-        own->values = calloc(start->count + 1, sizeof *own->values);
-        own->count = start->count;
+    RecordedStart *values = room_for_starts(pool->records, index, start->count);
+    if (values != NULL) {
+        note_starts(values, start, starts);
     }
-    if (own->values != NULL) {
-        note_starts(own->values, start, starts);
-    }
-    pool->records->rows[index] = own->values == NULL ? NOT_WHOLE : 0;
 }
 
 /* Threads may need a new block at the same time. Then one of them makes it for all. */
@@ -174,26 +178,55 @@ bool record_is_whole(const Pool *pool, size_t index) {
     return pool->records != NULL && pool->records->rows[index] != NOT_WHOLE;
 }
 
-bool record_copy(const Pool *pool, size_t index, Record *copy) {
-    Records *r = pool->records;
-    const Starts *starts = &r->starts[index];
-    const size_t rows = r->rows[index], width = r->width;
+size_t record_size(const Pool *pool, size_t index, int64_t *starts, int64_t *rows) {
+    const Records *r = pool->records;
 
-    *copy = (Record){.number_of_starts = starts->count, .rows = rows};
-    copy->starts = malloc((starts->count + 1) * sizeof *copy->starts);
-    copy->inputs = malloc((rows * width + 1) * sizeof *copy->inputs);
-    if (copy->starts == NULL || copy->inputs == NULL) {
-        return false;
-    }
-    memcpy(copy->starts, starts->values, starts->count * sizeof *copy->starts);
-    for (size_t row = 0; row < rows && width > 0; row++) {
-        memcpy(copy->inputs + row * width, row_of(r, row) + index * width,
-               width * sizeof *copy->inputs);
-    }
-    return true;
+    *starts = (int64_t)r->starts[index].count;
+    *rows = (int64_t)r->rows[index];
+    return r->starts[index].count * sizeof(RecordedStart) +
+           r->rows[index] * r->width * sizeof(double);
 }
 
-void record_clear(Record *copy) {
-    free(copy->starts);
-    free(copy->inputs);
+void record_write(const Pool *pool, size_t index, char *to) {
+    Records *r = pool->records;
+    const size_t size = r->starts[index].count * sizeof(RecordedStart);
+    const size_t row_size = r->width * sizeof(double);
+
+    memcpy(to, r->starts[index].values, size);
+    to += size;
+    for (size_t row = 0; row < r->rows[index] && row_size > 0; row++, to += row_size) {
+        memcpy(to, row_of(r, row) + index * r->width, row_size);
+    }
+}
+
+bool record_fits(const Pool *pool, int64_t starts, int64_t rows, size_t size) {
+    const Records *r = pool->records;
+
+    if (r == NULL || starts < 0 || (uint64_t)starts > size / sizeof(RecordedStart) || rows < 0) {
+        return false;
+    }
+    const size_t rest = size - (size_t)starts * sizeof(RecordedStart);
+    const size_t row_size = r->width * sizeof(double);
+    return row_size == 0 ? rest == 0 : rest % row_size == 0 && (uint64_t)rows == rest / row_size;
+}
+
+void record_put(Pool *pool, size_t index, size_t starts, size_t rows, const char *from) {
+    Records *r = pool->records;
+    RecordedStart *values = room_for_starts(r, index, starts);
+    const size_t row_size = r->width * sizeof(double);
+
+    if (values == NULL) {
+        return;
+    }
+    memcpy(values, from, starts * sizeof *values);
+    from += starts * sizeof *values;
+    for (size_t row = 0; row < rows; row++, from += row_size) {
+        double *to = row_of(r, row);
+        if (to == NULL) {
+            record_drop(pool, index);
+            return;
+        }
+        memcpy(to + index * r->width, from, row_size);
+    }
+    r->rows[index] = rows;
 }

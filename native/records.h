@@ -6,14 +6,6 @@
 
 #include "pool.h"
 
-/* A copy of the record of an instance. */
-typedef struct {
-    RecordedStart *starts;
-    size_t number_of_starts;
-    double *inputs; /* of each step */
-    size_t rows;
-} Record;
-
 /* Begins to keep records, with the next reset of each instance. Returns false if memory runs out. */
 bool records_open(Pool *pool);
 void records_close(Pool *pool);
@@ -28,8 +20,12 @@ void records_add(Pool *pool, size_t begin, size_t count, Mask mask, const double
 
 /* Whether no step of the episode is missing in the record. */
 bool record_is_whole(const Pool *pool, size_t index);
-/* Copies such a record. Returns false if memory runs out. The caller clears the copy in any case. */
-bool record_copy(const Pool *pool, size_t index, Record *copy);
-void record_clear(Record *copy);
+/* The bytes of such a record: its start values, and the inputs of each row. Sets how many there are. */
+size_t record_size(const Pool *pool, size_t index, int64_t *starts, int64_t *rows);
+void record_write(const Pool *pool, size_t index, char *to);
+/* Whether so many bytes are a record with so many start values and rows, for a pool that keeps any. */
+bool record_fits(const Pool *pool, int64_t starts, int64_t rows, size_t size);
+/* Lets the record of an instance be the one in such bytes. */
+void record_put(Pool *pool, size_t index, size_t starts, size_t rows, const char *from);
 
 #endif

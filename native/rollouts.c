@@ -94,9 +94,7 @@ static size_t roll_out(Position *p, const Task *task, size_t first, size_t count
     size_t troubled = 0;
 
     begin_at_first_step(p, task);
-    for (size_t j = 0; j < count; j++) {
-        over[j] = is_in(task->left_out, first + j);
-    }
+    memset(over, 0, count);
     for (size_t step = 0; step < task->horizon && troubled == 0; step++) {
         if (memchr(over, 0, count) == NULL) {
             leave_out(p, first, count);

@@ -12,17 +12,17 @@ static Status restore_instance(Task *task, Instance *me, size_t place, Scratch s
     const size_t index = index_of(task->pool, me);
 
     if (task->states != NULL) {
-        const size_t number = (size_t)task->states->sources[place];
-        return instance_unbundle(task->pool, me, task->states, number);
+        return instance_take_state(task->pool, me, task->states[place]);
     }
     health_count_steps(task->pool, me);
     record_drop(task->pool, index);
-    const Status status = instance_restore(task->pool, me, task->snapshot->states[index]);
+    const Kept *kept = &task->snapshot->kept[index];
+    const Status status = instance_restore(task->pool, me, kept->state);
     if (status > STATUS_WARNING) {
         return status;
     }
-    me->start_time = task->snapshot->start_times[index];
-    instance_count_from(me, task->snapshot->steps[index]);
+    me->start_time = kept->start_time;
+    instance_count_from(me, kept->steps);
     return instance_read_outputs(task->pool, me, scratch);
 }
 

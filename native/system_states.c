@@ -55,49 +55,35 @@ static void keep_slots(const Composite *me, Saved *saved) {
     saved->slots[s->inputs + s->outputs] = me->is_fresh ? 1.0 : 0.0;
 }
 
-static Status get_all(Composite *me, Saved *saved, bool *is_other) {
+static Status get_all(Composite *me, Saved *saved) {
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
         const Fmi *fmi = me->system->parts[i].fmi;
-        void *before = saved->states[i];
         status = fmi->get_state == NULL
                      ? STATUS_ERROR
                      : fmi->get_state(&me->libraries[i], me->components[i],
                                       &saved->states[i]);
         status = part_judge(me, i, status);
-        *is_other |= before != saved->states[i];
     }
     return status;
 }
 
-/* If a part makes a new state instead of overwriting the old one, so does the system, and the
- * caller sees it. */
+/* Always makes a new state. */
 Status system_get_state(const Library *library, void *component, void **state) {
     Composite *me = component;
-    Saved *old = *state, *saved = old == NULL ? make(me->system) : old;
-    bool is_other = false;
+    Saved *saved = make(me->system);
 
     (void)library;
     me->blamed = NULL;
     if (saved == NULL) {
         return STATUS_ERROR;
     }
-    const Status status = get_all(me, saved, &is_other);
+    const Status status = get_all(me, saved);
     keep_slots(me, saved);
-    if (status > STATUS_WARNING && old == NULL) {
+    if (status > STATUS_WARNING) {
         free_states(me, saved);
         return status;
-    }
-    if (old != NULL && is_other) {
-        Saved *moved = make(me->system);
-        if (moved == NULL) {
-            return STATUS_ERROR;
-        }
-        memcpy(moved->slots, saved->slots, number_of_slots(me->system) * sizeof(double));
-        memcpy(moved->states, saved->states, me->system->count * sizeof(void *));
-        drop(saved);
-        saved = moved;
     }
     *state = saved;
     return status;

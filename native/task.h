@@ -3,7 +3,7 @@
 #ifndef FMUGYM_TASK_H
 #define FMUGYM_TASK_H
 
-#include "bundles.h"
+#include "states.h"
 #include "steps.h"
 
 /* What a call does; all threads that work on it write to its last fields. */
@@ -12,9 +12,8 @@ typedef struct {
     const Call *call;
     int operation;
     const Snapshot *snapshot; /* the snapshot to restore */
-    const States *states;     /* or the serialized states */
+    const State *states;      /* or a state for each place in pool->chosen */
     size_t horizon;           /* the steps of a rollout, whose items are runs */
-    Mask left_out;            /* the instances that a rollout leaves as they are */
     bool listed;              /* items are places in pool->chosen, otherwise instances */
     bool measured;
     _Alignas(CACHE_LINE) Atomic troubled; /* instances with a status worse than a warning */

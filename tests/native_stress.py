@@ -30,7 +30,6 @@ from exchange_tools import exchange_fmu
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
-from fmugym.pool.bundle import Bundle
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.task.values import LateDict
@@ -99,8 +98,11 @@ def draws(*rows):
 
 
 DRAWS = draws(0)
-TOLD = "drawn", "_drawn", *LateDict.parts(lambda _, drawn, mask: {"drawn": drawn * mask}, None)
-"""What a reset tells of the episodes that it starts."""
+
+
+def tell(drawn, mask):
+    """What a reset tells of the episodes that it starts."""
+    return {"drawn": LateDict.of(lambda: {"drawn": drawn * mask}), "_drawn": mask}
 
 
 class ReceiverError(Exception):
@@ -191,7 +193,7 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (tuple, 0, (), self.results(), TOLD),
+                "results": (tuple, 0, (), self.results(), tell),
             },
         )
 
@@ -239,26 +241,19 @@ class Subject:
             self.pool.restore(self.snapshot, self.mask())
 
     def bundle(self):
-        """Serialize the states of some, as far as the FMU can."""
+        """Save the states of some, as far as the FMU can, or the records of their episodes."""
         indices = np.flatnonzero(self.mask())
         with contextlib.suppress(ValueError):
-            data, ends, steps, times = self.pool.serialize_states(indices)
-            outputs = np.zeros((len(self.outputs), len(indices)))
-            self.bundled = Bundle(outputs, steps, times, data, ends)
+            self.bundled = self.pool.save_states(indices, bool(self.rng.integers(2)))
             counts["bundled"] += 1
 
     def unbundle(self):
         """Restore them in others."""
         bundled = self.bundled  # another thread may replace it
-        if bundled is not None and len(bundled):
+        if bundled:
             indices = self.rng.permutation(self.n)[: int(self.rng.integers(1, self.n + 1))]
             sources = self.rng.integers(len(bundled), size=len(indices))
-            self.pool.deserialize_states(bundled, sources, indices)
-
-    def record(self):
-        record = self.pool.record_of(int(self.rng.integers(self.n)))
-        if record is not None:
-            self.pool.replace_record(int(self.rng.integers(self.n)), record)
+            self.pool.restore_states([bundled[source] for source in sources], indices)
 
     def write(self):
         self.pool.write(self.pool._spec.inputs, np.zeros_like(self.pool.inputs))
@@ -287,7 +282,7 @@ class Subject:
         self.pool.health()
 
     def costs(self):
-        return self.pool.costs, self.pool.uses_states
+        return self.pool.costs
 
     def close(self):
         if self.rng.random() < 0.05:
@@ -310,7 +305,7 @@ ACTIONS = (
         "health",
     ),
     *("costs", "close"),
-    *("bundle", "unbundle", "unbundle", "record", "write", "roll_out", "roll_out"),
+    *("bundle", "unbundle", "unbundle", "write", "roll_out", "roll_out"),
 )
 
 

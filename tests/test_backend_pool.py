@@ -16,6 +16,7 @@ from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, Paced, SimulationE
 from fmugym.pool import BackendPool, PoolSpec
 from fmugym.pool.backend import pool as backend_module
 from fmugym.pool.backend.clock import ManualClock
+from fmugym.pool.bundle import Bundle
 from fmugym.trial.opening import make_pool
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
@@ -572,9 +573,9 @@ class TestPool:
 
     def test_there_are_no_states(self, pools):
         with pytest.raises(SimulationError, match="no states that could be saved"):
-            pools[0].save()
+            pools[0].save_instances(np.arange(1))
         with pytest.raises(SimulationError, match="no states that could be restored"):
-            pools[0].restore(None)
+            pools[0].restore_instances(Bundle(()), np.arange(0), np.arange(0))
 
     def test_closed(self, pools):
         pools[0].close()

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from fmugym.pool import states
-from fmugym.pool.states import KeptState, StateFiles
+from fmugym.pool.states import StateFiles
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="it has no pipes among files")
 
 
 class TestFiles:
-    STATE = KeptState(np.array([1.0, 2.0]).tobytes(), b"state")
+    STATE = np.array([1.0, 2.0]).tobytes() + b"state"
 
     @pytest.fixture
     def files(self, tmp_path):
-        return StateFiles(str(tmp_path / "kept" / "fmu"), 2)
+        return StateFiles(str(tmp_path / "kept" / "fmu"))
 
     def test_come_back(self, files):
         assert files.find("a") is None
@@ -58,6 +58,6 @@ class TestFiles:
 
     def test_where_nothing_can_be_written(self, tmp_path):
         (tmp_path / "file").write_text("")
-        files = StateFiles(str(tmp_path / "file" / "fmu"), 2)
+        files = StateFiles(str(tmp_path / "file" / "fmu"))
         files.keep("a", self.STATE)
         assert files.find("a") is None

@@ -1,6 +1,7 @@
 """What the native pool survives: wrong arrays, unsound programs, too little memory, bad FMUs."""
 
 import json
+import struct
 import sys
 from pathlib import Path
 
@@ -15,9 +16,9 @@ from fmugym import FMU, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.bundle import Record
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
+from fmugym.pool.settings import record_in
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
 
 
@@ -81,26 +82,30 @@ class TestArrays:
         with_others.close()
 
 
-class TestRecords:
-    @pytest.fixture(name="pool")
-    def fixture_pool(self):
-        fmu = FMU(bundled_fmu("CartPole"))
-        spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
-        pool = NativePool(fmu, spec, 2, LOG)
-        start = fmu.variable("x_0")
-        pool.reset((start,), np.full((1, 2), 0.25))
-        pool.step(np.ones((1, 2)))
-        yield pool, start
-        pool.close()
+@pytest.fixture(name="pool")
+def fixture_pool():
+    """Two cart-poles after a step, whose inputs are recorded."""
+    fmu = FMU(bundled_fmu("CartPole"))
+    spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, records=True)
+    pool = NativePool(fmu, spec, 2, LOG)
+    pool.reset((fmu.variable("x_0"),), np.full((1, 2), 0.25))
+    pool.step(np.ones((1, 2)))
+    yield pool
+    pool.close()
 
+
+class TestRecords:
     def test_are_given_to_another_instance(self, pool):
-        pool, start = pool
-        pool.replace_record(1, Record((start.name,), np.array([0.5]), np.arange(40.0)[:, None]))
+        for step in range(40):
+            pool.step(np.array([[0.0, step]]), np.array([True, False]))
+        (state,) = pool.save_states(np.array([1]), True)
+        pool.restore_states([state], np.array([0]))
         pool.step(np.full((1, 2), 9.0))
-        first, second = pool.record_of(0), pool.record_of(1)
-        assert (first.starts.tolist(), first.inputs.tolist()) == ([0.25], [[1.0], [9.0]])
-        assert (second.names, second.starts.tolist()) == (("x_0",), [0.5])
-        assert second.inputs[:, 0].tolist() == [*range(40), 9.0]
+        found = [record_in(*pool._form, one) for one in pool.save_states(np.arange(2), True)]
+        for record in found:
+            assert [variable.name for variable in record.variables] == ["x_0"]
+            assert record.starts.tolist() == [0.25]
+            assert record.inputs[:, 0].tolist() == [1.0, *range(40), 9.0]
 
     def test_are_each_of_their_own_episode(self, pool):
         """However the steps of neighbours are shifted against each other."""
@@ -117,29 +122,52 @@ class TestRecords:
                 given[index].append(inputs[0, index])
             starting = rng.random(n) < 0.005
         assert max(map(len, given)) > 64 > min(map(len, given))
-        for index, own in enumerate(given):
-            assert many.record_of(index).inputs[:, 0].tolist() == own
+        for own, state in zip(given, many.save_states(np.arange(n), True), strict=True):
+            assert record_in(*many._form, state).inputs[:, 0].tolist() == own
         many.close()
 
+
+class TestStates:
+    @pytest.mark.parametrize("index", [2, -1, 2**40])
+    def test_of_instances_that_do_not_exist(self, pool, index):
+        (state,) = pool.save_states(np.zeros(1, np.int64), False)
+        with pytest.raises(IndexError, match=str(index)):
+            pool.save_states(np.array([index]), False)
+        with pytest.raises(IndexError, match=str(index)):
+            pool.restore_states([state], np.array([index]))
+
+    @pytest.mark.parametrize("records", [False, True])
+    def test_that_are_cut_off(self, pool, records):
+        """However much of a state is there, it is whole or refused."""
+        (state,) = pool.save_states(np.zeros(1, np.int64), records)
+        is_whole = {len(state)} if records else set(range(49, len(state) + 1))
+        for size in range(len(state) + 1):
+            if size not in is_whole:
+                with pytest.raises(ValueError, match="damaged"):
+                    pool.restore_states([state[:size]], np.zeros(1, np.int64))
+        pool.restore_states([state], np.zeros(1, np.int64))
+        assert pool.save_states(np.zeros(1, np.int64), records) == [state]
+
     @pytest.mark.parametrize(
-        ("index", "starts", "inputs", "steps"),
-        [
-            (2, bytes(8), b"", 0),
-            (-1, bytes(8), b"", 0),
-            (0, bytes(7), b"", 0),
-            (0, bytes(16), b"", 0),
-            (0, bytes(8), bytes(8), 2),
-            (0, bytes(8), bytes(9), 1),
-            (0, bytes(8), b"", -1),
-        ],
+        "head",
+        [(3, 0, 0), (-1, 0, 0), (2, -1, 0), (2, 0, -1), (2, 2**62, 0), (2, 0, 2**62), (2, 1, 2)],
     )
-    def test_that_do_not_fit(self, pool, index, starts, inputs, steps):
-        pool, start = pool
-        with pytest.raises((ValueError, IndexError, OverflowError)):
-            pool._pool.replace_record(index, pool._access((start,)), starts, inputs, steps)
-        assert len(pool.record_of(0).inputs) == 1
-        with pytest.raises(TypeError):
-            pool._pool.replace_record(0, None, starts, inputs, 0)
+    def test_with_another_head(self, pool, head):
+        (state,) = pool.save_states(np.zeros(1, np.int64), True)
+        kind, starts, rows = head
+        damaged = struct.pack("<qqdqq", kind, 1, 0.0, starts, rows) + state[40:]
+        with pytest.raises(ValueError, match="damaged"):
+            pool.restore_states([damaged], np.zeros(1, np.int64))
+
+    def test_of_the_wrong_kind(self, pool):
+        for states in (None, [None], ["text"]):
+            with pytest.raises(TypeError):
+                pool.restore_states(states, np.zeros(1, np.int64))
+        states = pool.save_states(np.arange(2), False)
+        with pytest.raises(ValueError, match="twice"):
+            pool.restore_states(states, np.zeros(2, np.int64))
+        with pytest.raises(ValueError, match="indices"):
+            pool.restore_states(states, np.zeros(1, np.int64))
 
 
 # Programs

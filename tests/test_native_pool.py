@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
+from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
@@ -545,31 +545,27 @@ def test_a_failing_receiver_does_not_break_the_pool(probe):
 
 
 class TestInitialStates:
-    def resets(self, pool, count=12, **values):
-        variables = tuple(map(pool.variable, values))
-        array = np.array(list(values.values()), float)[:, None]
-        for _ in range(count):
-            outputs, status = pool.reset(
-                variables, np.broadcast_to(array, (len(values), pool.num_instances))
-            )
+    def initializations(self, pool):
+        """How many of four resets of each instance initialize it."""
+        before = _native.initializations()
+        for _ in range(4):
+            outputs, status = pool.reset((), np.zeros((0, pool.num_instances)))
             assert not status.any()
             assert not outputs.any()
             pool.step()
+        return (_native.initializations() - before) / pool.num_instances
 
     def test_are_restored_where_that_is_asked_for(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 3, reset_method="restore")
-        self.resets(pool)
-        assert pool.uses_states
+        assert self.initializations(pool) == 2
 
     def test_not_otherwise(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 3)
-        self.resets(pool)
-        assert not pool.uses_states
+        assert self.initializations(pool) == 4
 
     def test_not_in_fmi_1(self, native):
         pool = native(bundled_fmu("CartPole", "1.0"), ["f"], ["x"], 3, reset_method="restore")
-        self.resets(pool)
-        assert not pool.uses_states
+        assert self.initializations(pool) == 4
 
 
 # Isolation

@@ -161,8 +161,8 @@ def test_from_one_root_no_state_is_serialized(monkeypatch):
     """Planning costs one saved state, however many candidates there are."""
     env, envs = halfway(), vector_of(Track, N)
     snapshot, saved = env.save_state(), []
-    kept = envs._pool.serialize_states
-    monkeypatch.setattr(envs._pool, "serialize_states", lambda i: saved.append(len(i)) or kept(i))
+    kept = envs._pool.save_states
+    monkeypatch.setattr(envs._pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
     envs.rollout(snapshot, actions_for(env, 3 * N))
     assert not saved
     envs.reset(seed=0)  # now there are episodes to return to

@@ -73,49 +73,30 @@ class Pilot(NamedTuple):
         space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
         self.controller.bind(_Many(count, space, time_step), self.names)
 
-    @property
-    def starts(self) -> tuple[float, ...]:
-        """What the controller remembers at the beginning."""
-        return tuple(map(float, getattr(self.controller, "starts", ())))
-
-    def act(self, env: Any, state: Sequence[Any]) -> tuple[Any, tuple[Any, ...]]:
-        """Choose the next action, as the agent would write it, shape (M,).
-
-        Args:
-            env: Its readings may be arrays or symbols.
-            state: What the controller remembers.
-
-        Returns:
-            The action, and what the controller remembers then.
-        """
-        value, state = self._decided(env, state)
+    def act(self, env: Any) -> Any:
+        """Choose the next action, as the agent would write it, shape (M,)."""
+        value = self._decided(env)
         if self.is_physical:
-            return value, tuple(state)
+            return value
         if self.record.levels:
-            levels = self.record.levels
-            order = np.argsort(levels)  # so that the lower one of two levels counts as nearer
-            distances = [np.abs(levels[place] - value) for place in order]
-            return np.take(order, np.argmin(np.array(distances), axis=0)), tuple(state)
+            order = np.argsort(self.record.levels)  # the lower of two levels counts as nearer
+            distances = np.abs(np.array(self.record.levels)[order, None] - value)
+            return order[distances.argmin(axis=0)]
         if self.present is not None:
             value = np.clip(value - self.present(env), -self.record.delta, self.record.delta)
-        return self._rescaled(value), tuple(state)
+        return self._rescaled(value)
 
-    def _decided(self, env: Any, state: Sequence[Any]) -> tuple[Any, Sequence[Any]]:
+    def _decided(self, env: Any) -> Any:
         """The value in the unit of the task; controllers work with numbers of float32."""
         from fmugym.baselines import Schedule
-        from fmugym.baselines.feedback import Law
 
         one: Any = self.controller
         if isinstance(one, Schedule):
-            return np.clip(one.at(self.clock(env)), self.record.low, self.record.high), state
-        if isinstance(one, Law):
-            signals = [_rounded(signal) for signal in self.signals(env)]
-            setpoint = signals[-1] if isinstance(one.setpoint, str) else one.setpoint
-            value, state = one.law(signals[0], setpoint, state)
-        else:
-            value = one.action + 0.0 * env.step_count  # a constant, for each environment
-        low, high = one.space.low.item(), one.space.high.item()
-        return _rounded(np.clip(value, low, high)), state
+            return np.clip(one.at(self.clock(env)), self.record.low, self.record.high)
+        rows = np.empty((len(env.step_count), len(self.names)), np.float32)
+        for place, signal in enumerate(self.signals(env)):
+            rows[:, place] = signal
+        return one.act(rows)[:, 0].astype(np.float64)
 
     def _rescaled(self, value: Any) -> Any:
         record = self.record
@@ -123,11 +104,6 @@ class Pilot(NamedTuple):
             return value
         low, high = (-record.delta, record.delta) if record.delta else (record.low, record.high)
         return (value - (low + high) / 2) / ((high - low) / 2)
-
-
-def _rounded(value: Any) -> Any:
-    """The nearest float32, as a float64."""
-    return np.positive(np.positive(value, dtype=np.float32), dtype=np.float64)
 
 
 class _Many:
@@ -180,21 +156,18 @@ class DeclaredWarmUp(WarmUp):
         tables = [(n, np.asarray(v).tobytes()) for n, v in sorted(constants.items())]
         content = repr((steps, time_step, told, list(codes), tables))
         self.digest = sha256(content.encode()).hexdigest()
-        for pilot in pilots:
-            pilot.bind(1, time_step)  # which finds mistakes
-        self.starts = tuple(start for pilot in pilots for start in pilot.starts)
+        self.begin(1)  # which finds mistakes
 
-    def decide(self, env: Any, state: Sequence[Any]) -> tuple[Mapping[int, Any], tuple[Any, ...]]:
-        """See ``WarmUp.decide``."""
-        chosen, after, place = dict[int, Any](), list[Any](), 0
+    def begin(self, count: int) -> None:
+        """See ``WarmUp.begin``."""
         for pilot in self._pilots:
-            end = place + len(pilot.starts)
-            chosen[pilot.place], own = pilot.act(env, state[place:end])
-            after, place = [*after, *own], end
-        return chosen, tuple(after)
+            pilot.bind(count, self._time_step)
 
     def inputs(self, env: Any) -> Any:
-        """See ``WarmUp.inputs``."""
+        """See ``WarmUp.inputs``; the controllers act first."""
+        env.previous_action, env.action = env.action, np.array(env.action)
+        for pilot in self._pilots:
+            env.action[pilot.place if env.action.ndim > 1 else ...] = pilot.act(env)
         return self._inputs(env)
 
     def update(self, env: Any) -> None:

@@ -125,7 +125,3 @@ class AttendedPool(CountedPool):
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> Any:
         """Do what ``reset`` does, without an attendant."""
-
-    def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
-        """Whether a reset of an instance with these start values, shape (P,), restores a state."""
-        return False

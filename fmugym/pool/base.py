@@ -108,34 +108,6 @@ class Pool(ABC):
         """
 
     @abstractmethod
-    def save(self) -> Any:
-        """Copy the FMU states and times of all instances.
-
-        Returns:
-            A snapshot for ``restore`` of the same pool. It is freed with its last reference.
-
-        Raises:
-            SimulationError: If the FMU offers no state, or an instance cannot save it now.
-        """
-
-    @abstractmethod
-    def restore(
-        self, snapshot: Any, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """Return instances to a snapshot.
-
-        Args:
-            snapshot: From ``save``.
-            mask: Which instances, shape (N,); None for all.
-
-        Returns:
-            As ``reset``.
-
-        Raises:
-            SimulationError: If the snapshot is of another pool, or an instance was replaced since.
-        """
-
-    @abstractmethod
     def failure(self, index: int) -> str:
         """Say why an instance's last status was worse than a warning."""
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import struct
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.texts import text_among
-from fmugym.archive.variable import Variable
-from fmugym.pool.spec import START_TIME
-
-__all__ = ["Bundle", "Copies", "Record", "SaveMethod", "joined"]
+__all__ = ["Bundle", "Copies", "Head", "SaveMethod", "ended_state", "head_of", "outputs_of"]
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
+
+_HEAD: Final = struct.Struct("<qqdqq")
+_ENDED: Final = 0
+_RECORD: Final = 2
+"""Kinds of states. The C extension makes these; see ``native/states.h``."""
 
 
 class SaveMethod(StrEnum):
@@ -34,40 +36,43 @@ class SaveMethod(StrEnum):
     """
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
-    """The episode of an instance until now.
+class Head(NamedTuple):
+    """What a state begins with; the outputs follow, and then the FMU's bytes or a record.
 
     Attributes:
-        names: The variables that were set before initialization.
-        starts: Their values, shape (P,).
-        inputs: The inputs of each step, shape (steps, k_in).
-        texts: Those of the Strings among the variables; ``starts`` has their numbers.
+        kind: Whether it has such bytes, or a record, or nothing.
+        steps: The communication steps of the episode.
+        start_time: Its first communication point.
+        starts: How many start values the record has.
+        rows: Of how many steps the record has the inputs.
     """
 
-    names: tuple[str, ...]
-    starts: FloatArray
-    inputs: FloatArray
-    texts: tuple[str, ...] = ()
-
-    @classmethod
-    def of(cls, variables: Sequence[Variable], starts: FloatArray, inputs: FloatArray) -> Record:
-        """The record of an episode in which these variables were set; see the attributes."""
-        pairs = zip(variables, starts.tolist(), strict=True)
-        texts = tuple(text_among(v, value) for v, value in pairs if v.kind == "string")
-        return cls(tuple(v.name for v in variables), starts, inputs, texts)
-
-    def start_time(self, default: float) -> float:
-        """The first communication point, which is the default unless it is among the starts."""
-        for name, value in zip(self.names, self.starts, strict=True):
-            if name == START_TIME.name:
-                return float(value)
-        return default
+    kind: int
+    steps: int
+    start_time: float
+    starts: int
+    rows: int
 
     @property
-    def content(self) -> tuple[object, ...]:
-        """What two equal records have in common."""
-        return self.names, self.starts.tobytes(), self.inputs.shape, self.inputs.tobytes()
+    def is_record(self) -> bool:
+        """Whether the state is the start and the inputs of an episode."""
+        return self.kind == _RECORD
+
+
+def head_of(state: bytes) -> Head:
+    """Read the head of a state."""
+    return Head(*_HEAD.unpack_from(state))
+
+
+def outputs_of(state: bytes, count: int) -> tuple[FloatArray, bytes]:
+    """Read the outputs of a state, so many of them, and what follows."""
+    end = _HEAD.size + 8 * count
+    return np.frombuffer(state[_HEAD.size : end]), state[end:]
+
+
+def ended_state(start_time: float, outputs: FloatArray) -> bytes:
+    """The state of an instance that is lost, and could not be stepped any more."""
+    return _HEAD.pack(_ENDED, 0, start_time, 0, 0) + outputs.tobytes()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,77 +94,42 @@ class Copies:
 class Bundle:
     """The states of M instances.
 
-    An instance that could not be stepped any more has an empty state.
-
     Attributes:
-        outputs: Their outputs, shape (k, M).
-        steps: Their communication steps, shape (M,).
-        start_times: The first communication points of their episodes, shape (M,).
-        data: The serialized states one after the other; ``b""`` if there are records.
-        ends: Where each of them ends in the data, shape (M,).
-        records: Or a record for each; None for an empty state.
+        states: One for each; see ``Head``.
+        replays: Whether they are records, or nothing where an episode had ended.
         copies: Copies of the states, besides the records. They are no part of a pickle.
     """
 
-    outputs: FloatArray
-    steps: IndexArray
-    start_times: FloatArray
-    data: bytes
-    ends: IndexArray
-    records: tuple[Record | None, ...] | None = None
+    states: tuple[bytes, ...]
+    replays: bool = False
     copies: Copies | None = None
 
     @property
     def method(self) -> SaveMethod:
         """How the states were saved."""
-        if self.records is None:
+        if not self.replays:
             return SaveMethod.STATE
         return SaveMethod.REPLAY if self.copies is None else SaveMethod.COPY
 
     def __reduce__(self) -> tuple[Any, ...]:
-        arrays = self.outputs, self.steps, self.start_times
-        return Bundle, (*arrays, self.data, self.ends, self.records)
+        return Bundle, (self.states, self.replays)
 
     def __len__(self) -> int:
-        return len(self.steps)
+        return len(self.states)
 
-    def state(self, place: int) -> bytes:
-        """One of the serialized states."""
-        begin = int(self.ends[place - 1]) if place else 0
-        return self.data[begin : int(self.ends[place])]
+    @property
+    def heads(self) -> list[Head]:
+        """The head of each state."""
+        return [head_of(state) for state in self.states]
 
     def take(self, places: Sequence[int] | IndexArray) -> Bundle:
         """The states at these places."""
         chosen = np.asarray(places, np.int64)
-        outputs = np.ascontiguousarray(self.outputs[:, chosen])
-        arrays = outputs, self.steps[chosen], self.start_times[chosen]
-        if self.records is not None:
-            records = tuple(self.records[place] for place in chosen.tolist())
-            copies = self.copies and replace(self.copies, indices=self.copies.indices[chosen])
-            return Bundle(*arrays, b"", self.ends[chosen], records, copies)
-        data, ends = joined(map(self.state, chosen.tolist()))
-        return Bundle(*arrays, data, ends)
+        states = tuple(self.states[place] for place in chosen.tolist())
+        copies = self.copies and replace(self.copies, indices=self.copies.indices[chosen])
+        return replace(self, states=states, copies=copies)
 
     @classmethod
     def of_all(cls, bundles: Sequence[Bundle]) -> Bundle:
         """Put bundles of one pool together."""
-        outputs = np.concatenate([bundle.outputs for bundle in bundles], axis=1)
-        steps = np.concatenate([bundle.steps for bundle in bundles])
-        times = np.concatenate([bundle.start_times for bundle in bundles])
-        data, ends = joined(b.state(place) for b in bundles for place in range(len(b)))
-        records = [bundle.records for bundle in bundles if bundle.records is not None]
-        return cls(outputs, steps, times, data, ends, sum(records, ()) if records else None)
-
-    @property
-    def content(self) -> tuple[object, ...]:
-        """What two equal bundles have in common."""
-        records = self.records
-        held = None if records is None else tuple(None if r is None else r.content for r in records)
-        arrays = (self.outputs, self.steps, self.start_times, self.ends)
-        return (self.outputs.shape, *(a.tobytes() for a in arrays), self.data, held)
-
-
-def joined(states: Iterable[bytes]) -> tuple[bytes, IndexArray]:
-    """Put serialized states into one piece; returns it and where each of them ends."""
-    parts = list(states)
-    return b"".join(parts), np.cumsum([len(part) for part in parts], dtype=np.int64)
+        return cls(sum((b.states for b in bundles), ()), bundles[0].replays)

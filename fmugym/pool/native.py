@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import logging
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, ParamSpec, TypeVar, cast
 
 import numpy as np
@@ -36,26 +36,24 @@ from fmugym.pool.base import (
     available_processors,
     names_of,
 )
-from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.callbacks import Receiver
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.health import HealthArray, no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
-from fmugym.pool.saving import SavingPool, Serialized
+from fmugym.pool.saving import SavingPool, keeps_records
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
     listing,
     manner_of,
-    record_from,
     solving_settings,
     table_of,
     variable_settings,
 )
-from fmugym.pool.spec import start_variables
 from fmugym.pool.systems import system_settings
 from fmugym.signals import ordinary
 from fmugym.systems.description import SystemDescription
@@ -134,8 +132,7 @@ class NativePool(SavingPool):
             fmu.close()
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
-        if self._prepare_saving(fmu.description, spec):
-            self._pool.keep_records()
+        self._prepare_saving(fmu.description, spec)
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self.watched(self._pool.reset)
@@ -162,7 +159,10 @@ class NativePool(SavingPool):
                         "system": system_settings(fmu, spec, folder),
                     },
                 ),
-                experiment=cast("_native.Experiment", experiment_settings(spec)),
+                experiment=cast(
+                    "_native.Experiment",
+                    experiment_settings(spec, records=keeps_records(description, spec)),
+                ),
                 variables=cast(
                     "_native.Variables",
                     variable_settings(spec)
@@ -222,7 +222,7 @@ class NativePool(SavingPool):
         return self._result
 
     def save(self) -> _native.Snapshot:
-        """See ``Pool.save``."""
+        """See ``SavingPool.save``."""
         if not self._fmu.description.capabilities.can_get_and_set_fmu_state:
             name = self._fmu.description.model_name
             raise SimulationError(f"{name} cannot get and set its state")
@@ -238,7 +238,7 @@ class NativePool(SavingPool):
     def restore(
         self, snapshot: _native.Snapshot, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``."""
+        """See ``SavingPool.restore``."""
         pool = self._open_pool()
         if not isinstance(snapshot, _native.Snapshot):
             raise SimulationError("the snapshot was taken from another pool")
@@ -300,10 +300,6 @@ class NativePool(SavingPool):
         found = rows.reshape(len(seeded), len(others), self.num_instances)
         return found if is_adjoint else found.swapaxes(0, 1)
 
-    def knows_start(self, index: int, variables: tuple[Variable, ...], values: FloatArray) -> bool:
-        """See ``AttendedPool.knows_start``."""
-        return self._open_pool().knows_start(index, self._access(variables), values.tobytes())
-
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""
         values = np.ascontiguousarray(values, np.float64)
@@ -311,35 +307,16 @@ class NativePool(SavingPool):
         if failed >= 0:
             raise SimulationError(self.failure(failed))
 
-    def serialize_states(self, indices: IndexArray) -> Serialized:
-        """See ``SavingPool.serialize_states``."""
-        ends, steps = np.empty(len(indices), np.int64), np.empty(len(indices), np.int64)
-        start_times = np.empty(len(indices))
-        chosen = np.ascontiguousarray(indices)
-        data = self._open_pool().bundle(chosen, ends, steps, start_times)
-        if isinstance(data, int):
-            raise SimulationError(self.failure(data))
-        return data, ends, steps, start_times
+    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+        """See ``SavingPool.save_states``."""
+        states = self._open_pool().save_states(np.ascontiguousarray(indices), records)
+        if isinstance(states, int):
+            raise SimulationError(self.failure(states))
+        return states
 
-    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        """See ``SavingPool.deserialize_states``."""
-        pool = self._open_pool()
-        sources, indices = np.ascontiguousarray(sources), np.ascontiguousarray(indices)
-        parts = bundle.data, bundle.ends, bundle.steps, bundle.start_times, bundle.outputs
-        pool.unbundle(indices, sources, *parts)
-
-    def record_of(self, index: int) -> Record | None:
-        """See ``SavingPool.record_of``."""
-        found = self._open_pool().record_of(index)
-        if found is None:
-            return None
-        return record_from(self._fmu.description, self._spec, *found)
-
-    def replace_record(self, index: int, record: Record) -> None:
-        """See ``SavingPool.replace_record``."""
-        access = self._access(start_variables(self._variable, record.names, record.texts))
-        starts, inputs = record.starts.tobytes(), record.inputs.tobytes()
-        self._open_pool().replace_record(index, access, starts, inputs, len(record.inputs))
+    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+        """See ``SavingPool.restore_states``."""
+        self._open_pool().restore_states(states, np.ascontiguousarray(indices))
 
     def _count_steps(self) -> None:
         if self._close.alive:
@@ -496,9 +473,8 @@ class NativePool(SavingPool):
                 tuple; the forms of observations and of infos, each the number of an array, or a
                 tuple of names and forms; the shape and type of each array: float32 observations, or
                 those that the second program stores, then rewards, terminated and truncated of a
-                step, and mask and drawn values (draws, N) of a reset; and the parts of a reset's
-                infos: the names of the drawn values and of the mask, and what ``LateDict.parts``
-                returns.
+                step, mask and drawn values (draws, N) of a reset; and a function of drawn values
+                and a mask, which returns what infos tell of the episodes that start.
 
         Returns:
             A function of actions and drawn values (draws, N). It does a step and fills the drawn
@@ -520,24 +496,12 @@ class NativePool(SavingPool):
         Args:
             arrays: Actions, observations, rewards, terminated and truncated as for the function
                 that ``prepare_play`` returns, each with a first axis for the steps; and memory for
-                drawn values, which are not drawn; and a mask of instances to leave out, shape
-                (N,), or nothing. Their inputs may change.
+                drawn values, which are not drawn.
 
         Returns:
             How many instances or numbers were in trouble; if there are any, not all steps are done.
         """
         return self._open_pool().rollout(*arrays)
-
-    def exchange_play(self, other: Any) -> Any:
-        """Put what was prepared before in the place of what is prepared now.
-
-        Args:
-            other: What an earlier call of this method has returned, or None.
-
-        Returns:
-            What ``prepare_play`` has prepared; None if there is nothing.
-        """
-        return self._open_pool().exchange_play(other)
 
     def prepare_one(self, *parts: Any) -> Callable[[Any, dict[str, Any]], Any]:
         """Prepare a pool of one instance to do whole steps of a single environment.
@@ -582,11 +546,6 @@ class NativePool(SavingPool):
             arrays of the result are new, or those of an earlier call that nobody holds any more.
         """
         return self._reset_of_play
-
-    @property
-    def uses_states(self) -> bool:
-        """Whether resets restore saved initial states, as far as known so far."""
-        return self._pool.uses_states()
 
 
 def prepare(

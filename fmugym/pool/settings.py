@@ -19,7 +19,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.texts import number_of, text_of, with_texts
 from fmugym.archive.variable import Variable, unlisted
-from fmugym.pool.bundle import Record
+from fmugym.pool.bundle import FloatArray, head_of, outputs_of
 from fmugym.pool.spec import (
     DEFAULT_TOLERANCE,
     SAMPLINGS,
@@ -33,11 +33,12 @@ from fmugym.wine.loader import windows_path, windows_uri
 
 __all__ = [
     "PlaceOfFMU",
+    "Record",
     "experiment_settings",
     "library_settings",
     "listing",
     "manner_of",
-    "record_from",
+    "record_in",
     "solving_settings",
     "table_of",
     "type_number",
@@ -139,7 +140,7 @@ def _structural_settings(description: ModelDescription) -> dict[str, bytes]:
     }
 
 
-def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
+def experiment_settings(spec: PoolSpec, *, records: bool = False) -> dict[str, Any]:
     """How instances are initialized and stepped, and how episodes begin."""
     method = spec.whole_reset_method
     return {
@@ -154,6 +155,7 @@ def experiment_settings(spec: PoolSpec) -> dict[str, Any]:
         "rebuilds": method not in (ResetMethod.RESTORE, ResetMethod.RESET),
         "reloads": method == ResetMethod.LIBRARY,
         "one_initialization": spec.one_initialization,
+        "records": records,
         "start_outputs": np.array(spec.start_outputs).tobytes() if spec.blind_start else None,
     }
 
@@ -299,26 +301,38 @@ def _variables_of(
     )
 
 
-def record_from(
-    description: ModelDescription,
-    spec: PoolSpec,
-    starts: Sequence[tuple[int, int, int, float]],
-    steps: int,
-    inputs: bytes,
-) -> Record:
-    """Make the record of an episode of what the C code tells.
+_START: Final = np.dtype(
+    [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "unused"))]
+)
+"""A start value in a record; ``RecordedStart`` of ``native/pool.h``."""
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The episode of an instance until it was saved.
+
+    Attributes:
+        variables: Those that were set before initialization.
+        starts: Their values, shape (P,).
+        inputs: The inputs of each step, shape (steps, k_in).
+    """
+
+    variables: tuple[Variable, ...]
+    starts: FloatArray
+    inputs: FloatArray
+
+
+def record_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> Record:
+    """Read the record in a state that has one.
 
     Args:
         description: That of the FMU.
         spec: That of the pool.
-        starts: The C type, value reference, place in an array and value of each start value.
-        steps: The number of steps.
-        inputs: Those of each step, float64.
+        state: The state.
     """
-    columns = zip(*starts, strict=True) if starts else ((), (), (), ())
-    types, references, places, values = columns
-    return Record.of(
-        _variables_of(description, types, references, places, values),
-        np.array(values, np.float64),
-        np.frombuffer(inputs).reshape(steps, len(spec.inputs)),
-    )
+    head, (_, content) = head_of(state), outputs_of(state, len(spec.outputs))
+    end = head.starts * _START.itemsize
+    starts = np.frombuffer(content[:end], _START)
+    parts = (starts[name].tolist() for name in ("type", "reference", "place", "value"))
+    inputs = np.frombuffer(content[end:]).reshape(head.rows, len(spec.inputs))
+    return Record(_variables_of(description, *parts), starts["value"], inputs)

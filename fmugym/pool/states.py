@@ -1,7 +1,7 @@
 """States of FMUs on disk, which episodes of later programs begin with.
 
-They are files in the cache folder: a digest, numbers that go with the state, and the FMU's own
-bytes. A file that is damaged, too large, or no regular file is no state.
+They are files in the cache folder: a digest, and the bytes that a caller makes of a state. A file
+that is damaged, too large, or no regular file is no state.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import logging
 import os
 import stat
 import tempfile
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from fmugym.pool.spec import PoolSpec
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["MOST_BYTES", "KeptState", "StateFiles", "essence"]
+__all__ = ["MOST_BYTES", "StateFiles", "essence"]
 
 logger = logging.getLogger(__name__)
 
@@ -28,24 +28,11 @@ MOST_BYTES: Final = 2**30
 _LARGEST: Final = 2**28
 """The largest size of one state, in bytes."""
 
-_MAGIC: Final = b"fmugym initial state 1\n"
+_MAGIC: Final = b"fmugym initial state 2\n"
 _DIGEST: Final = hashlib.sha256().digest_size
 
 _READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
-
-
-@dataclass(frozen=True)
-class KeptState:
-    """A serialized FMU state.
-
-    Attributes:
-        numbers: What goes with it, float64, as bytes.
-        data: The FMU's own bytes.
-    """
-
-    numbers: bytes
-    data: bytes
 
 
 class StateFiles:
@@ -53,17 +40,16 @@ class StateFiles:
 
     Args:
         prefix: The folder, and the beginning of the files' names, which stands for the FMU.
-        width: How many numbers go with a state.
     """
 
-    def __init__(self, prefix: str, width: int) -> None:
-        self._prefix, self._width = Path(prefix), width
+    def __init__(self, prefix: str) -> None:
+        self._prefix = Path(prefix)
 
     def path(self, key: str) -> Path:
         """The file of a state."""
         return self._prefix.with_name(f"{self._prefix.name}-{key}")
 
-    def find(self, key: str) -> KeptState | None:
+    def find(self, key: str) -> bytes | None:
         """Read a state; None if there is none, or only a damaged one."""
         path = self.path(key)
         try:
@@ -72,33 +58,29 @@ class StateFiles:
                 status = os.fstat(handle)
                 if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
                     return None
-                state = self._parse(file.read(_LARGEST))
+                state = _parsed(file.read(_LARGEST))
             os.utime(path)
         except ordinary(OSError):
             return None
         return state
 
-    def _parse(self, content: bytes) -> KeptState | None:
-        start = len(_MAGIC) + _DIGEST
-        digest, body = content[len(_MAGIC) : start], content[start:]
-        size = 8 * self._width
-        if content[: len(_MAGIC)] != _MAGIC or len(body) <= size:
-            return None
-        if hashlib.sha256(body).digest() != digest:
-            return None
-        return KeptState(body[:size], body[size:])
-
-    def keep(self, key: str, state: KeptState) -> None:
+    def keep(self, key: str, state: bytes) -> None:
         """Write a state; if that is not possible, nothing is kept, and no error is raised."""
-        body = state.numbers + state.data
-        if len(body) > _LARGEST // 2:
+        if len(state) > _LARGEST // 2:
             return
         try:
             self._prefix.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            _write(self.path(key), _MAGIC + hashlib.sha256(body).digest() + body)
+            _write(self.path(key), _MAGIC + hashlib.sha256(state).digest() + state)
             _remove_old(self._prefix.parent)
         except ordinary(OSError) as error:
             logger.debug("no state is kept: %s", error)
+
+
+def _parsed(content: bytes) -> bytes | None:
+    start = len(_MAGIC) + _DIGEST
+    digest, state = content[len(_MAGIC) : start], content[start:]
+    is_sound = content[: len(_MAGIC)] == _MAGIC and hashlib.sha256(state).digest() == digest
+    return state if is_sound else None
 
 
 def _write(path: Path, content: bytes) -> None:

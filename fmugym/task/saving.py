@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
 from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
-from fmugym.task.snapshot import Columns
+from fmugym.task.snapshot import Column, Columns
 
-__all__ = ["columns_of", "learn", "native_value", "place_columns", "require_saving"]
+__all__ = ["READ", "columns_of", "place_columns", "read_columns", "require_saving"]
+
+_NUMBERS: Final = ("values", "previous_state", "inputs")
+
+READ: Final = (*_NUMBERS, "action", "previous_action", "step_count", "done", "after_end")
+"""What hooks read, but for mappings."""
 
 
 def require_saving(pool: Pool) -> None:
@@ -39,24 +43,28 @@ def columns_of(env: Constructed) -> Columns:
     """
     attributes = plain_attributes(vars(env), env._own_names)
     streams, seeds = _stream_of(env)
-    return {
-        "values": np.array([env._readings.values]),
-        "previous_state": np.array([env.previous_state]),
-        "inputs": np.array([env.inputs], np.float64),
-        "action": [copy.deepcopy(env.action)],
-        "previous_action": [copy.deepcopy(env.previous_action)],
-        "step_count": np.array([env.step_count]),
-        "done": np.array([env.done]),
-        "after_end": np.array([env.after_end]),
+    return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
         "ended": np.array([env._ended]),
-        "parameters": {name: [value] for name, value in env.parameters.items()},
-        "texts": {name: [env.out[name]] for name in env.out.strings},
-        "variables": {name: [copy.deepcopy(v)] for name, v in env.variables.items()},
         "streams": streams,
         "seeds": seeds,
         "pictured": [(env._last_reward, env._return)],
         "attributes": [changed(attributes, env._as_constructed)],
     }
+
+
+def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
+    """Copy what hooks read, of one environment or of several.
+
+    Args:
+        env: The environment, or the prototype of several.
+        column: Copies a value, or those of several environments.
+    """
+    columns: Columns = {name: column(getattr(env._readings, name)) for name in READ}
+    texts = {name: env.out[name] for name in env.out.strings}
+    groups = {"parameters": env.parameters, "variables": env.variables, "texts": texts}
+    for kind, values in groups.items():
+        columns[kind] = {name: column(value) for name, value in values.items()}
+    return columns
 
 
 def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
@@ -73,21 +81,19 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
-    learn(columns.get("texts", {}))
     read = env._readings
-    read.values = tuple(np.asarray(columns["values"][place], np.float64).tolist())
+    for name in _NUMBERS:
+        setattr(read, name, tuple(np.asarray(columns[name][place], np.float64).tolist()))
     read.state = read.values[: env._output_count]
-    read.previous_state = tuple(np.asarray(columns["previous_state"][place], np.float64).tolist())
-    read.inputs = tuple(np.asarray(columns["inputs"][place], np.float64).tolist())
-    read.action = native_value(columns["action"], place)
-    read.previous_action = native_value(columns["previous_action"], place)
+    read.action = _native_value(columns["action"], place)
+    read.previous_action = _native_value(columns["previous_action"], place)
     read.step_count = int(columns["step_count"][place])
     read.done = bool(columns["done"][place])
     read.after_end = bool(columns["after_end"][place])
-    parameters = {name: native_value(c, place) for name, c in columns["parameters"].items()}
+    parameters = {name: _native_value(c, place) for name, c in columns["parameters"].items()}
     read.parameters = MappingProxyType({n: v for n, v in parameters.items() if v is not None})
     read.variables.update(
-        {name: native_value(column, place) for name, column in columns["variables"].items()}
+        {name: _native_value(column, place) for name, column in columns["variables"].items()}
     )
     pictured, attributes = columns["pictured"], columns["attributes"]
     env._last_reward, env._return = (None, 0.0) if pictured is None else pictured[place]
@@ -96,13 +102,7 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     env._was_reset, env._ended = True, bool(columns["ended"][place])
 
 
-def learn(texts: Mapping[str, Any]) -> None:
-    """Let this process know the texts of Strings that another one has met."""
-    for column in texts.values():
-        numbers_of(column)
-
-
-def native_value(column: Any, place: int) -> Any:
+def _native_value(column: Any, place: int) -> Any:
     """One value of a column as the hooks of a single environment read it."""
     value = column[place]
     if isinstance(column, list):

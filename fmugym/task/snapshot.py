@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.signals import ordinary
@@ -32,7 +33,7 @@ __all__ = [
     "taken",
 ]
 
-_VERSION: Final = 3
+_VERSION: Final = 4
 """Of pickles; it changes with their content."""
 
 _OPERATION: Final = {
@@ -112,13 +113,13 @@ class Snapshot:
 
     @property
     def _content(self) -> tuple[Any, ...]:
-        return self._scope, _content(self._columns), self._bundle.content
+        return self._scope, _content(self._columns), self._bundle.states
 
     def __eq__(self, other: object) -> bool:
         return self._content == other._content if isinstance(other, Snapshot) else NotImplemented
 
     def __hash__(self) -> int:
-        return hash((tuple(self._scope.items()), self._bundle.content))
+        return hash((tuple(self._scope.items()), self._bundle.states))
 
     def __repr__(self) -> str:
         return f"Snapshot({len(self)} environment(s), method={str(self.method)!r})"
@@ -158,7 +159,10 @@ def _unpickled(version: int, *parts: Any) -> Snapshot:
     content, digest = parts
     if hashlib.sha256(content).digest() != digest:
         raise SimulationError("the snapshot is damaged: its pickle has changed")
-    return Snapshot(*pickle.loads(content))
+    scope, columns, bundle = pickle.loads(content)
+    for column in (*columns["texts"].values(), *columns["parameters"].values()):
+        numbers_of(value for value in column if isinstance(value, str))  # are now known here
+    return Snapshot(scope, columns, bundle)
 
 
 def checked_snapshot(snapshot: Any, length: int | None = None) -> Snapshot:

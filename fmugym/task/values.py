@@ -253,22 +253,6 @@ class LateDict(dict[str, Any]):
         late._fill = fill, *arguments
         return late
 
-    @classmethod
-    def parts(
-        cls, fill: Callable[..., Mapping[str, Any]], first: Any
-    ) -> tuple[type[LateDict], str, str, Callable[..., Mapping[str, Any]], Any]:
-        """What the C extension makes such dicts of.
-
-        Args:
-            fill: See the class.
-            first: Its first argument; the others follow with each dict.
-
-        Returns:
-            The class, the key of a dict that is not filled yet, the attribute for the function with
-            its arguments, and what was given.
-        """
-        return cls, _UNFILLED, "_fill", fill, first
-
     def _filled(self) -> dict[str, Any]:
         if self._fill is not None:
             (fill, *arguments), self._fill = self._fill, None

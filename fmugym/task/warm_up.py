@@ -6,8 +6,7 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from importlib import import_module
+from dataclasses import replace
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, Final
@@ -21,19 +20,16 @@ from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.patience import failed_reset
-from fmugym.pool.states import KeptState, StateFiles, essence
+from fmugym.pool.states import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.trial.known import state_files
 
-__all__ = ["Found", "WarmUp", "WarmUps", "grouped", "rows_of_one"]
+__all__ = ["WarmUp", "WarmUps", "rows_of_one"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
-
-_COMPILER: Final = "fmugym.vector.warming"
-"""It lies above this room, and it takes a while to import."""
 
 _WARNING: Final = int(Status.WARNING)  # which is compared in less time
 
@@ -44,7 +40,7 @@ class WarmUp(ABC):
     """What happens in a warm-up.
 
     Its methods read the environment as hooks do. The readings are arrays with M environments on the
-    last axis, also in a single environment, or symbols. ``step_count`` rises to 0.
+    last axis, also in a single environment. ``step_count`` rises to 0.
 
     Attributes:
         steps: How many steps it has.
@@ -52,7 +48,6 @@ class WarmUp(ABC):
         depends_on: The episode variables on which it depends.
         writes: The episode variables that it writes.
         digest: Tells it from others that lead to other states.
-        starts: The numbers that its controllers remember, at the beginning.
     """
 
     steps: int
@@ -60,81 +55,52 @@ class WarmUp(ABC):
     depends_on: tuple[str, ...] = ()
     writes: tuple[str, ...] = ()
     digest: str = ""
-    starts: tuple[float, ...] = ()
 
     @abstractmethod
-    def decide(self, env: Any, state: Sequence[Any]) -> tuple[Mapping[int, Any], tuple[Any, ...]]:
-        """Choose actions.
+    def begin(self, count: int) -> None:
+        """Prepare for the warm-up of some environments.
 
         Args:
-            env: The environment.
-            state: What the controllers remember, in the order of ``starts``.
-
-        Returns:
-            The elements of the action that are chosen, by their places, and what the controllers
-            remember then.
+            count: M.
         """
 
     @abstractmethod
     def inputs(self, env: Any) -> Any:
-        """Return the FMU's inputs that follow from the action, numbers or of shape (M,)."""
+        """Choose the action, and return the FMU's inputs that follow, numbers or of shape (M,)."""
 
     @abstractmethod
     def update(self, env: Any) -> None:
         """Write the episode variables that the warm-up changes, when the FMU has stepped."""
 
 
-@dataclass(frozen=True)
-class Warmed:
-    """What a warm-up has led to.
-
-    Attributes:
-        state: The FMU's state.
-        inputs: Its inputs, shape (k_in,).
-        variables: The episode variables that the warm-up writes, by name.
-    """
-
-    state: Bundle
-    inputs: FloatArray
-    variables: Mapping[str, Any]
-
-    @property
-    def size(self) -> int:
-        """About how many bytes it takes."""
-        return len(self.state.data) + sum(np.asarray(v).nbytes for v in self.variables.values())
-
-
 class _Memory:
     """Warmed-up states of all environments of this process by key."""
 
     def __init__(self) -> None:
-        self._states: OrderedDict[bytes, Warmed] = OrderedDict()
+        self._states: OrderedDict[bytes, bytes] = OrderedDict()
         self._lock, self._size = Lock(), 0
 
-    def find(self, key: bytes) -> Warmed | None:
+    def find(self, key: bytes) -> bytes | None:
         with self._lock:
             if key in self._states:
                 self._states.move_to_end(key)
             return self._states.get(key)
 
-    def keep(self, key: bytes, warmed: Warmed) -> None:
+    def keep(self, key: bytes, warmed: bytes) -> None:
         with self._lock:
-            if key in self._states or warmed.size > _MOST_BYTES:
+            if key in self._states or len(warmed) > _MOST_BYTES:
                 return
             self._states[key] = warmed
-            self._size += warmed.size
+            self._size += len(warmed)
             while self._size > _MOST_BYTES:
-                self._size -= self._states.popitem(last=False)[1].size
+                self._size -= len(self._states.popitem(last=False)[1])
 
 
 _memory: Final = _Memory()
 
-Found = dict[int, Warmed]
-"""By the index of an environment, the state that its warm-up leads to."""
-
-
-_STEPS_BEFORE: Final = 1000
-"""After so many steps in Python, warm-ups are compiled."""
+Found = dict[int, bytes]
+"""By the index of an environment, what its warm-up leads to: the inputs and the episode variables
+that it writes, all float64, and the FMU's state."""
 
 
 class WarmUps:
@@ -153,9 +119,6 @@ class WarmUps:
         self._scope = b""
         self._keys: dict[int, bytes] = {}
         self._has_told = False
-        self._in_pass: Any = None
-        self._prepared_for: Pool | None = None
-        self._left = _STEPS_BEFORE
 
     # States that are known
 
@@ -216,18 +179,40 @@ class WarmUps:
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
-    def restore(self, pool: Pool, found: Found) -> None:
+    def restore(self, pool: Pool, found: Found) -> list[tuple[dict[str, Any], IndexArray]]:
         """Bring FMUs to states that were found.
+
+        Returns:
+            The episode variables that warm-ups have written, each time with the environments.
 
         Raises:
             SimulationError: If an FMU refuses.
         """
-        for warmed, indices in grouped(found):
-            sources = np.zeros(len(indices), np.int64)
-            statuses = pool.restore_instances(warmed.state, sources, indices)
-            for index in indices[statuses[indices] > _WARNING].tolist():
-                raise failed_reset(self._located(pool, index))
-            pool.inputs[:, indices] = warmed.inputs[:, None]
+        groups: dict[bytes, list[int]] = {}
+        for index, warmed in found.items():
+            groups.setdefault(warmed, []).append(index)
+        pairs = [(warmed, np.array(indices)) for warmed, indices in groups.items()]
+        return [(self._restored(pool, *pair), pair[1]) for pair in pairs]
+
+    def _restored(self, pool: Pool, warmed: bytes, indices: IndexArray) -> dict[str, Any]:
+        size, ends = self._size_of_numbers, np.cumsum([len(pool.inputs), *self._sizes])
+        inputs, *parts = np.split(np.frombuffer(warmed[:size]), ends[:-1])
+        bundle, sources = Bundle((warmed[size:],)), np.zeros(len(indices), np.int64)
+        statuses = pool.restore_instances(bundle, sources, indices)
+        for index in indices[statuses[indices] > _WARNING].tolist():
+            raise failed_reset(self._located(pool, index))
+        pool.inputs[:, indices] = inputs[:, None]
+        shapes = self._shapes.items()
+        return {name: p.reshape(shape) for (name, shape), p in zip(shapes, parts, strict=True)}
+
+    @property
+    def _sizes(self) -> list[int]:
+        return [int(np.prod(shape)) for shape in self._shapes.values()]
+
+    @property
+    def _size_of_numbers(self) -> int:
+        """How many bytes stand before the FMU's state."""
+        return 8 * (len(self._env._interface.inputs) + sum(self._sizes))
 
     # Warm-ups
 
@@ -248,24 +233,11 @@ class WarmUps:
         """
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
-        compiled = self._compiled(pool, len(indices))
-        run = self._run_in_python if compiled is None else compiled.run
-        variables = run(pool, readings, indices, skip)
-        for index in indices[pool.statuses[indices] > _WARNING].tolist():
-            raise failed_reset(self._located(pool, index))
+        variables = self._play(pool, readings, indices, skip)
         self._keep(pool, variables, indices)
         return variables
 
-    def _compiled(self, pool: Pool, count: int) -> Any:
-        """What does warm-ups in the pool's pass; None until that is worth its time, or for good."""
-        if self._left > 0:
-            self._left -= count * self._warm_up.steps
-        elif self._prepared_for is not pool:
-            self._prepared_for = pool
-            self._in_pass = import_module(_COMPILER).compiled(self._env, self._warm_up, pool)
-        return self._in_pass
-
-    def _run_in_python(
+    def _play(
         self,
         pool: Pool,
         readings: Readings,
@@ -273,15 +245,11 @@ class WarmUps:
         skip: npt.NDArray[np.bool_],
     ) -> dict[str, Any]:
         count, warm_up = len(indices), self._warm_up
-        state = tuple(np.full(count, start) for start in warm_up.starts)
+        warm_up.begin(count)
         with reading(self._env, readings), np.errstate(all="ignore"):
             env: Any = self._env
             for step in range(-warm_up.steps, 0):
                 env.step_count = np.full(count, step)
-                chosen, state = warm_up.decide(env, state)
-                env.previous_action, env.action = env.action, np.array(env.action)
-                for place, value in chosen.items():
-                    env.action[place if env.action.ndim > 1 else ...] = value
                 self._step(pool, indices, skip)
                 env.step_count = np.full(count, step + 1)
                 warm_up.update(env)
@@ -314,56 +282,20 @@ class WarmUps:
             key = self._keys.pop(index, None)
             if key is None:
                 continue
-            state = pool.save_instances(np.array([index]))
-            variables = {name: np.array(row[..., place]) for name, row in rows.items()}
-            warmed = Warmed(state, pool.inputs[:, index].copy(), variables)
-            _memory.keep(key, warmed)
-            self._write(key, warmed)
+            values = pool.inputs[:, index], *(row[..., place] for row in rows.values())
+            numbers = b"".join(np.asarray(value, np.float64).tobytes() for value in values)
+            (state,) = pool.save_instances(np.array([index])).states
+            _memory.keep(key, numbers + state)
+            if self._prefix:
+                StateFiles(self._prefix).keep(key.hex()[:32], numbers + state)
 
-    # On disk
-
-    @property
-    def _sizes(self) -> list[int]:
-        return [int(np.prod(shape)) for shape in self._shapes.values()]
-
-    def _files(self, pool_width: int) -> StateFiles | None:
-        prefix = self._prefix or ""
-        width = pool_width + 1 + len(self._env._interface.inputs) + sum(self._sizes)
-        return StateFiles(prefix, width) if prefix else None
-
-    def _read(self, key: bytes) -> Warmed | None:
-        spec, count = self._env._spec, len(self._env._interface.inputs)
-        files = self._files(len(spec.outputs))
-        found = None if files is None else files.find(key.hex()[:32])
-        if found is None:
+    def _read(self, key: bytes) -> bytes | None:
+        """Find a state on disk."""
+        found = StateFiles(self._prefix).find(key.hex()[:32]) if self._prefix else None
+        if found is None or len(found) <= self._size_of_numbers:
             return None
-        numbers = np.frombuffer(found.numbers)
-        outputs, start, rest = np.split(numbers, [len(spec.outputs), len(spec.outputs) + 1])
-        inputs, rest = np.split(rest, [count])
-        parts = np.split(rest, np.cumsum(self._sizes)[:-1]) if self._sizes else []
-        shapes = self._shapes.items()
-        variables = {n: p.reshape(s) for (n, s), p in zip(shapes, parts, strict=True)}
-        steps, ends = np.array([self._warm_up.steps * spec.substeps]), np.array([len(found.data)])
-        state = Bundle(outputs[:, None].copy(), steps, start, found.data, ends)
-        warmed = Warmed(state, inputs, variables)
-        _memory.keep(key, warmed)
-        return warmed
-
-    def _write(self, key: bytes, warmed: Warmed) -> None:
-        files = self._files(len(warmed.state.outputs))
-        if files is not None:
-            state = warmed.state
-            values = [state.outputs, state.start_times, warmed.inputs, *warmed.variables.values()]
-            numbers = np.concatenate([np.ravel(value).astype(np.float64) for value in values])
-            files.keep(key.hex()[:32], KeptState(numbers.tobytes(), warmed.state.data))
-
-
-def grouped(found: Found) -> list[tuple[Warmed, IndexArray]]:
-    """The states that were found, each with its environments."""
-    groups: dict[int, tuple[Warmed, list[int]]] = {}
-    for index, warmed in found.items():
-        groups.setdefault(id(warmed), (warmed, []))[1].append(index)
-    return [(warmed, np.array(indices)) for warmed, indices in groups.values()]
+        _memory.keep(key, found)
+        return found
 
 
 def rows_of_one(env: Any) -> Readings:

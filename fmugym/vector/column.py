@@ -65,17 +65,6 @@ class PoolColumn(Pool):
         self.observations[0] = self.outputs[: self.observations.shape[1], 0]
         return int(self.statuses[0] > WARNING_CODE)
 
-    def save(self) -> Any:
-        """See ``Pool.save``."""
-        return self._pool.save()
-
-    def restore(
-        self, snapshot: Any, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``."""
-        self._pool.restore(snapshot, self._mask(True))
-        return self.outputs, self.statuses
-
     @property
     def save_method(self) -> SaveMethod | None:
         """See ``Pool.save_method``."""

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.values import LateDict
-from fmugym.vector.codec import with_masks, within
+from fmugym.vector.codec import coded, within
 
 __all__ = [
     "copy_rows",
@@ -26,28 +26,25 @@ __all__ = [
 ]
 
 
-def drawn_info(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
+def drawn_info(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
         plan: What the environments in the mask have drawn from.
-        values: What they have drawn, shape (draws, M). No caller changes it.
-        mask: The environments that were reset.
+        drawn: What they have drawn, shape (draws, N). No caller changes it.
+        mask: The environments that were reset. No caller changes it.
     """
-    mask = mask.copy()
-    return {"drawn": LateDict.of(_drawn_rows, plan, values, mask), "_drawn": mask}  # rarely read
+    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def _drawn_rows(plan: EpisodePlan, values: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    drawn = plan.told | plan.shown(values)
-    rows = {name: _empty(len(mask), row, name in plan.strings) for name, row in drawn.items()}
-    for name, row in drawn.items():
-        rows[name][mask] = row
-    return with_masks(rows, mask)
+def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    told = plan.told | plan.shown(drawn)
+    kinds = {name: object if name in plan.strings else None for name in told}
+    return coded({n: _of_each(v, len(mask), kinds[n]) for n, v in told.items()}, mask)
 
 
-def _empty(count: int, row: Any, is_text: bool) -> npt.NDArray[Any]:
-    return np.full(count, None) if is_text else np.zeros((count, *np.shape(row)[1:]))
+def _of_each(value: Any, count: int, kind: Any) -> npt.NDArray[Any]:
+    return value if isinstance(value, np.ndarray) else np.full(count, value, kind)
 
 
 def final_infos(

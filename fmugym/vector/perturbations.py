@@ -175,8 +175,8 @@ class _Perturbation:
         self._bundle: Bundle = Bundle.of_all(bundles)
         self._columns: Columns = stacked(columns)
         spec = self._envs._prototype._spec
-        pairs = zip(self._bundle.steps.tolist(), self._bundle.start_times.tolist(), strict=True)
-        self._times = np.array([spec.communication_point(*pair) for pair in pairs])
+        heads = self._bundle.heads
+        self._times = np.array([spec.communication_point(h.steps, h.start_time) for h in heads])
         return np.array(x), np.array(y)
 
     def _scales(self, x: FloatArray) -> FloatArray:
@@ -229,7 +229,8 @@ class _Perturbation:
         if len(starting):
             self._start_at(trials)
             self._require_fine("a start", starting)
-            columns["values"][starting] = self._pool.outputs.T[starting]
+            for index in starting.tolist():
+                columns["values"][index] = self._pool.outputs[:, index].copy()
         before = self._pool.read(self._x).T
         self._require_states(before[starting], trials.states[starting])
         self._engine.place(columns, self._everywhere, self._everywhere)

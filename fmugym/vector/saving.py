@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
-from fmugym.task.saving import learn
+from fmugym.task.saving import READ, read_columns
 from fmugym.task.snapshot import Columns, Snapshot
 
 __all__ = [
@@ -25,9 +24,6 @@ __all__ = [
     "sources_for",
     "which_of",
 ]
-
-_FIRST = ("values", "previous_state", "inputs", "action", "previous_action", "done", "after_end")
-"""The attributes of a batch with the environments on their last axis."""
 
 
 def chosen(where: Any, num_envs: int) -> IndexArray:
@@ -86,24 +82,16 @@ def which_of(indices: IndexArray, count: int) -> Which:
     return slice(None) if in_order else indices
 
 
-def columns_of(env: FMUEnv, parameters: Mapping[str, Any], indices: IndexArray) -> Columns:
+def columns_of(env: FMUEnv, indices: IndexArray) -> Columns:
     """Copy what hooks read in some environments of a batch.
 
     Args:
         env: The prototype.
-        parameters: The parameters, arrays of shape (N,).
         indices: The environments, shape (M,).
     """
     which = which_of(indices, len(env.step_count))
-    first = {name: _rows(getattr(env._readings, name), which) for name in _FIRST}
-    return first | {
-        "step_count": _rows(env.step_count, which),
-        "parameters": {name: _rows(row, which) for name, row in parameters.items()},
-        "variables": {name: _rows(row, which) for name, row in env.variables.items()},
-        "texts": {name: _rows(env.out[name], which) for name in env.out.strings},
-        "pictured": None,
-        "attributes": None,
-    }
+    columns = read_columns(env, lambda values: _rows(values, which))
+    return columns | {"pictured": None, "attributes": None}
 
 
 def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
@@ -114,8 +102,7 @@ def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
 
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
-    learn(columns.get("texts", {}))
-    for name in (*_FIRST, "step_count"):
+    for name in READ:
         place_column(getattr(env._readings, name), columns[name], sources, which)
 
 

@@ -24,7 +24,7 @@ from fmugym.task.generators import row_of, state_of
 if TYPE_CHECKING:
     from fmugym._native import Draws
 
-__all__ = ["EpisodeStreams", "given_draws", "no_draws"]
+__all__ = ["EpisodeStreams", "given_draws"]
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -151,11 +151,6 @@ class EpisodeStreams:
 def given_draws(plan: EpisodePlan) -> Draws:
     """The draws of a plan as values that are drawn before the C extension needs them."""
     return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.draws), plan.drawn_rows)
-
-
-def no_draws() -> Draws:
-    """The draws of episodes in which nothing is drawn."""
-    return _draws((), ())
 
 
 def _native_draws(plan: EpisodePlan) -> Draws | None:

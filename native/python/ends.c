@@ -8,39 +8,39 @@
 enum { MOST_KEPT = 1 << 20, /* bytes of arrays that wait for their next use */
        SIZE_OF_ARRAY = 128  /* an array of numpy without its memory, about */ };
 
-/* The observations of single environments that one array of all of them holds. */
+/* The part of a single environment in one array. */
 typedef struct {
     Maker maker;
-    PyObject **spare; /* arrays that nobody else holds */
-    size_t number_of_spare, most;
     size_t size;    /* in bytes */
     bool is_scalar; /* then it is no array, and no maker is there */
-} RowMaker;
+} PartMaker;
 
 struct Observed {
     size_t count;
     const Form *form;
-    size_t number_of_rows;
     Maker objects;
-    RowMaker *rows;
+    PartMaker parts[MOST_SEEN];
+    PyObject **spare; /* arrays that nobody else holds, where an observation is one */
+    size_t number_of_spare, most;
 };
 
 /* Taking over */
 
-static bool take_row(RowMaker *row, const Maker *all, size_t count) {
-    row->size = count > 0 ? all->size / count : 0;
-    row->is_scalar = all->dimensions == 1;
-    if (row->is_scalar) {
-        return true;
-    }
-    const size_t most = MOST_KEPT / (row->size + SIZE_OF_ARRAY);
-    row->most = most < count ? most : count;
-    row->spare = calloc(row->most + 1, sizeof *row->spare);
-    if (row->spare == NULL) {
+static bool take_part(PartMaker *part, const Maker *all, size_t count) {
+    part->size = count > 0 ? all->size / count : 0;
+    part->is_scalar = all->dimensions == 1;
+    return part->is_scalar || maker_take_part(&part->maker, all, 1);
+}
+
+static bool take_spare(Observed *o) {
+    const size_t most = MOST_KEPT / (o->parts[0].size + SIZE_OF_ARRAY);
+
+    o->most = o->form->is_array && most < o->count ? most : o->form->is_array ? o->count : 0;
+    o->spare = calloc(o->most + 1, sizeof *o->spare);
+    if (o->spare == NULL) {
         PyErr_NoMemory();
-        return false;
     }
-    return maker_take_part(&row->maker, all, 1);
+    return o->spare != NULL;
 }
 
 static bool take_objects(Observed *o) {
@@ -51,20 +51,6 @@ static bool take_objects(Observed *o) {
     return taken;
 }
 
-static bool take_all(Observed *o, const Maker *arrays) {
-    bool good = take_objects(o);
-
-    o->rows = calloc(o->number_of_rows + 1, sizeof *o->rows);
-    if (o->rows == NULL && good) {
-        PyErr_NoMemory();
-        good = false;
-    }
-    for (size_t i = 0; i < o->number_of_rows && good; i++) {
-        good = take_row(&o->rows[i], &arrays[i], o->count);
-    }
-    return good;
-}
-
 Observed *observed_take(const Maker *arrays, size_t number_of_arrays, size_t count,
                         const Form *form) {
     Observed *o = calloc(1, sizeof *o);
@@ -73,20 +59,17 @@ Observed *observed_take(const Maker *arrays, size_t number_of_arrays, size_t cou
         PyErr_NoMemory();
         return NULL;
     }
-    *o = (Observed){.count = count, .form = form, .number_of_rows = number_of_arrays};
-    if (!take_all(o, arrays)) {
+    o->count = count;
+    o->form = form;
+    bool good = take_objects(o);
+    for (size_t i = 0; i < number_of_arrays && good; i++) {
+        good = take_part(&o->parts[i], &arrays[i], count);
+    }
+    if (!good || !take_spare(o)) {
         observed_free(o);
         return NULL;
     }
     return o;
-}
-
-static void drop_row(RowMaker *row) {
-    while (row->number_of_spare > 0) {
-        Py_DECREF(row->spare[--row->number_of_spare]);
-    }
-    free(row->spare);
-    maker_drop(&row->maker);
 }
 
 void observed_free(Observed *o) {
@@ -94,88 +77,56 @@ void observed_free(Observed *o) {
         return;
     }
     maker_drop(&o->objects);
-    for (size_t i = 0; i < o->number_of_rows && o->rows != NULL; i++) {
-        drop_row(&o->rows[i]);
+    for (size_t i = 0; i < MOST_SEEN; i++) {
+        maker_drop(&o->parts[i].maker);
     }
-    free(o->rows);
+    while (o->number_of_spare > 0) {
+        Py_DECREF(o->spare[--o->number_of_spare]);
+    }
+    free(o->spare);
     free(o);
 }
 
-/* Taking back what an array of objects has held. The caller's references end here. */
-
-static void keep(RowMaker *row, PyObject *object) {
+/* Takes back what an array of objects has held. */
+static void clear(Observed *o, PyObject **objects) {
     char *memory;
 
-    if (Py_REFCNT(object) == 1 && row->number_of_spare < row->most &&
-        maker_knows(&row->maker, object, &memory)) {
-        row->spare[row->number_of_spare++] = object;
-    } else {
-        Py_DECREF(object);
-    }
-}
-
-static void take_back(Observed *o, const Form *form, PyObject *object);
-
-static void take_back_items(Observed *o, const Form *form, PyObject *dict) {
-    PyObject *items[MOST_SEEN];
-
-    for (size_t i = 0; i < form->count; i++) {
-        items[i] = PyDict_GetItemWithError(dict, form->items[i].name);
-        Py_XINCREF(items[i]);
-        PyErr_Clear(); /* a key of the caller's cannot be compared */
-    }
-    Py_DECREF(dict);
-    for (size_t i = 0; i < form->count; i++) {
-        if (items[i] != NULL) {
-            take_back(o, &form->items[i], items[i]);
-        }
-    }
-}
-
-static void take_back(Observed *o, const Form *form, PyObject *object) {
-    if (form->is_array) {
-        keep(&o->rows[form->array], object);
-    } else if (PyDict_CheckExact(object) && Py_REFCNT(object) == 1 && form->count <= MOST_SEEN) {
-        take_back_items(o, form, object);
-    } else {
-        Py_DECREF(object);
-    }
-}
-
-static void clear(Observed *o, PyObject **objects) {
     for (size_t i = 0; i < o->count; i++) {
         PyObject *object = objects[i];
-        if (object != Py_None) {
-            objects[i] = Py_NewRef(Py_None); /* first, because the end of an object may call back */
-            if (object != NULL) {
-                take_back(o, o->form, object);
-            }
+        objects[i] = Py_NewRef(Py_None); /* first, because the end of an object may call back */
+        if (object != NULL && Py_REFCNT(object) == 1 && o->number_of_spare < o->most &&
+            maker_knows(&o->parts[0].maker, object, &memory)) {
+            o->spare[o->number_of_spare++] = object;
+        } else {
+            Py_XDECREF(object);
         }
     }
 }
 
 /* Filling */
 
-static PyObject *array_of(RowMaker *row, char **memory) {
-    while (row->number_of_spare > 0) {
-        PyObject *spare = row->spare[--row->number_of_spare];
-        if (maker_knows(&row->maker, spare, memory)) {
+static PyObject *array_of(Observed *o, const Maker *maker, char **memory) {
+    while (o->number_of_spare > 0) {
+        PyObject *spare = o->spare[--o->number_of_spare];
+        if (maker_knows(maker, spare, memory)) {
             return spare;
         }
         Py_DECREF(spare);
     }
-    return maker_make(&row->maker, memory);
+    return maker_make(maker, memory);
 }
 
-static PyObject *row_of(RowMaker *row, size_t index, PyObject *all, const char *memory_of_all) {
+static PyObject *part_of(Observed *o, size_t number, size_t index, PyObject *all,
+                         const char *memory_of_all) {
+    const PartMaker *part = &o->parts[number];
     char *memory;
 
-    if (row->is_scalar) {
+    if (part->is_scalar) {
         return PySequence_GetItem(all, (Py_ssize_t)index);
     }
-    PyObject *array = array_of(row, &memory);
+    PyObject *array = array_of(o, &part->maker, &memory);
     if (array != NULL) {
-        memcpy(memory, memory_of_all + index * row->size, row->size);
+        memcpy(memory, memory_of_all + index * part->size, part->size);
     }
     return array;
 }
@@ -185,7 +136,7 @@ static PyObject *seen_by(Observed *o, const Form *form, size_t index, PyObject *
     const size_t array = form->array;
 
     if (form->is_array) {
-        return row_of(&o->rows[array], index, arrays[array], memory[array]);
+        return part_of(o, array, index, arrays[array], memory[array]);
     }
     PyObject *dict = PyDict_New();
     for (size_t i = 0; i < form->count && dict != NULL; i++) {

@@ -7,18 +7,19 @@
 #include "arrays.h"
 #include "forms.h"
 
-typedef struct Infos Infos;
+/* The arrays that infos are made of. */
+typedef struct {
+    const Maker *makers, *mask_maker;
+    PyObject *const *arrays;
+    char *const *memory;
+    const char *mask; /* the environments; NULL for all */
+} Origin;
 
-/* Takes the form of the infos, a dict, which must outlive the result, and how the arrays and a mask
- * are made. Returns NULL with an exception if memory runs out. */
-Infos *infos_take(const Maker *arrays, size_t number_of_arrays, const Maker *mask,
-                  const Form *form);
-void infos_free(Infos *infos);
+/* Adds the arrays to a dict, or copies of them that are zero outside of the mask. Returns false with
+ * an exception if memory runs out. */
+bool infos_add(const Origin *origin, const Form *form, PyObject *dict);
 
-/* Adds the infos of all environments to a dict: the arrays themselves. Returns false with an
- * exception if memory runs out, as the next one does. */
-bool infos_add(Infos *infos, PyObject *dict, PyObject *const *arrays);
-/* Adds those of the environments in a mask: copies of the arrays, zero for the others. */
-bool infos_add_masked(Infos *infos, PyObject *dict, char *const *memory, const char *mask);
+/* Returns a copy of the mask, or NULL with an exception if memory runs out. */
+PyObject *infos_mask(const Origin *origin);
 
 #endif

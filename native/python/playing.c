@@ -439,22 +439,6 @@ PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs) {
         playing_free(playing);
         return NULL;
     }
-    PyCapsule_SetContext(capsule, self); /* other pools have other arrays */
     replace_reference(&self->playing, capsule);
     Py_RETURN_NONE;
-}
-
-/* Puts what was prepared before in the place of what is prepared now, and returns that. */
-PyObject *py_exchange_play(PyObject *object, PyObject *other) {
-    PyPool *self = (PyPool *)object;
-    PyObject *present = Py_NewRef(self->playing == NULL ? Py_None : self->playing);
-
-    if (other != Py_None &&
-        (!PyCapsule_IsValid(other, PLAYING) || PyCapsule_GetContext(other) != self)) {
-        Py_DECREF(present);
-        PyErr_SetString(PyExc_TypeError, "expected what exchange_play has returned");
-        return NULL;
-    }
-    replace_reference(&self->playing, other == Py_None ? NULL : Py_NewRef(other));
-    return present;
 }

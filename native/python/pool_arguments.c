@@ -11,7 +11,7 @@ typedef struct {
     Py_ssize_t size_of_references, size_of_values; /* of structural parameters */
     Py_ssize_t num_observed, count, threads, start_outputs_size;
     int version, manner, private_libraries, logging, can_save;
-    int restores, rebuilds, reloads, one_initialization;
+    int restores, rebuilds, reloads, one_initialization, records;
     long long substeps, warm_up_steps, retries;
     const char *sampling;
     Py_ssize_t samplings;
@@ -45,12 +45,12 @@ static bool parse_experiment(PyPool *self, PyObject *group, Arguments *a) {
     static char *names[] = {"start_time", "stop_time",     "tolerance", "time_step",
                             "substeps",   "warm_up_steps", "retries",   "restores",
                             "rebuilds",   "reloads",       "one_initialization",
-                            "start_outputs", NULL};
+                            "records",    "start_outputs", NULL};
     Settings *s = &self->pool.settings;
-    return parse_group(group, "$dOOdLLLppppz#:experiment", names, &s->experiment.start_time,
+    return parse_group(group, "$dOOdLLLpppppz#:experiment", names, &s->experiment.start_time,
                        &a->stop_time, &a->tolerance, &s->time_step, &a->substeps, &a->warm_up_steps,
                        &a->retries, &a->restores, &a->rebuilds, &a->reloads,
-                       &a->one_initialization, &s->start_outputs, &a->start_outputs_size);
+                       &a->one_initialization, &a->records, &s->start_outputs, &a->start_outputs_size);
 }
 
 static bool parse_variables(PyObject *group, Arguments *a) {
@@ -180,6 +180,7 @@ static bool settle(PyPool *self, const Arguments *a) {
     s->renews = self->system != NULL && self->system->renews;
     s->returns = self->system != NULL && self->system->restores;
     s->one_initialization = a->one_initialization;
+    s->records = a->records;
     s->inputs = &a->inputs->access;
     s->outputs = &a->outputs->access;
     s->sampling = a->samplings == 0 ? NULL : (const unsigned char *)a->sampling;

@@ -349,10 +349,3 @@ PyObject *py_costs(PyObject *object, PyObject *unused) {
     return Py_BuildValue("(dddd)", costs[STEP].low, costs[RESET].low, costs[MIXED].low,
                          costs[PLAY].low);
 }
-
-PyObject *py_uses_states(PyObject *object, PyObject *unused) {
-    PyPool *self = (PyPool *)object;
-    (void)unused;
-    return PyBool_FromLong(self->pool.settings.restores &&
-                           !atomic_get(&self->pool.states_too_large));
-}

@@ -6,7 +6,6 @@
 typedef struct {
     PyTurn turn;
     size_t horizon;
-    Mask left_out;
 } PyRollout;
 
 static bool has_bad_action(const PyRollout *r) {
@@ -29,8 +28,7 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
     t->ends.outside = false;
     t->bad_action = has_bad_action(r);
     if (!t->bad_action) {
-        t->troubled =
-            pool_rollout(&self->pool, &t->call, r->horizon, r->left_out, &t->ends.outside);
+        t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
     }
 }
 
@@ -79,25 +77,13 @@ static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *
                        (Py_ssize_t)playing->play.draws->count, n);
 }
 
-static bool take_left_out(PyPool *self, PyObject *mask, PyRollout *r) {
-    Py_buffer *buffer = &r->turn.buffers[MASK];
-
-    if (!take_vector(mask, buffer, COPIED, "the mask", ITEM_BOOLEAN,
-                     (Py_ssize_t)self->pool.settings.count)) {
-        return false;
-    }
-    r->left_out = (Mask){buffer->buf, buffer->strides[0]};
-    return true;
-}
-
-/* The mask may be NULL. */
-static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args, PyObject *mask) {
+static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
     const Playing *playing = playing_of(capsule);
     PyRollout r = {.horizon = 0};
     bool done = false;
 
     clear_turn(playing, &r.turn);
-    if (take_rollout(self, playing, args, &r) && (mask == NULL || take_left_out(self, mask, &r))) {
+    if (take_rollout(self, playing, args, &r)) {
         settle_turn(self, playing, &r.turn);
         done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
                report_messages(self);
@@ -113,11 +99,11 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, nargs == MASK + 1 ? nargs : MASK) || !is_prepared(self)) {
+    if (!has_arguments(nargs, MASK) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = roll_out(self, playing, args, nargs > MASK ? args[MASK] : NULL);
+    PyObject *result = roll_out(self, playing, args);
     Py_DECREF(playing);
     return result;
 }

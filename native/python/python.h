@@ -100,13 +100,8 @@ PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t n
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
 PyObject *py_costs(PyObject *object, PyObject *unused);
-PyObject *py_knows_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_bundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_unbundle(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_keep_records(PyObject *object, PyObject *unused);
-PyObject *py_replace_record(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_record_of(PyObject *object, PyObject *index);
-PyObject *py_uses_states(PyObject *object, PyObject *unused);
+PyObject *py_save_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
+PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 PyObject *py_save(PyObject *object, PyObject *unused);
 PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
@@ -115,7 +110,6 @@ PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_seed(PyObject *module, PyObject *args);
 
 PyObject *py_prepare_play(PyObject *object, PyObject *args, PyObject *kwargs);
-PyObject *py_exchange_play(PyObject *object, PyObject *other);
 PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset_by(PyObject *object, PyObject *options);
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

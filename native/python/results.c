@@ -10,41 +10,24 @@ static const char *const NAMES_AT_ENDS[] = {"final_obs", "_final_obs", "final_in
 
 enum { NAMES = sizeof NAMES_AT_ENDS / sizeof *NAMES_AT_ENDS };
 
-/* What is told of the episodes that a reset starts: dicts that are filled when somebody reads them. */
-typedef struct {
-    PyObject *name, *name_of_mask, *no_arguments;
-    PyTypeObject *class;
-    newfunc make;
-    PyObject *unfilled, *slot, *fill, *plan;
-} Telling;
-
 struct Results {
     PyObject *parts;
     PyTypeObject *class;
     allocfunc allocate;
-    Telling telling;
+    PyObject *tell; /* a function: what is told of the episodes that start */
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
-    Form observations, told; /* the second one of infos */
+    Form observations, infos;
     Observed *observed;
-    Infos *infos;
     PyObject *names_at_ends[NAMES];
 };
 
 /* Taking over */
 
-/* The masks of what is told of ends are like the other one. */
-static bool take_further_masks(Results *r) {
-    const Maker *mask = &r->makers[MASK_ARRAY];
-
-    return maker_take_part(&r->makers[FINAL_OBS_MASK], mask, 0) &&
-           maker_take_part(&r->makers[FINAL_INFO_MASK], mask, 0);
-}
-
 static bool take_makers(Results *r, PyObject *shapes) {
-    const Py_ssize_t count = PyTuple_Size(shapes), judged = GIVEN_ARRAYS - MOST_SEEN;
+    const Py_ssize_t count = PyTuple_Size(shapes), judged = RESULT_ARRAYS - MOST_SEEN;
 
-    if (count < judged || count > GIVEN_ARRAYS) {
+    if (count < judged || count > RESULT_ARRAYS) {
         PyErr_SetString(PyExc_ValueError, "results have too few or too many arrays");
         return false;
     }
@@ -57,18 +40,18 @@ static bool take_makers(Results *r, PyObject *shapes) {
             return false;
         }
     }
-    return take_further_masks(r);
+    return true;
 }
 
-static bool take_forms(Results *r, PyObject *observations, PyObject *told) {
+static bool take_forms(Results *r, PyObject *observations, PyObject *infos) {
     if (!form_take(&r->observations, observations, r->number_of_seen) ||
-        !form_take(&r->told, told, r->number_of_seen)) {
+        !form_take(&r->infos, infos, r->number_of_seen)) {
         return false;
     }
-    if (r->told.is_array) {
+    if (r->infos.is_array) {
         PyErr_SetString(PyExc_TypeError, "infos are no array");
     }
-    return !r->told.is_array;
+    return !r->infos.is_array;
 }
 
 static bool take_class(Results *r) {
@@ -80,44 +63,25 @@ static bool take_class(Results *r) {
     return true;
 }
 
-static bool take_telling(Telling *t, PyObject *parts) {
-    if (!PyArg_ParseTuple(parts, "UUO!UUOO;what is told of a reset", &t->name, &t->name_of_mask,
-                          &PyType_Type, &t->class, &t->unfilled, &t->slot, &t->fill, &t->plan)) {
-        return false;
-    }
-    t->make = (newfunc)PyType_GetSlot(t->class, Py_tp_new);
-    t->no_arguments = PyTuple_New(0);
-    if (t->make == NULL || !PyType_IsSubtype(t->class, &PyDict_Type)) {
-        PyErr_SetString(PyExc_TypeError, "what is told of a reset must be a dict");
-        return false;
-    }
-    return t->no_arguments != NULL;
-}
-
 static bool take_ends(Results *r) {
-    const Maker *mask = &r->makers[MASK_ARRAY];
-
     for (size_t i = 0; i < NAMES; i++) {
         r->names_at_ends[i] = PyUnicode_InternFromString(NAMES_AT_ENDS[i]);
         if (r->names_at_ends[i] == NULL) {
             return false;
         }
     }
-    r->observed = observed_take(r->last, r->number_of_seen, mask->size, &r->observations);
-    if (r->observed == NULL) {
-        return false;
-    }
-    r->infos = infos_take(r->makers, r->number_of_seen, mask, &r->told);
-    return r->infos != NULL;
+    r->observed = observed_take(r->last, r->number_of_seen, r->makers[MASK_ARRAY].size,
+                                &r->observations);
+    return r->observed != NULL;
 }
 
 static bool take_parts(Results *r, PyObject *parts) {
-    PyObject *observations, *told, *shapes, *telling;
+    PyObject *observations, *infos, *shapes;
 
-    return PyArg_ParseTuple(parts, "O!OOO!O!;results", &PyType_Type, &r->class, &observations,
-                            &told, &PyTuple_Type, &shapes, &PyTuple_Type, &telling) &&
+    return PyArg_ParseTuple(parts, "O!OOO!O;results", &PyType_Type, &r->class, &observations,
+                            &infos, &PyTuple_Type, &shapes, &r->tell) &&
            take_class(r) && numpy_import() && take_makers(r, shapes) &&
-           take_forms(r, observations, told) && take_telling(&r->telling, telling) && take_ends(r);
+           take_forms(r, observations, infos) && take_ends(r);
 }
 
 Results *results_take(PyObject *parts) {
@@ -142,9 +106,8 @@ void results_free(Results *r) {
         return;
     }
     observed_free(r->observed);
-    infos_free(r->infos);
     form_drop(&r->observations);
-    form_drop(&r->told);
+    form_drop(&r->infos);
     for (size_t i = 0; i < RESULT_ARRAYS; i++) {
         maker_drop(&r->makers[i]);
     }
@@ -154,7 +117,6 @@ void results_free(Results *r) {
     for (size_t i = 0; i < NAMES; i++) {
         Py_XDECREF(r->names_at_ends[i]);
     }
-    Py_XDECREF(r->telling.no_arguments);
     Py_XDECREF(r->parts);
     free(r);
 }
@@ -235,65 +197,46 @@ bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) 
 
 /* Returning */
 
-/* A dict that calls a function, with these arguments, when somebody reads or writes it. */
-static PyObject *late_dict(const Telling *t, PyObject *drawn, PyObject *mask) {
-    PyObject *filling = PyTuple_Pack(4, t->fill, t->plan, drawn, mask);
-    PyObject *dict = filling == NULL ? NULL : t->make(t->class, t->no_arguments, NULL);
+static bool add_starts(const Results *r, PyObject *infos, const ResultArrays *a) {
+    PyObject *told = PyObject_CallFunctionObjArgs(r->tell, a->arrays[DRAWN_ARRAY],
+                                                  a->arrays[MASK_ARRAY], NULL);
+    const bool added = told != NULL && PyDict_Update(infos, told) == 0;
 
-    if (dict != NULL && (PyObject_SetAttr(dict, t->slot, filling) < 0 ||
-                         PyDict_SetItem(dict, t->unfilled, Py_None) < 0)) {
-        Py_CLEAR(dict);
-    }
-    Py_XDECREF(filling);
-    return dict;
+    Py_XDECREF(told);
+    return added;
 }
 
-static bool add_starts(const Telling *t, PyObject *infos, const ResultArrays *a) {
-    PyObject *mask = a->arrays[MASK_ARRAY];
-
-    return set_item(infos, t->name, late_dict(t, a->arrays[DRAWN_ARRAY], mask)) &&
-           PyDict_SetItem(infos, t->name_of_mask, mask) == 0;
+static Origin origin_of(const Results *r, const ResultArrays *a) {
+    return (Origin){r->makers, &r->makers[MASK_ARRAY], a->arrays, a->memory, NULL};
 }
 
-static PyObject *copy_of_mask(Results *r, size_t which, const ResultArrays *a) {
-    char *memory;
-    PyObject *copy = maker_provide(&r->makers[which], &memory);
-
-    if (copy != NULL) {
-        memcpy(memory, a->memory[MASK_ARRAY], r->makers[which].size);
-    }
-    return copy;
-}
-
-static PyObject *final_infos(Results *r, const ResultArrays *a) {
+static PyObject *infos_within(const Origin *origin, const Form *form) {
     PyObject *infos = PyDict_New();
 
-    if (infos != NULL &&
-        !infos_add_masked(r->infos, infos, a->last_memory, a->memory[MASK_ARRAY])) {
+    if (infos != NULL && !infos_add(origin, form, infos)) {
         Py_CLEAR(infos);
     }
     return infos;
 }
 
-static PyObject *final_observations(Results *r, const ResultArrays *a) {
-    return observed_of(r->observed, a->memory[MASK_ARRAY], a->last, a->last_memory);
-}
-
 static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
     PyObject *const *names = r->names_at_ends;
+    const char *mask = a->memory[MASK_ARRAY];
+    Origin origin = origin_of(r, a);
 
-    return set_item(infos, names[0], final_observations(r, a)) &&
-           set_item(infos, names[1], copy_of_mask(r, FINAL_OBS_MASK, a)) &&
-           set_item(infos, names[2], final_infos(r, a)) &&
-           set_item(infos, names[3], copy_of_mask(r, FINAL_INFO_MASK, a));
+    origin.memory = a->last_memory;
+    origin.mask = mask;
+    return set_item(infos, names[0], observed_of(r->observed, mask, a->last, a->last_memory)) &&
+           set_item(infos, names[1], infos_mask(&origin)) &&
+           set_item(infos, names[2], infos_within(&origin, &r->infos)) &&
+           set_item(infos, names[3], infos_mask(&origin));
 }
 
 static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {
-    PyObject *infos = PyDict_New();
+    const Origin origin = origin_of(r, a);
+    PyObject *infos = infos_within(&origin, &r->infos);
 
-    if (infos != NULL &&
-        (!infos_add(r->infos, infos, a->arrays) ||
-         (any_started && (!add_starts(&r->telling, infos, a) || !add_ends(r, infos, a))))) {
+    if (infos != NULL && any_started && (!add_starts(r, infos, a) || !add_ends(r, infos, a))) {
         Py_CLEAR(infos);
     }
     return infos;
@@ -319,10 +262,11 @@ PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
 }
 
 static PyObject *infos_of_reset(Results *r, const ResultArrays *a) {
-    PyObject *infos = PyDict_New();
+    Origin origin = origin_of(r, a);
 
-    if (infos != NULL && (!infos_add_masked(r->infos, infos, a->memory, a->memory[MASK_ARRAY]) ||
-                          !add_starts(&r->telling, infos, a))) {
+    origin.mask = a->memory[MASK_ARRAY];
+    PyObject *infos = infos_within(&origin, &r->infos);
+    if (infos != NULL && !add_starts(r, infos, a)) {
         Py_CLEAR(infos);
     }
     return infos;

@@ -12,9 +12,6 @@ enum {
     TRUNCATED_ARRAY,
     MASK_ARRAY,
     DRAWN_ARRAY,
-    GIVEN_ARRAYS,
-    FINAL_OBS_MASK = GIVEN_ARRAYS,
-    FINAL_INFO_MASK,
     RESULT_ARRAYS
 };
 
@@ -29,9 +26,8 @@ typedef struct {
 
 /* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
  * the shape and type of each array: those of observations and infos, then rewards, terminated,
- * truncated, mask and drawn values; and the parts of a reset's infos: the names of the drawn values
- * and of the mask, and what fmugym.task.values.LateDict.parts returns. Returns NULL with an
- * exception if it does not fit. */
+ * truncated, mask and drawn values; and a function of drawn values and a mask that returns what infos
+ * tell of the episodes that start. Returns NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 

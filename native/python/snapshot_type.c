@@ -1,6 +1,8 @@
 /* The type Snapshot: FMU states that are freed with the last reference. Also the pool's methods
  * for it. */
 
+#include <stdlib.h>
+
 #include "python.h"
 
 PyTypeObject *snapshot_type;
@@ -60,7 +62,7 @@ PyObject *py_save(PyObject *object, PyObject *unused) {
         return PyErr_NoMemory();
     }
     if (!perform(self, NEVER_SHORT, do_save, &saving)) {
-        snapshot_free(saving.snapshot);
+        free(saving.snapshot);
         return NULL;
     }
     PyObject *result =

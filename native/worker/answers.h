@@ -14,12 +14,10 @@ void send_failure(Worker *worker, size_t index);
 /* Whether there is a failure is the first byte. */
 void write_failure(Worker *worker, Writer *writer, size_t index);
 
-/* The answers to requests for snapshots, serialized states and records; see saving.c. */
+/* The answers to requests for snapshots and for states as values; see saving.c. */
 void answer_save(Worker *worker, Reader *reader);
 void answer_restore(Worker *worker, Reader *reader);
-void answer_bundle(Worker *worker, Reader *reader);
-void answer_unbundle(Worker *worker, Reader *reader);
-void answer_record_of(Worker *worker, Reader *reader);
-void answer_replace_record(Worker *worker, Reader *reader);
+void answer_save_states(Worker *worker, Reader *reader);
+void answer_restore_states(Worker *worker, Reader *reader);
 
 #endif

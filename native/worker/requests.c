@@ -4,7 +4,6 @@
 #include <string.h>
 
 #include "../derivatives.h"
-#include "../records.h"
 #include "../texts.h"
 #include "answers.h"
 
@@ -24,13 +23,11 @@ enum {
     REQUEST_SAVE,
     REQUEST_RESTORE,
     REQUEST_WRITE,
-    REQUEST_BUNDLE,
-    REQUEST_UNBUNDLE,
-    REQUEST_RECORD_OF,
+    REQUEST_SAVE_STATES,
+    REQUEST_RESTORE_STATES,
     REQUEST_COUNT_STEPS,
     REQUEST_FAILURE,
     REQUEST_READ,
-    REQUEST_REPLACE_RECORD,
     REQUEST_DIFFERENTIATE,
     REQUEST_TEXT_OF,
     REQUEST_CLOSE,
@@ -258,13 +255,11 @@ bool worker_answer(Worker *w, Reader *reader) {
         [REQUEST_SAVE] = answer_save,
         [REQUEST_RESTORE] = answer_restore,
         [REQUEST_WRITE] = answer_write,
-        [REQUEST_BUNDLE] = answer_bundle,
-        [REQUEST_UNBUNDLE] = answer_unbundle,
-        [REQUEST_RECORD_OF] = answer_record_of,
+        [REQUEST_SAVE_STATES] = answer_save_states,
+        [REQUEST_RESTORE_STATES] = answer_restore_states,
         [REQUEST_COUNT_STEPS] = answer_count_steps,
         [REQUEST_FAILURE] = answer_failure,
         [REQUEST_READ] = answer_read,
-        [REQUEST_REPLACE_RECORD] = answer_replace_record,
         [REQUEST_DIFFERENTIATE] = answer_differentiate,
         [REQUEST_TEXT_OF] = answer_text_of,
         [REQUEST_CLOSE] = answer_close,

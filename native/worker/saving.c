@@ -1,10 +1,9 @@
-/* Requests for snapshots, serialized states and records. */
+/* Requests for snapshots and for states as values. */
 
 #include <stdlib.h>
 #include <string.h>
 
-#include "../bundles.h"
-#include "../records.h"
+#include "../states.h"
 #include "answers.h"
 
 /* Snapshots */
@@ -71,10 +70,10 @@ void worker_release(Worker *w, Reader *reader) {
     }
 }
 
-/* Serialized states */
+/* States as values */
 
-/* Reads a block of integers of 8 bytes; the caller frees them. */
-static int64_t *read_integers(Reader *reader, size_t *count) {
+/* Reads a block of indices; the caller frees them. */
+static int64_t *read_indices(Reader *reader, size_t *count) {
     size_t size;
     const char *bytes = read_block(reader, &size);
     int64_t *numbers = memory_for(NULL, size);
@@ -86,135 +85,75 @@ static int64_t *read_integers(Reader *reader, size_t *count) {
     return numbers;
 }
 
-static bool can_serialize(const Worker *w) {
-    return w->settings.can_save && w->settings.fmi->serialize != NULL;
+static void send_states(const Bytes *all, const int64_t *ends, size_t count) {
+    Writer writer = {.bytes = NULL};
+    int64_t begin = 0;
+
+    for (size_t i = 0; i < count; i++) {
+        write_block(&writer, all->bytes + begin, (size_t)(ends[i] - begin));
+        begin = ends[i];
+    }
+    send_result(&writer);
 }
 
-void answer_bundle(Worker *w, Reader *reader) {
+void answer_save_states(Worker *w, Reader *reader) {
     size_t count;
-    int64_t *indices = read_integers(reader, &count);
+    int64_t *indices = read_indices(reader, &count);
     int64_t *ends = memory_for(NULL, count * sizeof *ends);
-    int64_t *steps = memory_for(NULL, count * sizeof *steps);
-    double *start_times = memory_for(NULL, count * sizeof *start_times);
-    Bundle bundle = {.bytes = NULL};
+    const bool records = read_flag(reader);
+    Bytes all = {.bytes = NULL};
 
-    if (!can_serialize(w) || !reader->sound) {
-        send_error("the FMU cannot serialize its state");
+    if (!reader->sound) {
+        send_error("a list of instances is damaged");
     } else {
         pool_enter(&w->pool);
-        const ptrdiff_t failed =
-            pool_bundle(&w->pool, indices, count, &bundle, ends, steps, start_times);
+        const ptrdiff_t failed = pool_save_states(&w->pool, indices, count, records, &all, ends);
         pool_leave(&w->pool);
         worker_report(w);
         if (failed >= 0) {
             send_failure(w, (size_t)failed);
         } else {
-            Writer writer = {.bytes = NULL};
-            write_block(&writer, bundle.bytes, bundle.size);
-            write_block(&writer, ends, count * sizeof *ends);
-            write_block(&writer, steps, count * sizeof *steps);
-            write_block(&writer, start_times, count * sizeof *start_times);
-            send_result(&writer);
+            send_states(&all, ends, count);
         }
     }
-    free(bundle.bytes);
+    free(all.bytes);
     free(indices);
     free(ends);
-    free(steps);
-    free(start_times);
 }
 
-void answer_unbundle(Worker *w, Reader *reader) {
-    size_t count, sources, size;
-    int64_t *indices = read_integers(reader, &count);
-    States states = {.sources = read_integers(reader, &sources)};
+/* Reads a state for each of some instances; the caller frees them. Returns NULL if one is damaged. */
+static State *read_states(Worker *w, Reader *reader, size_t count) {
+    State *states = memory_for(NULL, count * sizeof *states);
+    bool sound = count <= w->settings.count;
 
-    states.ends = read_integers(reader, &states.count);
-    states.steps = read_integers(reader, &size);
-    int64_t *start_times = read_integers(reader, &size); /* of the same size as float64 */
-    int64_t *outputs = read_integers(reader, &size);
-    states.start_times = (const double *)start_times;
-    states.outputs = (const double *)outputs;
-    states.bytes = read_block(reader, &size);
-    if (!can_serialize(w) || !reader->sound || count > w->settings.count) {
-        send_error("the FMU cannot restore a serialized state");
+    for (size_t i = 0; i < count && sound; i++) {
+        states[i].bytes = read_block(reader, &states[i].size);
+        sound = reader->sound && state_is_sound(&w->pool, states[i]);
+    }
+    if (!sound) {
+        free(states);
+    }
+    return sound ? states : NULL;
+}
+
+void answer_restore_states(Worker *w, Reader *reader) {
+    size_t count;
+    int64_t *indices = read_indices(reader, &count);
+    State *states = read_states(w, reader, count);
+
+    if (states == NULL) {
+        send_error("the FMU cannot restore a state");
     } else {
         pool_enter(&w->pool);
         for (size_t i = 0; i < count; i++) {
             w->pool.chosen[i] = (uint32_t)indices[i];
         }
-        pool_unbundle(&w->pool, &states, count);
+        pool_restore_states(&w->pool, states, count);
         pool_leave(&w->pool);
         worker_report(w);
         worker_publish(w);
         send_done();
     }
+    free(states);
     free(indices);
-    free(states.sources);
-    free(states.ends);
-    free(states.steps);
-    free(start_times);
-    free(outputs);
-}
-
-/* Records */
-
-static void write_record(Writer *writer, const Record *record, size_t width) {
-    write_integer(writer, (int64_t)record->number_of_starts);
-    for (size_t i = 0; i < record->number_of_starts; i++) {
-        write_integer(writer, record->starts[i].type);
-        write_integer(writer, record->starts[i].reference);
-        write_integer(writer, record->starts[i].place);
-        write_number(writer, record->starts[i].value);
-    }
-    write_integer(writer, (int64_t)record->rows);
-    write_bytes(writer, record->inputs, record->rows * width * sizeof(double));
-}
-
-/* Without a whole record the answer is empty. */
-void answer_record_of(Worker *w, Reader *reader) {
-    const size_t index = (size_t)read_integer(reader);
-    Writer writer = {.bytes = NULL};
-    Record record;
-
-    if (index >= w->settings.count || !record_is_whole(&w->pool, index)) {
-        send_result(&writer);
-        return;
-    }
-    if (record_copy(&w->pool, index, &record)) {
-        write_record(&writer, &record, w->settings.inputs->count);
-        send_result(&writer);
-    } else {
-        send_error("out of memory");
-    }
-    record_clear(&record);
-}
-
-void answer_replace_record(Worker *w, Reader *reader) {
-    const size_t index = (size_t)read_integer(reader), rows = (size_t)read_integer(reader);
-    const size_t width = w->settings.inputs->count;
-    Access start;
-
-    if (!read_access(reader, w->settings.fmi, &start)) {
-        send_error("a list of variables is damaged");
-        return;
-    }
-    size_t values, size;
-    int64_t *starts = read_integers(reader, &values); /* of the same size as float64 */
-    int64_t *inputs = read_integers(reader, &size);
-    if (reader->sound && index < w->settings.count && values == start.count &&
-        size == rows * width) {
-        pool_enter(&w->pool);
-        record_begin(&w->pool, index, &start, (const double *)starts);
-        for (size_t row = 0; row < rows; row++) {
-            record_add(&w->pool, index, (const double *)inputs + row * width);
-        }
-        pool_leave(&w->pool);
-        send_done();
-    } else {
-        send_error("a record is damaged");
-    }
-    free(starts);
-    free(inputs);
-    access_close(&start);
 }

@@ -224,24 +224,11 @@ class BackendPool(CountedPool):
         self.step(None, None, self.observations)
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
-    def save(self) -> Any:
-        """Refuse: a real system cannot return to a state."""
-        raise self._stateless("saved")
-
     def save_instances(self, indices: IndexArray) -> Bundle:
-        """Refuse, as ``save`` does."""
-        raise self._stateless("saved")
-
-    def restore(
-        self, snapshot: Any, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
         """Refuse: a real system cannot return to a state."""
-        raise self._stateless("restored")
-
-    def _stateless(self, done: str) -> SimulationError:
         if self._is_real:
-            return SimulationError(f"a backend has no states that could be {done}")
-        return SimulationError(f"states are {done} by the C extension only (backend='native')")
+            raise SimulationError("a backend has no states that could be saved")
+        raise SimulationError("states are saved by the C extension only (backend='native')")
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

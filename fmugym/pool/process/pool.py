@@ -33,7 +33,7 @@ from fmugym.pool.base import (
     StatusArray,
     available_processors,
 )
-from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.health import HealthArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
@@ -41,7 +41,7 @@ from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
 from fmugym.pool.process.worker import Setup
-from fmugym.pool.saving import SavingPool, Serialized
+from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
@@ -292,7 +292,7 @@ class ProcessPool(SavingPool):
             self._step(skip)
 
     def save(self) -> SnapshotOfWorkers:
-        """See ``Pool.save``."""
+        """See ``SavingPool.save``."""
         with self._lock:
             self._require_present()
             snapshot = self._states.save()
@@ -302,7 +302,7 @@ class ProcessPool(SavingPool):
     def restore(
         self, snapshot: SnapshotOfWorkers, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.restore``; a state is lost with the process that saved it."""
+        """See ``SavingPool.restore``; a state is lost with the process that saved it."""
         mask = self._as_mask(mask)
         self._states.require_own(snapshot)
         with self._lock:
@@ -320,25 +320,16 @@ class ProcessPool(SavingPool):
                 lambda s: s.tell("write", variables, np.ascontiguousarray(values[:, s.block])),
             )
 
-    def serialize_states(self, indices: IndexArray) -> Serialized:
-        """See ``SavingPool.serialize_states``; lost instances get empty states."""
+    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+        """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
-            return self._states.serialize(indices, self._spec.start_time)
+            start_time = self._spec.start_time
+            return self._states.save_states(indices, records, start_time, self.outputs)
 
-    def deserialize_states(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        """See ``SavingPool.deserialize_states``; a lost worker is replaced."""
+    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+        """See ``SavingPool.restore_states``; a lost worker is replaced."""
         with self._lock:
-            self._states.deserialize(bundle, sources, indices)
-
-    def record_of(self, index: int) -> Record | None:
-        """See ``SavingPool.record_of``."""
-        with self._lock:
-            return self._states.record_of(index)
-
-    def replace_record(self, index: int, record: Record) -> None:
-        """See ``SavingPool.replace_record``."""
-        with self._lock:
-            self._states.replace_record(index, record)
+            self._states.restore_states(states, indices)
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""

@@ -1,17 +1,15 @@
-"""The states and records of instances in worker processes, saved and restored block by block."""
+"""The states of instances in worker processes, saved and restored block by block."""
 
 from __future__ import annotations
 
 import weakref
-
-import numpy as np
+from collections.abc import Sequence
 
 from fmugym.errors import SimulationError
-from fmugym.pool.base import MaskArray
-from fmugym.pool.bundle import Bundle, IndexArray, Record, joined
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.bundle import IndexArray, ended_state
 from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.supervisor import Supervisor
-from fmugym.pool.saving import Serialized
 
 __all__ = ["SnapshotOfWorkers", "StatesOfWorkers"]
 
@@ -70,33 +68,34 @@ class StatesOfWorkers:
         )
         self._crew.note_lost()
 
-    def serialize(self, indices: IndexArray, start_time: float) -> Serialized:
-        """Serialize instances; those that are lost get empty states at the start time."""
+    def save_states(
+        self, indices: IndexArray, records: bool, start_time: float, outputs: FloatArray
+    ) -> list[bytes]:
+        """Save instances; the episodes of those that are lost have ended with these outputs."""
+        states = {
+            index: ended_state(start_time, outputs[:, index])
+            for index in indices[self._crew.lost[indices]].tolist()
+        }
         parts = self._by_worker(indices[~self._crew.lost[indices]])
         replies = self._crew.run(
-            "saving states", list(parts), lambda s: s.tell("bundle", _within(s, parts[s]))
+            "saving states",
+            list(parts),
+            lambda s: s.tell("save_states", _within(s, parts[s]), records),
         )
-        states: dict[int, tuple[bytes, int, float]] = {}
-        for supervisor, (data, ends, steps, times) in replies.items():
-            one = Bundle(np.zeros((0, len(ends))), steps, times, data, ends)
-            for place, index in enumerate(parts[supervisor].tolist()):
-                states[index] = one.state(place), int(steps[place]), float(times[place])
-        lost = b"", 0, start_time
-        found = [states.get(index, lost) for index in indices.tolist()]
-        data, ends = joined(state for state, *_ in found)
-        steps = np.array([steps for _, steps, _ in found], np.int64)
-        return data, ends, steps, np.array([time for *_, time in found], np.float64)
+        for supervisor, reply in replies.items():
+            states.update(zip(parts[supervisor].tolist(), reply, strict=True))
+        return [states[index] for index in indices.tolist()]
 
-    def deserialize(self, bundle: Bundle, sources: IndexArray, indices: IndexArray) -> None:
-        """Restore instances from serialized states; a lost worker is replaced."""
+    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+        """Restore instances; a lost worker is replaced."""
         parts = self._by_worker(indices)
-        places = {int(index): int(source) for index, source in zip(indices, sources, strict=True)}
+        state_of = dict(zip(indices.tolist(), states, strict=True))
         alive = self._crew.revive(parts)
 
         def tell(supervisor: Supervisor) -> None:
             wanted = parts[supervisor]
-            states = bundle.take([places[index] for index in wanted.tolist()])
-            supervisor.tell("unbundle", states, _within(supervisor, wanted))
+            own = [state_of[index] for index in wanted.tolist()]
+            supervisor.tell("restore_states", own, _within(supervisor, wanted))
 
         for supervisor in self._crew.run("restoring states", alive, tell):
             supervisor.note_success()
@@ -109,20 +108,6 @@ class StatesOfWorkers:
             s: (indices >= s.block.start) & (indices < s.block.stop) for s in self._crew.supervisors
         }
         return {s: indices[own] for s, own in blocks.items() if own.any()}
-
-    def record_of(self, index: int) -> Record | None:
-        """The record of an instance; None if its worker has ended."""
-        supervisor = self._crew.of(index)
-        within = index - supervisor.block.start
-        replies = self._crew.run("a question", [supervisor], lambda s: s.tell("record_of", within))
-        record: Record | None = replies.get(supervisor)
-        return record
-
-    def replace_record(self, index: int, record: Record) -> None:
-        """Give an instance another record."""
-        supervisor = self._crew.of(index)
-        within = index - supervisor.block.start
-        self._crew.run("a change", [supervisor], lambda s: s.tell("replace_record", within, record))
 
 
 def _within(supervisor: Supervisor, indices: IndexArray) -> IndexArray:

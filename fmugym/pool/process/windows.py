@@ -19,23 +19,21 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.pool.bundle import Bundle, IndexArray, Record, SaveMethod
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.process.channel import Code
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
 from fmugym.pool.process.worker import Setup
 from fmugym.pool.reports import Failure, as_record, describe_failure, loading_failed
-from fmugym.pool.saving import Serialized, offered_method
+from fmugym.pool.saving import keeps_records
 from fmugym.pool.settings import (
     PlaceOfFMU,
     experiment_settings,
     library_settings,
     listing,
     manner_of,
-    record_from,
     solving_settings,
     variable_settings,
 )
-from fmugym.pool.spec import start_variables
 from fmugym.wine.loader import windows_path
 
 __all__ = ["REQUESTS", "ProgramCoding"]
@@ -45,13 +43,11 @@ REQUESTS: Final = (
     "save",
     "restore",
     "write",
-    "bundle",
-    "unbundle",
-    "record_of",
+    "save_states",
+    "restore_states",
     "count_steps",
     "failure",
     "read",
-    "replace_record",
     "differentiate",
     "text_of",
     "close",
@@ -130,9 +126,6 @@ class _Reader:
 
     def text(self) -> str:
         return self.block().decode(errors="replace")
-
-    def indices(self) -> IndexArray:
-        return np.frombuffer(self.block(), np.int64)
 
     def rest(self) -> bytes:
         return self._take(len(self._data) - self._place)
@@ -227,14 +220,13 @@ class ProgramCoding:
         writer.integers(description.fmi_major_version, manner_of(description, spec))
         _write_solving(writer, solving_settings(description, spec))
         _write_library(writer, library_settings(description, spec, place), setup.log_level)
-        experiment = experiment_settings(spec)
+        experiment = experiment_settings(spec, records=keeps_records(description, spec))
         _write_experiment(writer, experiment)
         writer.access(spec.inputs, description.fmi_major_version)
         writer.access(spec.outputs, description.fmi_major_version)
         _write_variables(writer, variable_settings(spec))
         writer.block(experiment["start_outputs"] or b"")
         writer.integers(setup.block.stop - setup.block.start, setup.threads)
-        writer.flags(spec.records or offered_method(description, spec) is not SaveMethod.STATE)
         self._write_memory(writer, setup)
 
     def _write_memory(self, writer: _Writer, setup: Setup) -> None:
@@ -284,42 +276,22 @@ class ProgramCoding:
         writer.access(variables, self._version)
         writer.values(values, np.float64)
 
-    def _ask_bundle(self, writer: _Writer, indices: IndexArray) -> None:
+    def _ask_save_states(self, writer: _Writer, indices: IndexArray, records: bool) -> None:
         writer.block(np.ascontiguousarray(indices, np.int64).tobytes())
+        writer.flags(records)
 
-    def _answer_bundle(self, reader: _Reader, _: IndexArray) -> Serialized:
-        data, ends, steps = reader.block(), reader.indices(), reader.indices()
-        return data, ends, steps, np.frombuffer(reader.block(), np.float64)
+    def _answer_save_states(self, reader: _Reader, *_: Any) -> list[bytes]:
+        states = []
+        while not reader.is_done:
+            states.append(reader.block())
+        return states
 
-    def _ask_unbundle(self, writer: _Writer, bundle: Bundle, indices: IndexArray) -> None:
-        sources = np.arange(len(indices))
-        for numbers in (indices, sources, bundle.ends, bundle.steps):
-            writer.block(np.ascontiguousarray(numbers, np.int64).tobytes())
-        for values in (bundle.start_times, bundle.outputs):
-            writer.block(np.ascontiguousarray(values, np.float64).tobytes())
-        writer.block(bundle.data)
-
-    def _ask_record_of(self, writer: _Writer, index: int) -> None:
-        writer.integers(index)
-
-    def _answer_record_of(self, reader: _Reader, _: int) -> Record | None:
-        if reader.is_done:
-            return None
-        starts = [
-            (reader.integer(), reader.integer(), reader.integer(), reader.number())
-            for _ in range(reader.integer())
-        ]
-        steps = reader.integer()
-        setup = self._setup
-        return record_from(setup.description, setup.spec, starts, steps, reader.rest())
-
-    def _ask_replace_record(self, writer: _Writer, index: int, record: Record) -> None:
-        find = self._setup.description.variable
-        variables = start_variables(find, record.names, record.texts)
-        writer.integers(index, len(record.inputs))
-        writer.access(variables, self._version)
-        for values in (record.starts, record.inputs):
-            writer.block(np.ascontiguousarray(values, np.float64).tobytes())
+    def _ask_restore_states(
+        self, writer: _Writer, states: Sequence[bytes], indices: IndexArray
+    ) -> None:
+        writer.block(np.ascontiguousarray(indices, np.int64).tobytes())
+        for state in states:
+            writer.block(state)
 
     def _ask_failure(self, writer: _Writer, index: int) -> None:
         writer.integers(index)
@@ -397,7 +369,7 @@ def _write_experiment(writer: _Writer, experiment: Mapping[str, Any]) -> None:
     writer.optional(experiment["tolerance"])
     writer.numbers(experiment["time_step"])
     writer.integers(*(experiment[name] for name in ("substeps", "warm_up_steps", "retries")))
-    names = ("restores", "rebuilds", "reloads", "one_initialization")
+    names = ("restores", "rebuilds", "reloads", "one_initialization", "records")
     writer.flags(*(experiment[name] for name in names))
 
 

@@ -13,7 +13,7 @@ import shutil
 import signal
 import socket
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,13 +30,13 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, FMULoadError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.pool.bundle import Bundle, IndexArray, Record
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.health import HealthArray
 from fmugym.pool.leaks import ProcessGrowth
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.channel import Channel, Code
 from fmugym.pool.process.shared_memory import Memory, make_arrays, make_echo, make_progress
-from fmugym.pool.saving import SavingPool, Serialized
+from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import Ignoring, ordinary
 from fmugym.systems.description import SystemDescription
@@ -279,13 +279,13 @@ class BlockWorker:
         return self._growth.after(int(np.count_nonzero(mask)))
 
     def save(self) -> int:
-        """See ``Pool.save``; the snapshot stays here, and its number is returned."""
+        """See ``SavingPool.save``; the snapshot stays here, and its number is returned."""
         number = next(self._numbers)
         self._snapshots[number] = self._pool.save()
         return number
 
     def restore(self, number: int, mask: MaskArray | None) -> None:
-        """See ``Pool.restore``."""
+        """See ``SavingPool.restore``."""
         self._pool.restore(self._snapshots[number], mask)
         self._publish()
 
@@ -293,22 +293,14 @@ class BlockWorker:
         """See ``Pool.write``."""
         self._pool.write(variables, values)
 
-    def bundle(self, indices: IndexArray) -> Serialized:
-        """See ``SavingPool.serialize_states``."""
-        return self._pool.serialize_states(indices)
+    def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
+        """See ``SavingPool.save_states``."""
+        return self._pool.save_states(indices, records)
 
-    def unbundle(self, bundle: Bundle, indices: IndexArray) -> None:
-        """See ``SavingPool.deserialize_states``; instance i of the indices gets the state i."""
-        self._pool.deserialize_states(bundle, np.arange(len(indices)), indices)
+    def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
+        """See ``SavingPool.restore_states``."""
+        self._pool.restore_states(states, indices)
         self._publish()
-
-    def record_of(self, index: int) -> Record | None:
-        """See ``SavingPool.record_of``."""
-        return self._pool.record_of(index)
-
-    def replace_record(self, index: int, record: Record) -> None:
-        """See ``SavingPool.replace_record``."""
-        self._pool.replace_record(index, record)
 
     def roll_out(
         self, play: Play | None, departure: Departure

@@ -27,7 +27,7 @@ from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import conclude
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.task.warm_up import WarmUps, grouped
+from fmugym.task.warm_up import WarmUps
 from fmugym.vector.actions import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
@@ -213,7 +213,7 @@ class BatchEngine(Engine):
         try:
             observations = self._observe()
             self._require_finite_start(observations, mask)
-            return observations, self._infos(mask) | drawn_info(plan, drawn, mask)
+            return observations, self._infos(mask) | drawn_info(plan, drawn, mask.copy())
         finally:
             self.env._in_hooks = False
             self.note_starts(mask)
@@ -228,7 +228,7 @@ class BatchEngine(Engine):
             )
 
     def _begin(self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
-        """Draw and start episodes; return the values, shape (draws, M)."""
+        """Draw and start episodes; return the values, shape (draws, N)."""
         drawn = self._streams.draw(plan, indices)
         values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
@@ -238,7 +238,9 @@ class BatchEngine(Engine):
             self._forget(indices, plan)
         else:
             self._begin_with_warm_up(warm_ups, indices, plan, values)
-        return drawn
+        drawn_by_all = np.zeros((len(drawn), self._n))
+        drawn_by_all[:, indices] = drawn
+        return drawn_by_all
 
     def _reset_pool(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, values: FloatArray
@@ -259,10 +261,8 @@ class BatchEngine(Engine):
             found = warm_ups.find(pool, plan.model_variables, values, rows, left)
             first = warm_ups.distinct(index for index in left if index not in found)
             self._warm_up(warm_ups, np.array(first, np.intp), plan, values)
-            warm_ups.restore(pool, found)
-            for warmed, where in grouped(found):
-                columns = [np.asarray(value)[..., None] for value in warmed.variables.values()]
-                self._place(warmed.variables, columns, where)
+            for variables, where in warm_ups.restore(pool, found):
+                self._place(variables, [v[..., None] for v in variables.values()], where)
             left = [index for index in left if index not in found and index not in first]
         env.previous_state[:, indices] = env.state[:, indices]
 
@@ -347,7 +347,7 @@ class BatchEngine(Engine):
 
     def columns(self, indices: IndexArray) -> Columns:
         """See ``Engine.columns``."""
-        return columns_of(self.env, self.env.parameters, indices) | {
+        return columns_of(self.env, indices) | {
             "ended": self.ended[indices],
             **dict(zip(("streams", "seeds"), self._streams.taken(indices), strict=True)),
         }
@@ -422,7 +422,7 @@ class BatchEngine(Engine):
                 return self._evaluate(observed, None)
             env.step_count[resetting] = 0
             result = self._evaluate(observed, resetting)
-            result.infos.update(drawn_info(env._plan, drawn, resetting))
+            result.infos.update(drawn_info(env._plan, drawn, resetting.copy()))
             return result
         finally:
             env._in_hooks = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,8 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.extension import require_refusal
 from fmugym.signals import ordinary
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.episode import EpisodePlan
 from fmugym.task.readings import Readings
-from fmugym.task.values import LateDict
 from fmugym.vector.actions import checked_actions
-from fmugym.vector.codec import coded
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.engines.batch import BatchEngine
 from fmugym.vector.engines.layout import Layout
@@ -26,10 +24,7 @@ from fmugym.vector.engines.memory import Memory
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.infos import (
-    not_finite,
-    restricted,
-)
+from fmugym.vector.infos import drawn_info, not_finite, restricted
 from fmugym.vector.streams import given_draws
 
 __all__ = ["CompiledEngine"]
@@ -88,7 +83,7 @@ class CompiledEngine(BatchEngine):
         self._resets_at_once = not (self._resets_apart or self._draws_ahead)
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, (self._drawn_shape, real)
-        told = "drawn", "_drawn", *LateDict.parts(_told, plan)
+        tell = partial(drawn_info, plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             memory.programs(task),
@@ -96,7 +91,7 @@ class CompiledEngine(BatchEngine):
             self._start_values,
             (given_draws(plan) if draws is None else draws, streams.states),
             (self.env.step_count, self.ended, self._limit),
-            memory.surroundings(task, (StepResult, *layout.form, arrays, told)),
+            memory.surroundings(task, (StepResult, *layout.form, arrays, tell)),
         )
         self._play_with_resets = self._pool.watched(self._play)
         if not self._resets_apart:
@@ -135,7 +130,7 @@ class CompiledEngine(BatchEngine):
         drawn = self._draw_ahead(mask) if self._draws_ahead else np.empty(self._drawn_shape)
         self.has_moved = True
         troubled, self.any_ended = self._start(mask, seen, drawn)
-        infos = _start_infos(self.env._plan, drawn, mask)
+        infos = drawn_info(self.env._plan, drawn, mask)
         if self._divided is not None:
             seen, told = self._divided(seen)
             infos = restricted(told, mask) | infos
@@ -224,7 +219,7 @@ class CompiledEngine(BatchEngine):
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
         if resetting is not None:
-            result.infos.update(_start_infos(self.env._plan, drawn, resetting))
+            result.infos.update(drawn_info(self.env._plan, drawn, resetting))
         if troubled or self._left:
             return self._completed(result, troubled, resetting, started)
         return result
@@ -395,11 +390,3 @@ class CompiledEngine(BatchEngine):
 
 def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
     return np.empty((horizon, *array.shape), array.dtype)
-
-
-def _start_infos(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
-
-
-def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    return coded(plan.shown(drawn), mask)
