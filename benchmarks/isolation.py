@@ -60,7 +60,7 @@ def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[An
     for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
         env = make_with_pool(make_env, count, threads=1, **options)
         stack.callback(env.close)
-        plan = env._plan
+        plan = env.inside.plan
         pools.append(env._pool)
         env._pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], count, axis=1))
     return pools

@@ -215,13 +215,13 @@ def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
 
 def _call_hooks(env: Any) -> None:
     """Call the hooks of a step that follow the FMU's."""
-    own = env._own
+    own = env.inside.own
     if own.update:
         env._update()
     env._is_done()
     if own.is_truncated:
         env._is_truncated()
-    if env._pool_observes:
+    if env.inside.pool_observes:
         env._reward_policy()
     else:
         env._reward_and_observation()

@@ -76,7 +76,7 @@ def _pool(stack: ExitStack, path: Path, size: int) -> Any:
         lambda: PushedCartPoleEnv(path), size, isolation="process", workers=1, threads=1
     )
     stack.callback(env.close)
-    plan = env._plan
+    plan = env.inside.plan
     env._pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], size, axis=1))
     return env._pool
 

@@ -164,12 +164,12 @@ class FMUEnv(Constructed):
     # Gymnasium's interface.
 
     def __repr__(self) -> str:
-        if "_spec" not in vars(self):  # the constructor has not come that far
+        if not hasattr(self.inside, "spec"):  # the constructor has not come that far
             return object.__repr__(self)
         inputs, outputs = self.config.model_input_names, self.config.model_output_names
         return (
             f"<{type(self).__name__} of {self.fmu.path.name}: {shortened(inputs)} -> "
-            f"{shortened(outputs)} every {self._spec.time_step:g} s>"
+            f"{shortened(outputs)} every {self.inside.spec.time_step:g} s>"
         )
 
     def reset(
@@ -201,25 +201,25 @@ class FMUEnv(Constructed):
         """
         check_misplaced(misplaced)
         pool = self._open_pool("reset")
-        if not self._was_reset:
+        if not self.inside.was_reset:
             self._prepare_hooks()  # the constructor of the class may have set some as attributes
             self._require_way(pool)
         seed, plan = check_seed(seed), self._plan_of_reset(options)
         super().reset(seed=seed)
         generator = self._np_random
         episode = plan.draw(self.np_random if generator is None else generator)
-        self._ended = True  # there is no episode if the FMU fails
+        self.inside.ended = True  # there is no episode if the FMU fails
         try:
-            if self._warm_ups is None:
+            if self.inside.warm_ups is None:
                 self._reset_pool(pool, plan, episode)
                 self._begin_episode(episode)
             else:
-                self._begin_with_warm_up(self._warm_ups, pool, plan, episode)
+                self._begin_with_warm_up(self.inside.warm_ups, pool, plan, episode)
             observation, info = self._observation_and_info()
             if not self._has_chosen:
                 self._choose_player(pool)
         except BaseException:
-            self._ended = True
+            self.inside.ended = True
             self._halt()
             raise
         info["drawn"] = episode.drawn
@@ -248,16 +248,16 @@ class FMUEnv(Constructed):
         else:
             written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
             variables = {name: row[..., 0] for name, row in written.items()}
-        read = self._readings
+        read = self.inside.readings
         read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
         read.inputs = tuple(self._input_row.tolist())
         read.values = tuple(self._output_row.tolist())
-        read.state = read.previous_state = read.values[: self._output_count]
+        read.state = read.previous_state = read.values[: self.inside.output_count]
 
     def _obstacle(self, pool: Pool) -> str | None:
         """What keeps the pool from calling hooks, whatever they compute."""
-        if self._own.step or self._own.reset:
-            return f"{'step' if self._own.step else 'reset'} is overridden"
+        if self.inside.own.step or self.inside.own.reset:
+            return f"{'step' if self.inside.own.step else 'reset'} is overridden"
         if not pool.plays_alone or pool.num_instances > 1:
             return "the pool is not a native one of its own"
         return None
@@ -276,28 +276,28 @@ class FMUEnv(Constructed):
 
     def _begin_episode(self, episode: Episode) -> None:
         self._keep_readings()
-        read = self._readings
+        read = self.inside.readings
         read.parameters = episode.parameters
         read.variables.update(episode.variables)
         read.step_count = 0
-        read.action = read.previous_action = self._no_action
+        read.action = read.previous_action = self.inside.no_action
         given = episode.parameters.get
-        read.inputs = tuple([given(name, start) for name, start in self._start_inputs])
+        read.inputs = tuple([given(name, start) for name, start in self.inside.start_inputs])
         read.done = read.after_end = False
         read.values = tuple(self._output_row.tolist())
-        read.state = read.previous_state = read.values[: self._output_count]
+        read.state = read.previous_state = read.values[: self.inside.output_count]
         self._last_reward, self._return = None, 0.0
-        self._was_reset, self._ended = True, False
+        self.inside.was_reset, self.inside.ended = True, False
 
     def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
-        self._in_hooks = True
+        self.inside.in_hooks = True
         try:
             observation = self._get_observation()
-            if not self._is_finite(observation):
+            if not self.inside.is_finite(observation):
                 raise SimulationError(f"the first observation is not finite: {shown(observation)}")
             return observation, self._info()
         finally:
-            self._in_hooks = False
+            self.inside.in_hooks = False
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -319,15 +319,15 @@ class FMUEnv(Constructed):
         """
         player = self._player
         if player is not None:
-            result = None if self._ended else self._step_compiled(player, action)
+            result = None if self.inside.ended else self._step_compiled(player, action)
             if result is not None:
                 return result
             self._keep_readings()
-        read = self._readings
+        read = self.inside.readings
         pool = self._pool
-        if pool is None or self._ended:
+        if pool is None or self.inside.ended:
             pool = self._checked_before_step()
-        self._in_hooks = True
+        self.inside.in_hooks = True
         try:
             self._take_action(action)
             try:
@@ -335,27 +335,27 @@ class FMUEnv(Constructed):
                 read.step_count += 1
                 result = self._conclude(pool, pool.statuses.item(0) if troubled else 0)
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
-                self._ended = True
+                self.inside.ended = True
                 raise
         except BaseException:  # a real system must not go on without its controller
             self._halt()
             raise
         finally:
-            self._in_hooks = False
+            self.inside.in_hooks = False
         if self.render_mode is not None:
             self._note_for_picture(result[1])
         return result
 
     def _step_compiled(self, player: Any, action: Any) -> Result | None:
         """Let the pool do the whole step; None if Python must do it."""
-        if self._readings is not player.readings and not player.take_over(self):
+        if self.inside.readings is not player.readings and not player.take_over(self):
             return None
         try:
             result = player.step(action, self.__dict__)
             if result is None and player.renew(self) and player.take_over(self):
                 result = player.step(action, self.__dict__)
         except BaseException:  # as in ``step``
-            self._ended = True
+            self.inside.ended = True
             self._halt()
             raise
         if result is None:
@@ -365,7 +365,7 @@ class FMUEnv(Constructed):
         if not result:
             return self._judged_again()
         if result[2] or result[3]:
-            self._ended = True
+            self.inside.ended = True
         if self.render_mode is not None:
             self._note_for_picture(result[1])
         step: Result = result
@@ -376,7 +376,7 @@ class FMUEnv(Constructed):
     ) -> Result | None:
         """Call the hooks that are not compiled; None if they make what is not finite."""
         left = self._player.left
-        self._in_hooks = True
+        self.inside.in_hooks = True
         try:
             if "_is_truncated" in left:
                 truncated = as_flag("_is_truncated", self._is_truncated()) | truncated
@@ -387,41 +387,41 @@ class FMUEnv(Constructed):
             elif "_get_observation" in left:
                 observation = self._get_observation()
             reward = as_reward(reward)
-            if not (isfinite(reward) and self._is_finite(observation)):
+            if not (isfinite(reward) and self.inside.is_finite(observation)):
                 return None
             if "_get_info" in left:
                 info = self._info()
         except BaseException:  # as in ``step``
-            self._ended = True
+            self.inside.ended = True
             self._halt()
             raise
         finally:
-            self._in_hooks = False
+            self.inside.in_hooks = False
         return observation, reward, terminated, truncated, info
 
     def _judged_again(self) -> Result:
         """Judge a step in Python: its status or a number is not good, or a hook raises."""
         self._player.go_back(self)
-        if self._pool_observes:
+        if self.inside.pool_observes:
             with np.errstate(over="ignore"):  # what is infinite then is a fault
-                self._observation_row[:] = self._output_row[: self._output_count]
-        self._in_hooks = True
+                self.inside.observation_row[:] = self._output_row[: self.inside.output_count]
+        self.inside.in_hooks = True
         try:
             pool = self._open_pool("step")
             result = self._conclude(pool, pool.statuses.item(0))
         except BaseException:  # as in ``step``
-            self._ended = True
+            self.inside.ended = True
             self._halt()
             raise
         finally:
-            self._in_hooks = False
+            self.inside.in_hooks = False
         if self.render_mode is not None:
             self._note_for_picture(result[1])
         return result
 
     def _checked_before_step(self) -> Pool:
         pool = self._open_pool("step")
-        if not self._was_reset:
+        if not self.inside.was_reset:
             raise SimulationError("step was called before the first reset")
         if not self.steps_after_end:
             raise SimulationError("step was called after the end of the episode; call reset first")
@@ -431,19 +431,19 @@ class FMUEnv(Constructed):
         return pool
 
     def _take_action(self, action: Any) -> None:
-        elements = self._elements
+        elements = self.inside.elements
         if elements is None or type(action) not in _INTEGERS or action not in elements:
             self._require_usable(action)
         self._take_usable(action)
-        self._input_writer.write(self._readings.inputs, self._input_row)
+        self.inside.input_writer.write(self.inside.readings.inputs, self._input_row)
 
     def _take_usable(self, action: Any) -> None:
         """Make the inputs for an action that was checked already."""
-        read = self._readings
+        read = self.inside.readings
         before = read.action, read.previous_action, read.previous_state, read.inputs
         read.previous_action, read.previous_state, read.action = read.action, read.state, action
         try:
-            read.inputs = self._input_writer.checked(self._get_inputs(), action)
+            read.inputs = self.inside.input_writer.checked(self._get_inputs(), action)
         except BaseException as error:  # the FMU was not touched: a better action may follow
             self._give_up(before)
             blaming = self._blame(action, error)
@@ -457,11 +457,11 @@ class FMUEnv(Constructed):
         Args:
             before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
         """
-        read = self._readings
+        read = self.inside.readings
         read.action, read.previous_action, read.previous_state, read.inputs = before
 
     def _require_usable(self, action: Any) -> None:
-        elements = self._elements
+        elements = self.inside.elements
         if elements is not None:
             if not is_element(action, elements):
                 raise ConfigError(f"action {shown(action)} is not in {self.action_space}")
@@ -472,7 +472,7 @@ class FMUEnv(Constructed):
         """The error if ``_get_inputs`` failed because of an action outside of the action space."""
         if isinstance(error, FMUGymError) or not isinstance(error, Exception):
             return None
-        if self._own.step or not is_misfit(action, self.action_space, error):
+        if self.inside.own.step or not is_misfit(action, self.action_space, error):
             return None  # with a step of its own, its actions may be others
         return ConfigError(f"action {shown(action)} is not in {self.action_space}: {shown(error)}")
 
@@ -493,36 +493,36 @@ class FMUEnv(Constructed):
             stopped = status == _TERMINATED
             if status > _WARNING and not stopped:
                 return self._fault(pool.failure(0))
-        read = self._readings
-        variables = read.variables.copy() if self._own.update else None
+        read = self.inside.readings
+        variables = read.variables.copy() if self.inside.own.update else None
         before = read.values
         if values is None:
             values = tuple(self._output_row.tolist())  # Python's floats are faster
         read.values = values
-        read.state = values if self._no_monitors else values[: self._output_count]
-        if observed is None and self._pool_observes:
-            observed = self._observation_row.copy()
-        cut_off = read.step_count >= self._step_limit
+        read.state = values if self.inside.no_monitors else values[: self.inside.output_count]
+        if observed is None and self.inside.pool_observes:
+            observed = self.inside.observation_row.copy()
+        cut_off = read.step_count >= self.inside.step_limit
         result = conclude(self, self._form, stopped, cut_off, observed)
         observation, reward, terminated, truncated = result
         # One call for all numbers, which is enough for nearly all steps.
         is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
         if not is_small:
             if observation is IN_POOL:
-                observation = self._observation_row.copy()
-            if not (isfinite(reward) and self._is_finite(observation)):
+                observation = self.inside.observation_row.copy()
+            if not (isfinite(reward) and self.inside.is_finite(observation)):
                 return self._fault_of_hooks(reward, observation, (before, variables))
-        info = self._info() if self._has_info else {}
+        info = self._info() if self.inside.has_info else {}
         if stopped:
             info["fmu_terminated"] = True
         if terminated or truncated:
-            self._ended = True
+            self.inside.ended = True
         return observation, reward, terminated, truncated, info
 
     def _info(self) -> dict[str, Any]:
         """Return the info of the hook and of the pool."""
         info = as_info(self._get_info())
-        if self._pool_tells:
+        if self.inside.pool_tells:
             info = info | {
                 name: value.item(0) for name, value in self._open_pool("info").info().items()
             }
@@ -531,22 +531,22 @@ class FMUEnv(Constructed):
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
-        steps = (self._warm_up_steps + self.step_count) * self._spec.substeps
-        return self._spec.communication_point(steps, self._start_time)
+        steps = (self.inside.warm_up_steps + self.step_count) * self.inside.spec.substeps
+        return self.inside.spec.communication_point(steps, self._start_time)
 
     @property
     def _start_time(self) -> Any:
         """The first communication point of the episode."""
         if self.config.draws_start_time:
             return self.parameters["start_time"]
-        return self._spec.start_time
+        return self.inside.spec.start_time
 
     def _fault_of_hooks(
         self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]
     ) -> Result:
         """End the episode because of a number that is not finite, in the state before the step."""
         reason = self._not_finite(reward, observation)
-        read = self._readings
+        read = self.inside.readings
         read.values, variables = before
         read.state = read.previous_state
         read.variables.update(variables or {})
@@ -565,7 +565,7 @@ class FMUEnv(Constructed):
         return f"_reward_policy returned {reward}"
 
     def _fault(self, reason: str) -> Result:
-        self._ended = True
+        self.inside.ended = True
         policy = self.config.on_fault
         if policy == "raise":
             raise SimulationError(reason)
@@ -573,7 +573,7 @@ class FMUEnv(Constructed):
         self.done = policy == "terminate"
         info = self._info() | {"fault": reason, "fault_rate": self._fault_rate()}
         observation = self._get_observation()
-        if not self._is_finite(observation):
+        if not self.inside.is_finite(observation):
             raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
         return observation, as_reward(self._fault_reward()), self.done, not self.done, info
 
@@ -599,7 +599,7 @@ class FMUEnv(Constructed):
                 for the FMU, or if the FMU fails.
         """
         pool = self._open_pool("save_state")
-        if not self._was_reset:
+        if not self.inside.was_reset:
             raise SimulationError("save_state was called before the first reset")
         self._keep_readings()
         bundle = pool.save_instances(np.zeros(1, np.int64))
@@ -620,12 +620,12 @@ class FMUEnv(Constructed):
         """
         pool = self._open_pool("restore_state")
         columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
-        if not self._was_reset:
+        if not self.inside.was_reset:
             self._prepare_hooks()  # as in ``reset``
             self._require_way(pool)
         require_saving(pool)
         self._keep_readings()
-        self._ended = True  # there is no episode if the FMU fails
+        self.inside.ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
@@ -643,7 +643,7 @@ class FMUEnv(Constructed):
         """Make a new environment in the middle of the same episode, if there is one."""
         args, kwargs = copy.deepcopy(self._constructor_arguments, memo)
         twin = type(self)(*args, **kwargs)
-        if self._was_reset and self._pool is not None:
+        if self.inside.was_reset and self._pool is not None:
             twin.restore_state(self.save_state())
         return twin
 
@@ -670,7 +670,7 @@ class FMUEnv(Constructed):
     def observation_names(self) -> tuple[str, ...] | None:
         """The names of the observation's elements; None if a hook of the class makes it."""
         is_default = type(self)._get_observation is FMUEnv._get_observation
-        return tuple(v.name for v in self._interface.outputs) if is_default else None
+        return tuple(v.name for v in self.inside.interface.outputs) if is_default else None
 
     @property
     def compute_reward(self) -> Callable[[Any, Any, Any], Any]:
@@ -679,7 +679,7 @@ class FMUEnv(Constructed):
         Raises:
             AttributeError: If this is no goal task, as Stable-Baselines3 expects it.
         """
-        if not self._own.goal_reward:
+        if not self.inside.own.goal_reward:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
         return lambda achieved, desired, info: self._goal_reward(achieved, desired)
 
@@ -694,7 +694,7 @@ class FMUEnv(Constructed):
             SimulationError: If the environment is closed or was never reset.
         """
         pool = self._open_pool("read_variables")
-        if not self._was_reset:
+        if not self.inside.was_reset:
             raise SimulationError("read_variables was called before the first reset")
         variables = readable_named(self.fmu.description, names)
         values = pool.read(variables)[:, 0].tolist()
@@ -706,7 +706,7 @@ class FMUEnv(Constructed):
     @property
     def np_random(self) -> np.random.Generator:
         """The environment's generator; hooks must not use it."""
-        if self._in_hooks:
+        if self.inside.in_hooks:
             raise SimulationError(
                 "a hook drew random numbers; give a distribution in the config under "
                 "'model_parameters' or 'episode_variables' instead and read the drawn value"

@@ -254,9 +254,9 @@ class _Player:
     ) -> None:
         self._recorder = Recorder(env)
         inner: FMUEnv = env.unwrapped
-        if inner._warm_up_steps:
+        if inner.inside.warm_up_steps:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
-        self._plant, self._log, self._time_step = plant, log, inner._spec.time_step
+        self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
         self._columns = _Columns(inner, log, columns)
         self._actions = _Actions(inner, self._columns, tolerance)
 
@@ -301,7 +301,7 @@ class _Columns:
                 units = env.fmu.description.units
                 to_log = conversion_between(own, unit or declared.get("unit"), units)
                 self._from[name] = column, 1.0 / to_log.factor, -to_log.offset / to_log.factor
-        for variable in env._spec.outputs:
+        for variable in env.inside.spec.outputs:
             self.require(variable)
 
     def require(self, variable: Variable) -> None:
@@ -356,7 +356,9 @@ class _Actions:
         """
         tried = [self._inputs(action) for action in self._candidates]
         self._find_written(np.array(tried))
-        wanted = np.array([row[self._env._spec.inputs[place].name] for place in self._written])
+        wanted = np.array(
+            [row[self._env.inside.spec.inputs[place].name] for place in self._written]
+        )
         action = self._nearest(np.array(tried), wanted)
         self._require_near(action, wanted, time)
         return action
@@ -366,7 +368,7 @@ class _Actions:
         env, before = self._env, self._env.action
         env.action = action
         try:
-            return flat_inputs(env._get_inputs(), env._spec.inputs, shown)
+            return flat_inputs(env._get_inputs(), env.inside.spec.inputs, shown)
         finally:
             env.action = before
 
@@ -375,10 +377,10 @@ class _Actions:
         changes = np.flatnonzero(np.ptp(tried, axis=0) > 0.0).tolist()
         new = [place for place in changes if place not in self._written]
         for place in new:
-            self._columns.require(self._env._spec.inputs[place])
+            self._columns.require(self._env.inside.spec.inputs[place])
         if new:
             self._written = sorted(self._written + new)
-            inputs = self._env._spec.inputs
+            inputs = self._env.inside.spec.inputs
             self._scales = np.array([self._columns.range_of(inputs[i]) for i in self._written])
 
     def _nearest(self, tried: FloatArray, wanted: FloatArray) -> Any:
@@ -397,7 +399,7 @@ class _Actions:
         off = np.abs(made - wanted) > self._tolerance * self._scales
         if off.any():
             place = int(np.flatnonzero(off)[0])
-            name = self._env._spec.inputs[self._written[place]].name
+            name = self._env.inside.spec.inputs[self._written[place]].name
             raise ConfigError(
                 f"the log at {time:g} s: no action of {self._space} makes {name} = "
                 f"{wanted[place]:g}; the nearest makes {made[place]:g}. If that is near enough, "

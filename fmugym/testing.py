@@ -195,7 +195,9 @@ def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
     """Another seed and, if the FMU runs with them, parameters that differ by one percent."""
     with _fresh(env) as tried:
         tried.reset(seed=seed)
-        given = {n: v for n, v in tried.parameters.items() if n not in tried._interface.input_names}
+        given = {
+            n: v for n, v in tried.parameters.items() if n not in tried.inside.interface.input_names
+        }
         changed = {name: _changed(tried, name, value) for name, value in given.items()}
         start = _Start(
             seed + 1, {name: value for name, value in changed.items() if value is not None}
@@ -236,7 +238,7 @@ def _require_type(what: str, value: Any, expected: type) -> None:
 def _check_time(env: FMUEnv, actions: list[Any], seed: int) -> None:
     with _fresh(env) as tried:
         tried.reset(seed=seed)
-        start, step = tried.time, tried._interface.time_step
+        start, step = tried.time, tried.inside.interface.time_step
         for count, action in enumerate(actions, start=1):
             *_, terminated, truncated, _ = tried.step(action)
             expected = start + count * step
@@ -260,7 +262,9 @@ def _check_parameters(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 raise ContractError(f"parameter {name!r} was set to {value}, but is {read[name]}")
         before = _trace(tried, actions, seed, {})
         for name, value in given.items():
-            changed = None if name in tried._interface.input_names else _changed(tried, name, value)
+            changed = (
+                None if name in tried.inside.interface.input_names else _changed(tried, name, value)
+            )
             if changed is not None and _trace(tried, actions, seed, {name: changed}) == before:
                 logger.warning(
                     "parameter %r has no effect on the outputs: %g gives the same as %g",
@@ -278,7 +282,7 @@ def _changed(env: FMUEnv, name: str, value: float) -> float | None:
     nominal = abs(value) or abs(variable.nominal or 1.0)
     for candidate in (value + 0.01 * nominal, value - 0.01 * nominal):
         with suppress(ConfigError):
-            env._interface.within(variable, candidate)
+            env.inside.interface.within(variable, candidate)
             return candidate
     return None
 

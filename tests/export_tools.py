@@ -79,7 +79,7 @@ def largest_difference(env, network, logic, step, steps):
         action = network.action(np.ravel(observation))
         is_discrete = isinstance(env.action_space, spaces.Discrete)
         observation, _, terminated, *_ = env.step(int(action[0]) if is_discrete else action)
-        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+        inputs = dict(zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True))
         worst = max(worst, np.abs(actions - np.array([inputs[v.name] for v in logic.inputs])).max())
         if terminated:
             break
@@ -179,7 +179,7 @@ def plant_of(env, tmp_path):
 
     def step(time):
         parts = env.config.substeps
-        size = env._interface.time_step / parts
+        size = env.inside.interface.time_step / parts
         for index in range(parts):
             slave.doStep(time + index * size, size)
 

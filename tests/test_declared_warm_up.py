@@ -55,7 +55,7 @@ def driven(task, controller, seed):
     observation, _ = env.reset(seed=seed)
     for _ in range(STEPS):
         observation, *_ = env.step(bound.act(observation))
-    result = env._readings.values, env.inputs[0], observation[2]
+    result = env.inside.readings.values, env.inputs[0], observation[2]
     env.close()
     return result
 
@@ -66,7 +66,7 @@ def test_it_leads_where_the_controller_leads_as_an_agent(controller):
     for seed in (3, 4):
         observation, _ = env.reset(seed=seed)
         values, heating, outside = driven(house(), controller, seed)
-        assert env._readings.values == values
+        assert env.inside.readings.values == values
         assert env.inputs[0] == heating
         assert observation[2] == outside
         assert env.time == 86400.0
@@ -82,7 +82,7 @@ def test_data_move_without_a_controller():
     plain.reset(seed=1)
     for _ in range(STEPS):
         plain.step([0.0])
-    assert env._readings.values == plain._readings.values
+    assert env.inside.readings.values == plain.inside.readings.values
     env.close()
     plain.close()
 
@@ -110,7 +110,7 @@ def test_a_thermostat_whose_arguments_the_task_tells(name, change):
     full = "hysteresis of=T setpoint=T_set band=0 below=1 above=0"
     env, same = fmugym.load(house(name, **change)), fmugym.load(house(full, **change))
     assert env.reset(seed=0)[0].tolist() == same.reset(seed=0)[0].tolist()
-    assert env._readings.values == same._readings.values
+    assert env.inside.readings.values == same.inside.readings.values
     env.close()
     same.close()
 

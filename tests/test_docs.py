@@ -157,6 +157,9 @@ def messages():
                 yield "".join(parts)
             elif isinstance(node, ast.Constant) and isinstance(node.value, str):
                 yield re.sub(r"%[-+.\d]*[sdgr]", "...", node.value).replace("\n", " ")
+    for path in (ROOT / "native").rglob("*.c"):
+        joined = re.sub(r'"\s*\n\s*"', "", path.read_text())
+        yield from re.findall(r'"([^"\\\n]*)"', joined)
 
 
 def test_the_classes_of_errors_are_those_of_the_package():

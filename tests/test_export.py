@@ -79,7 +79,7 @@ def differences(env, network, controller, plant, steps):
     """The largest differences of measurements and inputs between the two loops."""
     logic = controller.agent.logic
     measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
-    observation, step = env._get_observation(), env._interface.time_step
+    observation, step = env._get_observation(), env.inside.interface.time_step
     worst = np.zeros(2)
     for count in range(steps):
         own = np.array(plant.read(measured))
@@ -90,7 +90,7 @@ def differences(env, network, controller, plant, steps):
         observation, _, terminated, truncated, _ = env.step(
             int(action[0]) if is_discrete else action
         )
-        inputs = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+        inputs = dict(zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True))
         wanted = [inputs[name] for name in written]
         worst = np.maximum(
             worst, [np.abs(own - seen).max(), np.abs(actions - np.array(wanted)).max()]

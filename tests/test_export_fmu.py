@@ -161,7 +161,7 @@ class TestClosedLoop:
         )
         observation, _ = env.reset(seed=1)
         parameters = {one.name: env.variables[one.name] for one in agent.logic.parameters}
-        worst, size, inputs = 0.0, env._interface.time_step, env._interface.inputs
+        worst, size, inputs = 0.0, env.inside.interface.time_step, env.inside.interface.inputs
         with plant_of(env, tmp_path) as plant, controller_of(path, tmp_path) as controller:
             controller.begin(**parameters)
             for count in range(300):
@@ -215,7 +215,7 @@ class TestClosedLoop:
             start_values={"clock": env.variables["clock"]},
             validate=True,
         )
-        for index, variable in enumerate(env._interface.inputs):
+        for index, variable in enumerate(env.inside.interface.inputs):
             assert result[variable.name][1:] == pytest.approx([w[index] for w in wanted], abs=1e-5)
             assert result[variable.name][0] == result[variable.name][1]  # known at the beginning
 

@@ -67,11 +67,13 @@ def loops_differ(env, model, agent, tmp_path, normalization=None, seed=0):
             observation, _, terminated, truncated, _ = outer.step(
                 action if action.ndim else int(action)
             )
-            wanted = dict(zip([v.name for v in env._interface.inputs], env.inputs, strict=True))
+            wanted = dict(
+                zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True)
+            )
             errors = np.abs(own - seen).max(), np.abs(actions - [wanted[n] for n in written]).max()
             worst = np.maximum(worst, errors)
             plant.write(written, actions)
-            plant.step(count * env._interface.time_step)
+            plant.step(count * env.inside.interface.time_step)
             count, is_over = count + 1, terminated or truncated or count == 699
     return *worst, count
 

@@ -103,7 +103,7 @@ def test_interrupts_in_a_step_end_the_episode(cart):
     finally:
         signal.signal(signal.SIGALRM, usual)
     assert (env.step_count, env.action, env.previous_action) == (1, 1, 0)
-    assert env._ended
+    assert env.inside.ended
     env.reset(seed=0)
     assert env.step(1)[1] == 1.0
 

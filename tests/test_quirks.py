@@ -175,7 +175,8 @@ def test_verdict(make_fmu, version, quirk, caplog):
     """What several instances need, and what the log tells."""
     path = make_fmu(quirk.token, version)
     envs = make_vector(path, probe_timeout=quirk.probe_timeout)
-    spec, starts = envs.get_attr("_spec")[0], envs.get_attr("_plan")[0].starts()
+    inside = envs.get_attr("inside")[0]
+    spec, starts = inside.spec, inside.plan.starts()
     envs.close()
     candidate = Candidate.of(fmugym.FMU(path, probe_timeout=quirk.probe_timeout))
     verdict = examine(candidate, spec, starts, several=True, must_survive=False)

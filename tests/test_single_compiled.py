@@ -274,11 +274,11 @@ class TestAttributes:
 
         env = with_hooks(Bound, "compiled")
         env.reset(seed=0)
-        assert env.step(env._no_action)[1] == 2.0 * env.state[0]
+        assert env.step(env.inside.no_action)[1] == 2.0 * env.state[0]
         assert env._player is not None
         env._reward_policy = MethodType(lambda env: 3.0 * env.state[0], env)
         env.reset()
-        assert env.step(env._no_action)[1] == 3.0 * env.state[0]
+        assert env.step(env.inside.no_action)[1] == 3.0 * env.state[0]
         reference = weakref.ref(env)
         env.close()
         del env
@@ -311,7 +311,7 @@ class TestAttributes:
                 getattr(env, change)[0] += 1.5
                 env.reset()  # where changes inside are noticed
             for _ in range(3):
-                assert same(one.step(one._no_action), other.step(one._no_action))
+                assert same(one.step(one.inside.no_action), other.step(one.inside.no_action))
 
     def test_readings_may_be_set(self):
         one, other = (with_hooks(Counting, hooks) for hooks in ("compiled", "python"))
@@ -546,7 +546,7 @@ class TestLife:
         env = with_hooks(Random, "auto")
         env.reset(seed=0)
         with pytest.raises(SimulationError, match="random"):
-            env.step(env._no_action)
+            env.step(env.inside.no_action)
         env.close()
 
     def test_rendering(self):
@@ -593,7 +593,7 @@ class TestSideEffects:
         env = with_hooks(cls, "auto", max_episode_steps=5000)
         env.reset(seed=0)
         for _ in range(20):
-            env.step(env._no_action)
+            env.step(env.inside.no_action)
         return env
 
     @pytest.mark.parametrize(

@@ -228,9 +228,9 @@ def test_the_single_environments_are_marked_as_ended():
     vector.step(NOTHING)
     with pytest.raises(ZeroDivisionError):
         vector.step(NOTHING)
-    assert vector.get_attr("_ended") == (True,) * 3
+    assert all(inside.ended for inside in vector.get_attr("inside"))
     vector.reset(seed=1)
-    assert vector.get_attr("_ended") == (False,) * 3
+    assert not any(inside.ended for inside in vector.get_attr("inside"))
     vector.close()
 
 

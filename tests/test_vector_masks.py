@@ -337,7 +337,17 @@ def test_a_first_observation_that_is_not_finite():
 def test_references_do_not_leak():
     envs, mask = made(CART_POLE), np.array([True, False, False, True, False])
     engine, options = envs._engine, {"reset_mask": mask}
-    watched = (mask, options, engine.env._plan, CART_POLE, None, True, False, "drawn", "_drawn")
+    watched = (
+        mask,
+        options,
+        engine.env.inside.plan,
+        CART_POLE,
+        None,
+        True,
+        False,
+        "drawn",
+        "_drawn",
+    )
 
     def play():
         for _ in range(300):

@@ -303,7 +303,7 @@ class Naming:
                 raise record.entry.error(f"{name!r} is a String: expressions have numbers only")
             return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
         place = self._places[name]
-        return converted(record.conversion, f"env._readings.values[{place}]")
+        return converted(record.conversion, f"env.inside.readings.values[{place}]")
 
     def _previous_code_of(self, name: str) -> Code | None:
         declared, record = self._declared, self._declared.records.get(name)

@@ -41,7 +41,9 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
     for name, value in vars(env).items():  # those that the class's own constructor has set
         if not name.startswith("_"):
             vars(other).setdefault(name, value)
-    other._warm_up_steps = env._warm_up_steps  # the first sample is taken when the warm-up is over
+    other.inside.warm_up_steps = (
+        env.inside.warm_up_steps
+    )  # the first sample is taken when the warm-up is over
     with closing(other):
         yield other
 

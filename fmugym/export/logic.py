@@ -146,8 +146,8 @@ def logic_of(
 def _logic_of_ideal(
     env: FMUEnv, decision: Decision, all_inputs: bool, external: Collection[str]
 ) -> Logic:
-    if env._own.step or env._own.reset:
-        name = "step" if env._own.step else "reset"
+    if env.inside.own.step or env.inside.own.reset:
+        name = "step" if env.inside.own.step else "reset"
         raise ConfigError(f"{type(env).__name__} cannot be exported: {name} is overridden")
     if not isinstance(env.action_space, spaces.Box | spaces.Discrete | spaces.MultiDiscrete):
         raise ConfigError(
@@ -271,11 +271,11 @@ class _Assembly:
     ) -> None:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
-        self._episode = env._plan.draw(rng)
+        self._episode = env.inside.plan.draw(rng)
         self._starts = {**self._episode.variables, **traced.starts}
-        self._drawn = set(env._plan.drawn_names)
+        self._drawn = set(env.inside.plan.drawn_names)
         self._external = self._given(external)
-        rows = zip(env._interface.inputs, traced.inputs, traced.are_chosen, strict=True)
+        rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [
             (variable, node) for variable, node, is_chosen in rows if all_inputs or is_chosen
         ]
@@ -288,7 +288,7 @@ class _Assembly:
     def _given(self, names: Collection[str]) -> dict[int, Variable]:
         """What the controller is given, by node; names differ from those of the plant's inputs."""
         found = found_in(self._env, names, self._graph, self._traced.observation)
-        taken = {variable.name for variable in self._env._interface.inputs}
+        taken = {variable.name for variable in self._env.inside.interface.inputs}
         return {
             one.node: replace(one.variable, name=f"{one.variable.name}_given")
             if one.variable.name in taken
@@ -311,7 +311,10 @@ class _Assembly:
         updates = (node for kept in self._kept for node in kept.updates)
         numbers = sorted(needed.union(updates))
         loads = {n: load for n in numbers if (load := self._load(n, places)) is not None}
-        env, outputs = self._env, self._env._interface.outputs + self._env._interface.monitors
+        env, outputs = (
+            self._env,
+            self._env.inside.interface.outputs + self._env.inside.interface.monitors,
+        )
         return Logic(
             self._graph,
             loads,
@@ -321,7 +324,7 @@ class _Assembly:
             self._traced.features,
             tuple(self._kept),
             tuple(self._parameters),
-            env._interface.time_step,
+            env.inside.interface.time_step,
         )
 
     def _closure(self, roots: Iterable[int]) -> frozenset[int]:
@@ -351,7 +354,7 @@ class _Assembly:
             if _is_row(node, "output") or _is_row(node, "kept")
         }
         places = sorted({row[1] for row in rows})
-        interface = self._env._interface
+        interface = self._env.inside.interface
         for place in places:
             variable = (interface.outputs + interface.monitors)[place]
             if variable.causality != "output":
@@ -384,14 +387,14 @@ class _Assembly:
 
     def _first_inputs(self) -> list[float]:
         given = self._episode.parameters
-        for name, _ in self._env._start_inputs:
+        for name, _ in self._env.inside.start_inputs:
             if name in self._drawn:
                 raise UntraceableError(f"it reads the input {name!r}, whose first value is drawn")
-        return [float(given.get(name, start)) for name, start in self._env._start_inputs]
+        return [float(given.get(name, start)) for name, start in self._env.inside.start_inputs]
 
     def _add_actions(self, nodes: list[Node]) -> None:
         space: Any = self._env.action_space
-        dtype, first = np.dtype(space.dtype), np.ravel(self._env._no_action)
+        dtype, first = np.dtype(space.dtype), np.ravel(self._env.inside.no_action)
         has_older = any(node.kind == "previous_action" for node in nodes)
         if any(node.kind in _PAST_ACTIONS for node in nodes):
             self._add("action", dtype, first.tolist(), self._traced.action)
@@ -409,7 +412,7 @@ class _Assembly:
     def _add_parameter(self, name: str) -> None:
         if name not in self._fields:
             own = self._episode.parameters[name]
-            value, variable = np.ravel(own), self._env._interface.parameter(name, own)
+            value, variable = np.ravel(own), self._env.inside.interface.parameter(name, own)
             self._add(name, np.dtype(np.float64), value.tolist(), ())
             self._note_parameters(name, value, variable)
 

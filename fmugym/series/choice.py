@@ -140,7 +140,7 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 
 def _of_config(env: FMUEnv) -> Quantities:
-    find, interface = env.fmu.variable, env._interface
+    find, interface = env.fmu.variable, env.inside.interface
     strings = env.fmu.description.strings
     inputs, outputs = interface.input_names, tuple(n for n in env.out if n not in strings)
     places = [place for place, name in enumerate(env.out) if name not in strings]
@@ -151,7 +151,7 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *(env._readings.values[index] for index in places),
+            *(env.inside.readings.values[index] for index in places),
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )
@@ -167,7 +167,7 @@ def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
     """Add the Strings that the config monitors or sets; they are read as numbers of texts."""
     strings = env.fmu.description.strings
     places = {name: place for place, name in enumerate(env.out) if name in strings}
-    given = tuple(name for name in env._interface.parameters if name in strings)
+    given = tuple(name for name in env.inside.interface.parameters if name in strings)
     if not places and not given:
         return quantities
 
@@ -175,7 +175,7 @@ def _with_texts(env: FMUEnv, quantities: Quantities) -> Quantities:
         drawn = env.parameters
         return (
             *quantities.read(env),
-            *(env._readings.values[place] for place in places.values()),
+            *(env.inside.readings.values[place] for place in places.values()),
             *(_number(drawn.get(name, np.nan)) for name in given),
         )
 
@@ -200,7 +200,7 @@ def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:
     """The numbers and Strings of the FMU for which the task has no name of its own."""
-    known = {*env._interface.input_names, *env.out, *(one.name for one in quantities)}
+    known = {*env.inside.interface.input_names, *env.out, *(one.name for one in quantities)}
     for variable in env.fmu.description.variables.values():
         if variable.is_number or (variable.kind == "string" and not variable.shape):
             yield from (one for one in variable.elements if one.name not in known)

@@ -48,7 +48,7 @@ class _Recorder:
         patterns = [variables] if isinstance(variables, str) else variables
         self._choice = choose(episodes.prototype, patterns)
         self._indices = _chosen(environments, episodes.count)
-        self._every = _steps_of(every, episodes.prototype._spec.time_step)
+        self._every = _steps_of(every, episodes.prototype.inside.spec.time_step)
         self._path = None if path is None else check_path("the path of a recording", path)
         self._most_rows = check_count("most_rows", most_rows)
         self._memory: Memory | None = None

@@ -228,8 +228,8 @@ class Rows:
         is_due = mask[self._indices]
         which = self._indices[is_due]
         env = self._episodes.prototype
-        spec = env._spec
-        passed: Any = (env._warm_up_steps + self._steps[which]) * spec.substeps
+        spec = env.inside.spec
+        passed: Any = (env.inside.warm_up_steps + self._steps[which]) * spec.substeps
         parts = [
             *([which] if self._is_vector else []),
             *(self._number[which], self._steps[which]),

@@ -27,8 +27,9 @@ from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.hooks import Hooks, OwnHooks, misspelt_hooks
+from fmugym.task.hooks import Hooks, misspelt_hooks
 from fmugym.task.inputs import InputWriter
+from fmugym.task.inside import Inside, OwnHooks
 from fmugym.task.interface import resolve
 from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
@@ -64,12 +65,9 @@ class Constructed(Pictured):
     _as_constructed: dict[str, Any]
     """The plain attributes of a subclass when its hooks were prepared."""
 
-    _has_info: bool
-    _pool_tells = False
     _warm_up: WarmUp | None = None
     """What happens in warm-ups with moving inputs; the pool knows of others only."""
 
-    _warm_ups: WarmUps | None = None
     _pool: Pool | None = None
     _is_closed = False
     _player: Any = None
@@ -86,6 +84,7 @@ class Constructed(Pictured):
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
         env._number = next(env_numbers)
+        env.inside = Inside()
         return env
 
     def _construct(
@@ -104,12 +103,12 @@ class Constructed(Pictured):
         self.render_mode = self._checked_render_mode(render_mode)
         self.fmu = open_fmu(type(self), fmu_path, self.config, self.fmi_interface)
         self._require_fmi_version()
-        self._interface = resolve(self.config, self.fmu.description)
-        self._spec = self._interface.pool_spec()
-        self._warm_up_steps = self._spec.warm_up_steps
+        self.inside.interface = resolve(self.config, self.fmu.description)
+        self.inside.spec = self.inside.interface.pool_spec()
+        self.inside.warm_up_steps = self.inside.spec.warm_up_steps
         if self._warm_up is not None:
-            self._spec = replace(self._spec, warm_up_steps=0)
-            self._warm_ups = WarmUps(self, self._warm_up)
+            self.inside.spec = replace(self.inside.spec, warm_up_steps=0)
+            self.inside.warm_ups = WarmUps(self, self._warm_up)
         self._warn_of_peculiarities()
         self._prepare_values()
         self._prepare_episodes()
@@ -120,11 +119,17 @@ class Constructed(Pictured):
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
-        self._opening = PoolOpening(
-            self.fmu, self._spec, self.config, self._plan, self.logger, backend, isolation
+        self.inside.opening = PoolOpening(
+            self.fmu,
+            self.inside.spec,
+            self.config,
+            self.inside.plan,
+            self.logger,
+            backend,
+            isolation,
         )
         if not pools_are_deferred():
-            self._use(self._opening.open())
+            self._use(self.inside.opening.open())
 
     def _use(self, pool: Pool) -> None:
         """Let a pool of one step this environment, or one of N if a vector environment does it."""
@@ -132,9 +137,9 @@ class Constructed(Pictured):
         self._pool = pool
         self._step_pool, self._halt = pool.step_own, pool.halt
         self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
-        self._observation_row = pool.observations[0]
-        self._pool_tells = bool(pool.info())
-        self._has_info = self._has_info or self._pool_tells
+        self.inside.observation_row = pool.observations[0]
+        self.inside.pool_tells = bool(pool.info())
+        self.inside.has_info = self.inside.has_info or self.inside.pool_tells
         self._note_own_names(foreign)
 
     def _note_own_names(self, foreign: Collection[str]) -> None:
@@ -146,13 +151,13 @@ class Constructed(Pictured):
             self._require_construction()
             if self._is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-            self._opening = self._opening.apart()
-            self.fmu = self._opening.fmu
-            self._use(self._opening.open())
+            self.inside.opening = self.inside.opening.apart()
+            self.fmu = self.inside.opening.fmu
+            self._use(self.inside.opening.open())
         return cast(Pool, self._pool)
 
     def _require_construction(self) -> None:
-        if not hasattr(self, "_opening"):
+        if not hasattr(self.inside, "opening"):
             name = type(self).__name__
             raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 
@@ -180,11 +185,11 @@ class Constructed(Pictured):
 
     def _warn_of_peculiarities(self) -> None:
         internal = self.fmu.description.fixed_internal_step_size
-        if internal is not None and self._spec.communication_step_size < 0.999999 * internal:
+        if internal is not None and self.inside.spec.communication_step_size < 0.999999 * internal:
             self.logger.warning(
                 "the communication step of %g s is smaller than the internal step of %g s of %s: "
                 "some of the steps will do nothing",
-                self._spec.communication_step_size,
+                self.inside.spec.communication_step_size,
                 internal,
                 self.fmu.path.name,
             )
@@ -198,23 +203,23 @@ class Constructed(Pictured):
 
     def _prepare_values(self) -> None:
         """Set what hooks may read to what it is before the first reset."""
-        interface = self._interface
+        interface = self.inside.interface
         names = [variable.name for variable in interface.outputs + interface.monitors]
         fps = min(1 / interface.time_step, _FASTEST_FPS)
         self.metadata = {**self.metadata, "render_fps": max(1, round(fps))}
-        self._output_count = len(interface.outputs)
-        self._no_monitors = not interface.monitors
-        self._start_inputs = [(v.name, v.start_number) for v in interface.inputs]
-        self._readings = self._first_readings(names)
+        self.inside.output_count = len(interface.outputs)
+        self.inside.no_monitors = not interface.monitors
+        self.inside.start_inputs = [(v.name, v.start_number) for v in interface.inputs]
+        self.inside.readings = self._first_readings(names)
 
     def _first_readings(self, names: Sequence[str]) -> Readings:
         values = (nan,) * len(names)
-        state = values[: self._output_count]
-        strings = frozenset(v.name for v in self._interface.monitors if v.kind == "string")
-        start = {"start_time": self._spec.start_time} if self.config.draws_start_time else {}
+        state = values[: self.inside.output_count]
+        strings = frozenset(v.name for v in self.inside.interface.monitors if v.kind == "string")
+        start = {"start_time": self.inside.spec.start_time} if self.config.draws_start_time else {}
 
         def present() -> Any:
-            return self._readings.values
+            return self.inside.readings.values
 
         out = NamedTexts(names, strings, present) if strings else None
         return Readings(
@@ -222,7 +227,7 @@ class Constructed(Pictured):
             out=NamedValues("output", names, present) if out is None else out,
             state=state,
             previous_state=state,
-            inputs=tuple(start for _, start in self._start_inputs),
+            inputs=tuple(start for _, start in self.inside.start_inputs),
             action=None,
             previous_action=None,
             step_count=0,
@@ -233,11 +238,13 @@ class Constructed(Pictured):
         )
 
     def _prepare_episodes(self) -> None:
-        self._plan = self._plan_episode({})
-        self._step_limit = _step_limit(self.config, self._spec, self._warm_up_steps)
-        self._ended = True
-        self._in_hooks = False
-        self._was_reset = False
+        self.inside.plan = self._plan_episode({})
+        self.inside.step_limit = _step_limit(
+            self.config, self.inside.spec, self.inside.warm_up_steps
+        )
+        self.inside.ended = True
+        self.inside.in_hooks = False
+        self.inside.was_reset = False
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -248,48 +255,48 @@ class Constructed(Pictured):
                     f"{type(self).__name__}._get_{name}_space returned {shown(space)}, "
                     "expected a gymnasium.spaces.Space"
                 )
-        self._no_action = no_action(self.action_space)
+        self.inside.no_action = no_action(self.action_space)
 
     def _prepare_hooks(self) -> None:
         """Find out which hooks the class overrides, and prepare the defaults of the others."""
-        interface, space = self._interface, self.observation_space
-        self._own = own = OwnHooks.of(self, self._base)
+        interface, space = self.inside.interface, self.observation_space
+        self.inside.own = own = OwnHooks.of(self, self._base)
         if self.config.draws_start_time and self.config.stop_time is not None:
             self._let_stop_time_end_episodes()
-            self._own = own = OwnHooks.of(self, self._base)
+            self.inside.own = own = OwnHooks.of(self, self._base)
         self._form = NUMBERS
         # A subclass with its own step may take other actions.
-        self._elements = None if own.step else elements_of(self.action_space)
+        self.inside.elements = None if own.step else elements_of(self.action_space)
         derived = not own.get_action_space
         values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
-        self._action_values = values
+        self.inside.action_values = values
         default = not own.get_observation
         make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
-        self._observe = make(interface, space)
-        self._is_finite = finiteness_of(space)
+        self.inside.observe = make(interface, space)
+        self.inside.is_finite = finiteness_of(space)
         # The pool writes this observation in the pass that steps the FMU.
-        self._pool_observes = (
+        self.inside.pool_observes = (
             default and isinstance(space, spaces.Box) and space.dtype == np.float32
         )
-        self._has_info = own.get_info or self._pool_tells
-        self._input_writer = InputWriter(interface.inputs)
+        self.inside.has_info = own.get_info or self.inside.pool_tells
+        self.inside.input_writer = InputWriter(interface.inputs)
         self._as_constructed = plain_attributes(vars(self), self._own_names)
 
     def _let_stop_time_end_episodes(self) -> None:
         """Each episode has its own last step, as each has its own start time."""
-        hook = self._is_truncated if self._own.is_truncated else None
+        hook = self._is_truncated if self.inside.own.is_truncated else None
         if not isinstance(hook, _StopTime):
             vars(self)["_is_truncated"] = _StopTime(self, hook)
 
     def _plan_of_reset(self, options: Mapping[str, Any] | None, *also_known: str) -> EpisodePlan:
         if options is None:
-            return self._plan
+            return self.inside.plan
         options = check_mapping("the options of reset", options)
         for name in options:
             if name not in self.reset_options:
                 raise unknown_name("reset option", name, (*self.reset_options, *also_known))
         if not options:
-            return self._plan
+            return self.inside.plan
         parameters = self._get_episode_parameters(options)
         return self._plan_episode(
             check_mapping("what _get_episode_parameters returned", parameters)
@@ -297,12 +304,12 @@ class Constructed(Pictured):
 
     def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
         """Prepare the draws of episodes in which these parameters replace the config's."""
-        parameters = dict(self._interface.parameters)
+        parameters = dict(self.inside.interface.parameters)
         given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
-        own = self._interface.start_values(given)
+        own = self.inside.interface.start_values(given)
         parameters |= own
         return EpisodePlan(
-            tuple(map(self._interface.parameter, parameters, parameters.values())),
+            tuple(map(self.inside.interface.parameter, parameters, parameters.values())),
             parameters,
             self.config.episode_variables,
             own.keys(),
@@ -376,5 +383,5 @@ class _StopTime:
 
     def __call__(self) -> Any:
         env: Any = self._env
-        is_over = env.config.stop_time - env.time < env._spec.time_step * (1 - 1e-9)
+        is_over = env.config.stop_time - env.time < env.inside.spec.time_step * (1 - 1e-9)
         return is_over if self._own is None else self._own() | is_over

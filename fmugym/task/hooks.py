@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from copy import copy
-from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from inspect import signature
 from types import FunctionType
@@ -19,50 +18,17 @@ from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.interface import Interface
-from fmugym.task.readings import Readings, read_by
+from fmugym.task.inside import Inside
+from fmugym.task.readings import read_by
 from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
     from fmugym.rendering import Scene
 
-__all__ = ["Hooks", "OwnHooks", "misspelt_hooks"]
+__all__ = ["Hooks", "misspelt_hooks"]
 
 _ALIKE: Final = 0.85
 """How alike the names of a method and of a hook are if one is meant to be the other."""
-
-
-@dataclass(frozen=True, slots=True)
-class OwnHooks:
-    """Which methods an environment does not have from ``FMUEnv``, but from its class or itself.
-
-    A hook may also be an attribute of the environment, such as a function.
-    """
-
-    step: bool
-    reset: bool
-    update: bool
-    is_truncated: bool
-    get_observation: bool
-    get_info: bool
-    goal_reward: bool
-    reward_policy: bool
-    get_action_space: bool
-
-    @classmethod
-    def of(cls, env: Hooks, base: type[Any]) -> OwnHooks:
-        """Compare the methods of an environment with those of its base class ``FMUEnv``."""
-        return cls(*[_is_own(env, base, field.name) for field in fields(cls)])
-
-    def __contains__(self, hook: str) -> bool:
-        """Whether the environment has a hook of its own, by the hook's name."""
-        return bool(getattr(self, hook.removeprefix("_")))
-
-
-def _is_own(env: Hooks, base: type[Any], name: str) -> bool:
-    name = name if name in {"step", "reset"} else f"_{name}"
-    found = getattr(env, name)
-    return getattr(found, "__func__", found) is not getattr(base, name)
 
 
 def misspelt_hooks(cls: type[Any], base: type[Any]) -> dict[str, str]:
@@ -113,23 +79,23 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
     config: EnvConfig
 
-    state: Any = read_by("state", lambda env: env._readings.state)
-    previous_state: Any = read_by("previous_state", lambda env: env._readings.previous_state)
-    out: NamedValues = read_by("out", lambda env: env._readings.out)
-    inputs: Any = read_by("inputs", lambda env: env._readings.inputs)
-    action: Any = read_by("action", lambda env: env._readings.action)
-    previous_action: Any = read_by("previous_action", lambda env: env._readings.previous_action)
-    step_count: Any = read_by("step_count", lambda env: env._readings.step_count)
-    done: Any = read_by("done", lambda env: env._readings.done)
-    after_end: Any = read_by("after_end", lambda env: env._readings.after_end)
-    parameters: Mapping[str, Any] = read_by("parameters", lambda env: env._readings.parameters)
-    variables: dict[str, Any] = read_by("variables", lambda env: env._readings.variables)
+    state: Any = read_by("state", lambda env: env.inside.readings.state)
+    previous_state: Any = read_by("previous_state", lambda env: env.inside.readings.previous_state)
+    out: NamedValues = read_by("out", lambda env: env.inside.readings.out)
+    inputs: Any = read_by("inputs", lambda env: env.inside.readings.inputs)
+    action: Any = read_by("action", lambda env: env.inside.readings.action)
+    previous_action: Any = read_by(
+        "previous_action", lambda env: env.inside.readings.previous_action
+    )
+    step_count: Any = read_by("step_count", lambda env: env.inside.readings.step_count)
+    done: Any = read_by("done", lambda env: env.inside.readings.done)
+    after_end: Any = read_by("after_end", lambda env: env.inside.readings.after_end)
+    parameters: Mapping[str, Any] = read_by(
+        "parameters", lambda env: env.inside.readings.parameters
+    )
+    variables: dict[str, Any] = read_by("variables", lambda env: env.inside.readings.variables)
 
-    _readings: Readings
-    _interface: Interface
-    _action_values: Sequence[int] | None
-    _own: OwnHooks
-    _observe: Callable[[Any], Any]
+    inside: Inside
 
     # In the order of a step.
 
@@ -143,7 +109,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             One number for each input. By default, these are the elements of the action. For a
             ``Discrete`` made from an Enumeration or Integer, it is the value of the element.
         """
-        values = self._action_values
+        values = self.inside.action_values
         if values is None:
             return self.action
         if isinstance(values, range):  # the range of an Integer, which may be wide
@@ -169,7 +135,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             otherwise. For a goal task, ``_goal_reward`` of this observation.
         """
         positive, negative = self.config.positive_reward, self.config.negative_reward
-        if self._own.goal_reward:
+        if self.inside.own.goal_reward:
             return self._reward_for_goals(self._get_observation())
         if isinstance(self.done, bool):
             return negative if self.done else positive
@@ -193,7 +159,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
         ``_goal_reward`` gets copies: what it does to them must not change the observation.
         """
-        if self._own.reward_policy or not self._own.goal_reward:
+        if self.inside.own.reward_policy or not self.inside.own.goal_reward:
             reward = self._reward_policy()
             return reward, self._get_observation()
         observation = self._get_observation()
@@ -213,7 +179,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
             By default, the outputs in the type of the observation space. If they do not fit that
             space (an overriding hook may add elements), in the type of their default space.
         """
-        return self._observe(self.state)
+        return self.inside.observe(self.state)
 
     def _get_info(self) -> dict[str, Any]:
         """Additional facts about this step by name, as a new dict."""
@@ -223,11 +189,11 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
     def _get_action_space(self) -> spaces.Space[Any]:
         """The action space; by default made from the inputs' types, min and max."""
-        return fmu_spaces.action_space(self._interface)
+        return fmu_spaces.action_space(self.inside.interface)
 
     def _get_observation_space(self) -> spaces.Space[Any]:
         """The observation space; by default made from the outputs' types, min and max."""
-        return fmu_spaces.observation_space(self._interface)
+        return fmu_spaces.observation_space(self.inside.interface)
 
     # For some tasks only.
 

@@ -25,7 +25,6 @@ class Pictured(Hooks):
     """Width and height of the pictures in pixels."""
 
     _renderer: Renderer[Any] | None = None
-    _was_reset: bool
     _last_reward: float | None = None
     _return: float = 0.0
 
@@ -72,7 +71,7 @@ class Pictured(Hooks):
         if self.render_mode is None:
             gymnasium.logger.warn("render was called, but no render_mode was given at construction")
             return None
-        if not self._was_reset:
+        if not self.inside.was_reset:
             raise SimulationError("render was called before the first reset")
         if self._renderer is None:
             self._renderer = self._make_renderer(self.render_mode)
@@ -84,7 +83,7 @@ class Pictured(Hooks):
         scene = self._get_scene()
         if not callable(getattr(scene, "draw", None)):
             raise ConfigError(f"_get_scene returned {shown(scene)}, expected a scene with 'draw'")
-        fps = 1 / self._interface.time_step
+        fps = 1 / self.inside.interface.time_step
         return Renderer(scene, self.render_size, fps, mode, type(self).__name__)
 
     def _overlay(self) -> Overlay:

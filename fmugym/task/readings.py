@@ -45,7 +45,7 @@ class Readings:
     def of(cls, env: Any) -> Readings:
         """Return what the hooks of an environment read now; the values are not copied."""
         env._keep_readings()
-        present: Readings = env._readings
+        present: Readings = env.inside.readings
         return replace(present)
 
 
@@ -63,7 +63,7 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
 
     def put(env: Any, value: Any) -> None:
         env._keep_readings()
-        setattr(env._readings, name, value)
+        setattr(env.inside.readings, name, value)
 
     return property(get, put)
 
@@ -75,8 +75,8 @@ def reading(env: Any, readings: Readings) -> Iterator[None]:
     The environment stays the same object. So objects and functions that it holds, and that refer
     to it, read the same values as its hooks.
     """
-    before, env._readings = env._readings, readings
+    before, env.inside.readings = env.inside.readings, readings
     try:
         yield
     finally:
-        env._readings = before
+        env.inside.readings = before

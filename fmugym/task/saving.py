@@ -44,7 +44,7 @@ def columns_of(env: Constructed) -> Columns:
     attributes = plain_attributes(vars(env), env._own_names)
     streams, seeds = _stream_of(env)
     return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
-        "ended": np.array([env._ended]),
+        "ended": np.array([env.inside.ended]),
         "streams": streams,
         "seeds": seeds,
         "pictured": [(env._last_reward, env._return)],
@@ -59,7 +59,7 @@ def read_columns(env: Constructed, column: Callable[[Any], Column]) -> Columns:
         env: The environment, or the prototype of several.
         column: Copies a value, or those of several environments.
     """
-    columns: Columns = {name: column(getattr(env._readings, name)) for name in READ}
+    columns: Columns = {name: column(getattr(env.inside.readings, name)) for name in READ}
     texts = {name: env.out[name] for name in env.out.strings}
     groups = {"parameters": env.parameters, "variables": env.variables, "texts": texts}
     for kind, values in groups.items():
@@ -81,10 +81,10 @@ def _stream_of(env: Constructed) -> tuple[Any, list[Any]]:
 
 def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     """Let an environment go on from the columns, except for the FMU's state."""
-    read = env._readings
+    read = env.inside.readings
     for name in _NUMBERS:
         setattr(read, name, tuple(np.asarray(columns[name][place], np.float64).tolist()))
-    read.state = read.values[: env._output_count]
+    read.state = read.values[: env.inside.output_count]
     read.action = _native_value(columns["action"], place)
     read.previous_action = _native_value(columns["previous_action"], place)
     read.step_count = int(columns["step_count"][place])
@@ -99,7 +99,7 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
     env._last_reward, env._return = (None, 0.0) if pictured is None else pictured[place]
     vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
-    env._was_reset, env._ended = True, bool(columns["ended"][place])
+    env.inside.was_reset, env.inside.ended = True, bool(columns["ended"][place])
 
 
 def _native_value(column: Any, place: int) -> Any:

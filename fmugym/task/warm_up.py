@@ -174,7 +174,7 @@ class WarmUps:
     def _key(self, parts: Iterable[bytes]) -> bytes:
         if self._prefix is None:
             self._prefix = state_files(self._env.fmu)
-            spec = repr(essence(self._env._spec))
+            spec = repr(essence(self._env.inside.spec))
             self._scope = f"{self._prefix} {spec} {self._warm_up.digest}".encode()
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
@@ -212,7 +212,7 @@ class WarmUps:
     @property
     def _size_of_numbers(self) -> int:
         """How many bytes stand before the FMU's state."""
-        return 8 * (len(self._env._interface.inputs) + sum(self._sizes))
+        return 8 * (len(self._env.inside.interface.inputs) + sum(self._sizes))
 
     # Warm-ups
 
@@ -260,8 +260,8 @@ class WarmUps:
         given = np.empty((len(pool.inputs), len(indices)))
         for row, value in zip(given, self._warm_up.inputs(env), strict=True):
             row[:] = value
-        if not env._input_writer.all_real:
-            columns = [to_input_types(env._interface.inputs, column) for column in given.T]
+        if not env.inside.input_writer.all_real:
+            columns = [to_input_types(env.inside.interface.inputs, column) for column in given.T]
             given = np.array(columns).T
         env.inputs = given
         pool.inputs[:, indices] = given
@@ -269,8 +269,8 @@ class WarmUps:
         pool.step(None, skip)
         for index in indices[pool.statuses[indices] > _WARNING].tolist():
             raise failed_reset(self._located(pool, index))
-        env._readings.values = outputs = pool.outputs[:, indices]
-        env.state = outputs[: env._output_count]
+        env.inside.readings.values = outputs = pool.outputs[:, indices]
+        env.state = outputs[: env.inside.output_count]
 
     def _located(self, pool: Pool, index: int) -> str:
         text = f"the warm-up failed: {pool.failure(index)}"
@@ -307,7 +307,7 @@ def rows_of_one(env: Any) -> Readings:
     return replace(
         readings,
         **rows,
-        state=rows["values"][: env._output_count],
+        state=rows["values"][: env.inside.output_count],
         parameters=MappingProxyType(
             ParameterValues((n, _row(v)) for n, v in readings.parameters.items())
         ),

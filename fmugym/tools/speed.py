@@ -88,7 +88,7 @@ def bench(make_env: Callable[[], FMUEnv], sizes: Iterable[int], seconds: float) 
     load: float | None = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     env = make_env()
     try:
-        time_step = env._spec.time_step
+        time_step = env.inside.spec.time_step
         report = Report((_of_single(env, seconds),), time_step, _processors(), load)
     finally:
         env.close()
@@ -166,14 +166,14 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     episode may have, so that they stay near states that occur.
     """
     pool = env._open_pool("a measurement")
-    variables = tuple(env._plan.model_variables)
+    variables = tuple(env.inside.plan.model_variables)
     rng = np.random.default_rng(0)
-    limit = min(env._step_limit, 1000)
+    limit = min(env.inside.step_limit, 1000)
     best = float("inf")
     end = perf_counter() + seconds / 2
     try:
         while perf_counter() < end:
-            pool.reset(variables, env._plan.draw_starts(rng, pool.num_instances))
+            pool.reset(variables, env.inside.plan.draw_starts(rng, pool.num_instances))
             begin = perf_counter()
             for _ in range(limit):
                 pool.step(None)

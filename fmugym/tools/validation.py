@@ -208,7 +208,7 @@ def _findings(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
     yield _of_repetition(env, first)
     pairs = {
         name: [_play(env, _always(value)) for value in ends]
-        for name, *ends in _extremes(env.action_space, env._interface.input_names)
+        for name, *ends in _extremes(env.action_space, env.inside.interface.input_names)
     }
     yield from _of_actions(env, pairs)
     yield from _of_parameters(env)
@@ -316,7 +316,7 @@ def _of_parameters(env: FMUEnv) -> Iterator[Finding]:
 
 def _numbers_of(env: FMUEnv, name: str) -> dict[str, Any]:
     """What a parameter is, by scalars; nothing for Strings and structural parameters."""
-    known = env._interface.parameters
+    known = env.inside.interface.parameters
     scalars = env.fmu.description.scalars(name)
     return {v.name: known[v.name] for v in scalars if v.name in known}
 
@@ -349,7 +349,7 @@ def _two_values(env: FMUEnv, name: str, value: Any) -> list[Any]:
 
 def _of_inputs(env: FMUEnv) -> Iterator[Finding]:
     """Tell the inputs of the FMU that nobody writes."""
-    interface = env._interface
+    interface = env.inside.interface
     written = {*interface.input_names, *interface.parameters}
     idle = [
         variable.name

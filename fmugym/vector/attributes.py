@@ -77,7 +77,7 @@ class Attributes:
         }
         for variable, column in columns.items():
             for value in column.tolist():
-                self._prototype._interface.within(variable, value)
+                self._prototype.inside.interface.within(variable, value)
         for variable, column in columns.items():
             self._engine.set_parameter(variable.name, column)
 

@@ -22,9 +22,7 @@ from fmugym.vector.hooks.tables import functions_of, places_of
 
 __all__ = ["Contents", "borrowed", "differs"]
 
-_NOT_COMPARED: Final = frozenset(
-    {"_readings", "_in_hooks", "_input_row", "_output_row", "_observation_row"}
-)
+_NOT_COMPARED: Final = frozenset({"inside", "_input_row", "_output_row", "_observation_row"})
 """Attributes that the caller of hooks and the pool change."""
 
 _LARGEST_OUTSIDE: Final = 2000
@@ -179,13 +177,13 @@ def borrowed(env: FMUEnv, outside: bool = False) -> Iterator[Contents]:
         env: The environment.
         outside: Whether this is to hold for global variables, too.
     """
-    before, env._in_hooks = env._in_hooks, True
+    before, env.inside.in_hooks = env.inside.in_hooks, True
     contents = Contents(env, outside)
     try:
         yield contents
     finally:
         contents.restore()
-        env._in_hooks = before
+        env.inside.in_hooks = before
 
 
 def _has_changed(kept: _Kept) -> bool:

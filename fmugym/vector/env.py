@@ -120,7 +120,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         env = self._prototype
         try:
-            self._pool = env._opening.open(self.num_envs, **pool_options)
+            self._pool = env.inside.opening.open(self.num_envs, **pool_options)
             try:
                 env._use(self._pool)
                 env._has_chosen = True  # to be stepped by an engine

@@ -30,7 +30,7 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
     """
     env = EnvMaker(make_env).make()
     env._require_construction()
-    env._use(env._opening.open(num_instances, **options))
+    env._use(env.inside.opening.open(num_instances, **options))
     return env
 
 
@@ -90,7 +90,7 @@ def _differences(first: FMUEnv, second: FMUEnv) -> dict[str, bool]:
     return {
         "class": type(first) is not type(second),
         "FMU": first.fmu.path != second.fmu.path,
-        "interface to the FMU": not _are_equal(first._spec, second._spec),
+        "interface to the FMU": not _are_equal(first.inside.spec, second.inside.spec),
         "action space": first.action_space != second.action_space,
         "observation space": first.observation_space != second.observation_space,
     }

@@ -96,7 +96,7 @@ class Player:
 
     def __init__(self, env: FMUEnv) -> None:
         env._keep_readings()
-        self._own = env._readings
+        self._own = env.inside.readings
         self._pool: Any = env._open_pool("step")
         self._numbers: dict[str, npt.NDArray[Any]] = {}
         self._compile(env)
@@ -104,7 +104,7 @@ class Player:
     def _compile(self, env: FMUEnv) -> None:
         self._watched = tuple(_watched_in(env))
         task = _traced(env, self._numbers)
-        plan, ended = env._plan, np.zeros(1, np.bool_)
+        plan, ended = env.inside.plan, np.zeros(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
         self._starts = plan.constants[:, None].copy()
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
@@ -116,14 +116,14 @@ class Player:
 
     def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
         """Hand the programs and their arrays to the pool."""
-        plan, layout = env._plan, Layout(task, env, 1)
+        plan, layout = env.inside.plan, Layout(task, env, 1)
         self._pool.prepare_play(
             plan.model_variables,
             memory.programs(task),
             memory.action_group(),
             self._starts,
             (given_draws(plan), np.zeros((1, 6), np.uint64)),
-            (self._rows.step_count, memory.ended, env._step_limit),
+            (self._rows.step_count, memory.ended, env.inside.step_limit),
             memory.surroundings(task, results=None),
         )
         arrays = tuple(np.zeros(shape, dtype) for shape, dtype in layout.shapes)
@@ -162,15 +162,15 @@ class Player:
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False
         self._pool.inputs[:, 0] = own.inputs
-        env._readings = self.readings
+        env.inside.readings = self.readings
         return True
 
     def keep(self, env: FMUEnv) -> None:
         """Let the environment keep again what hooks read, as after the latest step."""
         own, now = self._own, self.readings
-        if env._readings is not now:
+        if env.inside.readings is not now:
             return
-        env._readings = own
+        env.inside.readings = own
         if now.step_count == own.step_count:
             return  # nothing has happened
         for name in _KEPT:
@@ -236,7 +236,7 @@ class PoolReadings:
 
     def __init__(self, env: FMUEnv, own: Readings, rows: Readings, memory: Memory) -> None:
         self._env, self._own = weakref.ref(env), own
-        self._width, self._count = env._output_count, rows.step_count
+        self._width, self._count = env.inside.output_count, rows.step_count
         self._outputs, self._inputs = rows.values[:, 0], rows.inputs[:, 0]
         self._kept, self._done = memory.kept[:, 0], rows.done
         self._current, self._previous = memory.actions

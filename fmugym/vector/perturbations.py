@@ -98,7 +98,7 @@ class _Perturbation:
         self._envs, self._engine, self._pool = envs, envs._engine, envs._pool
         self._space = float_box(envs.single_action_space, "action")
         self._x = tuple(map(env.fmu.variable, states))
-        self._count_of_y = env._output_count
+        self._count_of_y = env.inside.output_count
         self._start = start
         self._times: FloatArray = np.empty(0)
         self._everywhere = np.arange(envs.num_envs)
@@ -107,7 +107,7 @@ class _Perturbation:
             for name, column in start.columns_for(envs._episodes.scope)["parameters"].items()
             if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
-        fixed = [env._interface.parameter(name, value) for name, value in given.items()]
+        fixed = [env.inside.interface.parameter(name, value) for name, value in given.items()]
         pairs = zip(fixed, given.values(), strict=True)
         self._fixed = np.array([checked_value(variable, value) for variable, value in pairs])
         self._variables = (*fixed, *map(env.fmu.variable, states.values()), START_TIME)
@@ -174,7 +174,7 @@ class _Perturbation:
             y.append(self._pool.outputs[: self._count_of_y, 0].copy())
         self._bundle: Bundle = Bundle.of_all(bundles)
         self._columns: Columns = stacked(columns)
-        spec = self._envs._prototype._spec
+        spec = self._envs._prototype.inside.spec
         heads = self._bundle.heads
         self._times = np.array([spec.communication_point(h.steps, h.start_time) for h in heads])
         return np.array(x), np.array(y)

@@ -103,7 +103,7 @@ def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
     """Let hooks read the columns; parameters and variables are placed elsewhere."""
     for name in READ:
-        place_column(getattr(env._readings, name), columns[name], sources, which)
+        place_column(getattr(env.inside.readings, name), columns[name], sources, which)
 
 
 def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Which) -> None:

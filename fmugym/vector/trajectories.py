@@ -161,7 +161,7 @@ def _name(env: FMUEnv) -> str:
 
 
 def _outputs(env: FMUEnv) -> tuple[Variable, ...]:
-    return env._spec.outputs[: env._output_count]
+    return env.inside.spec.outputs[: env.inside.output_count]
 
 
 def _states(env: FMUEnv, given: Any) -> dict[str, str]:
@@ -191,7 +191,7 @@ def _states(env: FMUEnv, given: Any) -> dict[str, str]:
 
 def _obstacle(env: FMUEnv, states: States) -> str:
     """Why the FMU offers no directional derivatives for a trajectory; empty if it does."""
-    description, spec = env.fmu.description, env._spec
+    description, spec = env.fmu.description, env.inside.spec
     if not description.capabilities.provides_derivatives:
         return "the FMU does not offer any"
     declared = set(description.state_derivatives)
@@ -227,7 +227,7 @@ def _by_directional_derivatives(
     """Play the trajectory with an instance of its own, and ask that for derivatives."""
     env = envs._maker.make()
     try:
-        env._use(env._opening.open(1))
+        env._use(env.inside.opening.open(1))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)
@@ -256,12 +256,12 @@ class _Follower:
     def __init__(self, env: FMUEnv, states: States) -> None:
         description = env.fmu.description
         self._env, self._pool = env, env._open_pool("linearize_along")
-        spec = env._spec
+        spec = env.inside.spec
         self._time_step = spec.substeps * spec.communication_step_size
         self._x = tuple(map(description.variable, states))
         slopes = description.state_derivatives
         self._x_dot = tuple(description.variable(slopes[name]) for name in states)
-        self._u, self._y = env._spec.inputs, _outputs(env)
+        self._u, self._y = env.inside.spec.inputs, _outputs(env)
 
     def follow(self, nominal: npt.NDArray[Any]) -> Matrices:
         """Play the nominal actions."""
@@ -335,13 +335,13 @@ def _require_no_feedback(env: FMUEnv, action: npt.NDArray[Any]) -> None:
     Raises:
         ConfigError: If the inputs change with the outputs.
     """
-    wanted, values, state = _inputs_of(env, action), env._readings.values, env.state
-    env._readings.values = tuple(value + 0.01 * (abs(value) or 1.0) for value in values)
-    env.state = env._readings.values[: len(state)]
+    wanted, values, state = _inputs_of(env, action), env.inside.readings.values, env.state
+    env.inside.readings.values = tuple(value + 0.01 * (abs(value) or 1.0) for value in values)
+    env.state = env.inside.readings.values[: len(state)]
     try:
         found = _inputs_of(env, action)
     finally:
-        env._readings.values, env.state = values, state
+        env.inside.readings.values, env.state = values, state
     if found != wanted:
         raise ConfigError(
             "_get_inputs depends on the outputs, which directional derivatives of the FMU do not "
@@ -357,7 +357,7 @@ def _inputs_by_action(env: FMUEnv, action: npt.NDArray[Any]) -> FloatArray:
     """
     space = float_box(env.action_space, "action")
     up, down, widths = moved_both_ways(space, action[None], precise_step(space))
-    slopes = np.empty((len(env._spec.inputs), action.size))
+    slopes = np.empty((len(env.inside.spec.inputs), action.size))
     for place in np.ndindex(action.shape):
         ends = (_inputs_of(env, _replaced(action, place, one[0][place])) for one in (up, down))
         upper, lower = map(np.array, ends)

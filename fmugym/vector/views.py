@@ -35,9 +35,9 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     return Readings(
         values=outputs,
         out=env.out.over(lambda: outputs),
-        state=outputs[: env._output_count],
-        previous_state=np.zeros((env._output_count, count)),
-        inputs=np.zeros((len(env._start_inputs), count)) if inputs is None else inputs,
+        state=outputs[: env.inside.output_count],
+        previous_state=np.zeros((env.inside.output_count, count)),
+        inputs=np.zeros((len(env.inside.start_inputs), count)) if inputs is None else inputs,
         action=action,
         previous_action=action.copy(),
         step_count=np.zeros(count, np.int64),

@@ -59,17 +59,17 @@ class BatchEngine(Engine):
         self._n = num_envs
         self._pool = env._open_pool("a vector environment")
         self._streams = EpisodeStreams(num_envs)
-        self._limit = min(env._step_limit, max_episode_steps or sys.maxsize)
+        self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
         self._idle: MaskArray | None = None
         self._foreign = np.zeros(num_envs, np.bool_)
-        env._readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
-        env._was_reset = True  # for the calls on single environments
+        env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
+        env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
         self._outputs_before: FloatArray = self._pool.outputs
         self._variables_before: dict[str, FloatArray] = {}
-        self._make_parameters(env._plan)
+        self._make_parameters(env.inside.plan)
         self._note_foreign(slice(None), False)
 
     def _make_parameters(self, plan: EpisodePlan) -> None:
@@ -86,9 +86,9 @@ class BatchEngine(Engine):
         """See ``Engine.set_parameter``."""
         env, before = self.env, self._parameters
         self._given[name] = numbers_of(values) if values.dtype == object else values
-        env._interface = env._interface.with_parameter(name, values, 0)
-        env._plan = env._plan_episode({})
-        self._make_parameters(env._plan)
+        env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
+        env.inside.plan = env._plan_episode({})
+        self._make_parameters(env.inside.plan)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
         self._note_foreign(slice(None), True)
@@ -209,13 +209,13 @@ class BatchEngine(Engine):
         self._streams.seed(seeds, indices)
         plan = self.env._plan_of_reset(options, "reset_mask")
         drawn = self._begin(mask, indices, plan)
-        self.env._in_hooks = True
+        self.env.inside.in_hooks = True
         try:
             observations = self._observe()
             self._require_finite_start(observations, mask)
             return observations, self._infos(mask) | drawn_info(plan, drawn, mask.copy())
         finally:
-            self.env._in_hooks = False
+            self.env.inside.in_hooks = False
             self.note_starts(mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
@@ -232,7 +232,7 @@ class BatchEngine(Engine):
         drawn = self._streams.draw(plan, indices)
         values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
-        warm_ups = self.env._warm_ups
+        warm_ups = self.env.inside.warm_ups
         if warm_ups is None:
             self._reset_pool(mask, indices, plan, values)
             self._forget(indices, plan)
@@ -283,10 +283,10 @@ class BatchEngine(Engine):
         env = self.env
         env.step_count[indices] = 0
         env.previous_state[:, indices] = env.state[:, indices]
-        no_action = np.reshape(env._no_action, (*env.action.shape[:-1], 1))
+        no_action = np.reshape(env.inside.no_action, (*env.action.shape[:-1], 1))
         env.action[..., indices] = env.previous_action[..., indices] = no_action
         env.done[indices] = False
-        for row, (name, start) in zip(env.inputs, env._start_inputs, strict=True):
+        for row, (name, start) in zip(env.inputs, env.inside.start_inputs, strict=True):
             row[indices] = (
                 self._parameters[name][indices] if name in plan.parameter_names else start
             )
@@ -304,7 +304,7 @@ class BatchEngine(Engine):
         Returns:
             The parameters in the order of the plan, shape (P, N).
         """
-        default = plan is self.env._plan
+        default = plan is self.env.inside.plan
         self._place(plan.variable_starts, plan.variable_starts.values(), indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
@@ -372,7 +372,7 @@ class BatchEngine(Engine):
 
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
         """Whether parameters that are placed are not all those of the plan."""
-        plan = self.env._plan
+        plan = self.env.inside.plan
         own = all(
             (np.asarray(columns[name]) == value).all()
             for name, value in plan.constants_shown.items()
@@ -392,11 +392,11 @@ class BatchEngine(Engine):
 
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
-        self.env._in_hooks = True
+        self.env.inside.in_hooks = True
         try:
             observations = self._observe()
         finally:
-            self.env._in_hooks = False
+            self.env.inside.in_hooks = False
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
         self._require_finite_start(observations, mask)
@@ -409,11 +409,11 @@ class BatchEngine(Engine):
         env, pool = self.env, self._pool
         self.has_moved = False
         actions = self._checked(actions)
-        env._in_hooks = True
+        env.inside.in_hooks = True
         try:
             self._take_actions(actions, resetting)
             if resetting is not None:
-                drawn = self._begin(resetting, resetting.nonzero()[0], env._plan)
+                drawn = self._begin(resetting, resetting.nonzero()[0], env.inside.plan)
             observed = self._new_observations()
             self.has_moved = True
             pool.step(None, resetting, observed)
@@ -422,17 +422,17 @@ class BatchEngine(Engine):
                 return self._evaluate(observed, None)
             env.step_count[resetting] = 0
             result = self._evaluate(observed, resetting)
-            result.infos.update(drawn_info(env._plan, drawn, resetting.copy()))
+            result.infos.update(drawn_info(env.inside.plan, drawn, resetting.copy()))
             return result
         finally:
-            env._in_hooks = False
+            env.inside.in_hooks = False
 
     def _take_actions(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         env = self.env
         before = env.action, env.previous_action, env.previous_state
         env.previous_action, env.action = env.action, actions
         self._outputs_before = self._pool.outputs.copy()
-        env.previous_state = self._outputs_before[: env._output_count]
+        env.previous_state = self._outputs_before[: env.inside.output_count]
         try:
             self._write_inputs(env._get_inputs(), resetting)
         except BaseException:  # no FMU was touched: valid actions may follow
@@ -453,10 +453,10 @@ class BatchEngine(Engine):
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
         results.write_inputs(values, inputs)
-        if not self.env._input_writer.all_real:
+        if not self.env.inside.input_writer.all_real:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
-                    self.env._interface.inputs, inputs[:, index]
+                    self.env.inside.interface.inputs, inputs[:, index]
                 )
         self._require_finite_inputs(resetting)
 
@@ -476,9 +476,9 @@ class BatchEngine(Engine):
                 )
 
     def _new_observations(self) -> npt.NDArray[np.float32] | None:
-        if not self.env._pool_observes:
+        if not self.env.inside.pool_observes:
             return None
-        return np.empty((self._n, self.env._output_count), np.float32)
+        return np.empty((self._n, self.env.inside.output_count), np.float32)
 
     def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
         env, statuses = self.env, self._pool.statuses
@@ -494,7 +494,7 @@ class BatchEngine(Engine):
             rewards[resetting] = 0.0
         if observed is None:
             observations = results.observations(observations, env.observation_space, self._n)
-        infos = self._infos(np.ones(self._n, np.bool_)) if env._has_info else {}
+        infos = self._infos(np.ones(self._n, np.bool_)) if env.inside.has_info else {}
         result = StepResult(observations, rewards, terminated, truncated, infos)
         wrong = not_finite(observations)
         if resetting is not None and wrong is not None:
@@ -539,7 +539,9 @@ class BatchEngine(Engine):
         row = results.variable(name, value, self._n)
         if row.dtype == np.float64:
             return row
-        return row.astype(results.type_of_variable(self.env._plan, name, row.dtype), copy=False)
+        return row.astype(
+            results.type_of_variable(self.env.inside.plan, name, row.dtype), copy=False
+        )
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._variables_before.items():
@@ -559,10 +561,10 @@ class BatchEngine(Engine):
         return results.observations(env._get_observation(), env.observation_space, self._n)
 
     def _infos(self, mask: MaskArray) -> dict[str, Any]:
-        if not self.env._has_info:
+        if not self.env.inside.has_info:
             return {}
         infos = results.info_arrays(self.env._get_info(), mask)
-        if self.env._pool_tells:
+        if self.env.inside.pool_tells:
             infos |= results.info_arrays(self._pool.info(), mask)
         return infos
 
@@ -616,7 +618,7 @@ class BatchEngine(Engine):
         undone = faulty & ~failed
         if undone.any():
             self._undo(undone)
-        if undone.any() or env._has_info or not env._pool_observes:
+        if undone.any() or env.inside.has_info or not env.inside.pool_observes:
             self._see_again(result, faulty, reasons)
         texts = np.full(self._n, None, dtype=object)
         texts[faulty] = list(reasons.values())
@@ -629,7 +631,7 @@ class BatchEngine(Engine):
     def _undo(self, mask: MaskArray) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
         self._pool.outputs[:, mask] = self._outputs_before[:, mask]
-        if self.env._own.update:
+        if self.env.inside.own.update:
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
             self._pool.note_fault(index)
@@ -644,7 +646,7 @@ class BatchEngine(Engine):
                 f"environment {index}: {reasons[index]}; before it the observation is {before}"
             )
         copy_rows(again, result.observations, mask)
-        if self.env._has_info:
+        if self.env.inside.has_info:
             infos = self._infos(np.ones(self._n, np.bool_))
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 

@@ -55,12 +55,12 @@ class CompiledEngine(BatchEngine):
         self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
     ) -> None:
         super().__init__(env, num_envs, max_episode_steps)
-        self._memory = Memory(env, env._readings, self.ended, self._columns)
+        self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
         self._prepare(task)
 
     def _prepare(self, task: TracedTask | None) -> None:
         """Give the pool everything it needs for a step, if there are programs."""
-        plan, streams = self.env._plan, self._streams
+        plan, streams = self.env.inside.plan, self._streams
         self._task = task
         self._prepared = self._resets_at_once = self._is_whole = False
         if task is None:
@@ -69,10 +69,10 @@ class CompiledEngine(BatchEngine):
         self._drawn_shape = len(plan.draws), self._n
         draws = streams.native_draws(plan)
         self._draws_ahead = draws is None
-        in_pass = not self._draws_ahead and self.env._warm_ups is None
+        in_pass = not self._draws_ahead and self.env.inside.warm_ups is None
         in_pass = in_pass and self._pool.plays_alone
         self._starts_in_pass = in_pass and task.left.keys() <= {"_get_inputs"}
-        self._resets_apart = self._pool.is_attended or self.env._warm_ups is not None
+        self._resets_apart = self._pool.is_attended or self.env.inside.warm_ups is not None
         self._resets_apart = self._resets_apart or not self._pool.plays_alone
         memory = self._memory
         memory.parameters = self._parameters
@@ -130,7 +130,7 @@ class CompiledEngine(BatchEngine):
         drawn = self._draw_ahead(mask) if self._draws_ahead else np.empty(self._drawn_shape)
         self.has_moved = True
         troubled, self.any_ended = self._start(mask, seen, drawn)
-        infos = drawn_info(self.env._plan, drawn, mask)
+        infos = drawn_info(self.env.inside.plan, drawn, mask)
         if self._divided is not None:
             seen, told = self._divided(seen)
             infos = restricted(told, mask) | infos
@@ -168,7 +168,7 @@ class CompiledEngine(BatchEngine):
         """Make the array of drawn values; those that only Python can draw are in it."""
         drawn = np.empty(self._drawn_shape)
         if self._draws_ahead:
-            drawn[:, mask] = self._streams.draw(self.env._plan, np.flatnonzero(mask))
+            drawn[:, mask] = self._streams.draw(self.env.inside.plan, np.flatnonzero(mask))
         return drawn
 
     def call(
@@ -204,7 +204,7 @@ class CompiledEngine(BatchEngine):
 
     def _step_in_parts(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """Do a step for which one call of the pool may not be all."""
-        warms_up = resetting is not None and self.env._warm_ups is not None
+        warms_up = resetting is not None and self.env.inside.warm_ups is not None
         if self._any_foreign or not self._prepared or warms_up:
             return self._step_on_arrays(actions, resetting)
         if self._left or (resetting is not None and self._draws_ahead):
@@ -219,7 +219,7 @@ class CompiledEngine(BatchEngine):
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
         if resetting is not None:
-            result.infos.update(drawn_info(self.env._plan, drawn, resetting))
+            result.infos.update(drawn_info(self.env.inside.plan, drawn, resetting))
         if troubled or self._left:
             return self._completed(result, troubled, resetting, started)
         return result
@@ -287,18 +287,18 @@ class CompiledEngine(BatchEngine):
         env = self.env
         before = env.action, env.previous_action, env.previous_state
         env.previous_action, env.action = env.action, np.moveaxis(actions, 0, -1)
-        env.previous_state, env._in_hooks = env.state.copy(), True
+        env.previous_state, env.inside.in_hooks = env.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
         finally:
-            env._in_hooks = False
+            env.inside.in_hooks = False
             env.action, env.previous_action, env.previous_state = before
 
     def _with_hooks_left(self, result: StepResult, resetting: MaskArray | None) -> StepResult:
         """Call the hooks that are not compiled, in their order."""
         env, left, n = self.env, self._left, self._n
         observations, infos = result.observations, result.infos
-        env._in_hooks = True
+        env.inside.in_hooks = True
         idle = slice(0) if resetting is None else resetting
         try:
             if "_is_truncated" in left:
@@ -314,7 +314,7 @@ class CompiledEngine(BatchEngine):
             if "_get_info" in left:
                 infos = self._infos(np.ones(n, np.bool_)) | infos
         finally:
-            env._in_hooks = False
+            env.inside.in_hooks = False
         return result._replace(observations=observations, infos=infos)
 
     def _seen_by_hooks_left(
@@ -322,14 +322,14 @@ class CompiledEngine(BatchEngine):
     ) -> tuple[Any, dict[str, Any]]:
         """What the hooks that are not compiled observe where episodes have started."""
         env, left = self.env, self._left
-        env._in_hooks = True
+        env.inside.in_hooks = True
         try:
             if "_get_observation" in left:
                 observations = self._observe()
             if "_get_info" in left:
                 infos = self._infos(starting) | infos
         finally:
-            env._in_hooks = False
+            env.inside.in_hooks = False
         return observations, infos
 
     def _flat(self, actions: Any) -> npt.NDArray[Any]:
@@ -368,11 +368,11 @@ class CompiledEngine(BatchEngine):
             self._require_finite_start(result.observations, starting)
         self._require_possible_inputs(starting)
         self._outputs_before, self._variables_before = self._memory.kept, self._memory.before
-        env._in_hooks = True
+        env.inside.in_hooks = True
         try:
             self._handle_faults(result, statuses, True, not_finite(result.observations))
         finally:
-            env._in_hooks = False
+            env.inside.in_hooks = False
         self.note_ends(result.terminated, result.truncated)
         if starting is not None:
             self.note_starts(starting)
@@ -380,11 +380,11 @@ class CompiledEngine(BatchEngine):
     def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
         """Refuse inputs that are not finite, which they also are outside of their type's range."""
         inputs = self._pool.inputs
-        if not self.env._input_writer.all_real and not np.isfinite(inputs).all():
+        if not self.env.inside.input_writer.all_real and not np.isfinite(inputs).all():
             wanted = np.array(inputs)
             results.write_inputs(self.env._get_inputs(), wanted)
             for index in self._stepping(resetting):
-                fmu_spaces.to_input_types(self.env._interface.inputs, wanted[:, index])
+                fmu_spaces.to_input_types(self.env.inside.interface.inputs, wanted[:, index])
         self._require_finite_inputs(resetting)
 
 

@@ -39,8 +39,8 @@ class Layout:
         self.shapes = tuple(((self._n, *array.shape), array.dtype) for array in task.seen)
         self.names: tuple[str, ...] | None = ()
         self.divided: Callable[[Any], tuple[Any, dict[str, Any]]] | None = self._tree
-        if not task.seen and env._pool_observes:
-            self.shapes = (((self._n, env._output_count), np.dtype(np.float32)),)
+        if not task.seen and env.inside.pool_observes:
+            self.shapes = (((self._n, env.inside.output_count), np.dtype(np.float32)),)
             self.names, self.divided = None, None
         elif self._paths == [("observation",)]:
             self.names, self.divided = None, None

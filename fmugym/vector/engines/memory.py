@@ -67,7 +67,7 @@ class Memory:
 
     def show(self) -> None:
         """Let hooks on arrays read what the pool keeps."""
-        read, width = self._readings, self._env._output_count
+        read, width = self._readings, self._env.inside.output_count
         read.action, read.previous_action = (np.moveaxis(a, 0, -1) for a in self.actions)
         self.kept[:width] = read.previous_state
         read.previous_state = self.kept[:width]
@@ -126,12 +126,12 @@ class Memory:
             "highest": high,
             "current": flat[0],
             "previous": flat[1],
-            "none": np.array(env._no_action, dtype).reshape(-1),
+            "none": np.array(env.inside.no_action, dtype).reshape(-1),
         }
 
     def surroundings(self, task: TracedTask, results: Any) -> dict[str, Any]:
         """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
-        env, plan = self._env, self._env._plan
+        env, plan = self._env, self._env.inside.plan
         names = plan.parameter_names
         flat = {name: row.reshape(-1, self._n) for name, row in self.variables.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self.before.items()}
@@ -145,7 +145,7 @@ class Memory:
             ),
             "input_starts": tuple(
                 (names.index(name), start) if name in names else (-1, start)
-                for name, start in env._start_inputs
+                for name, start in env.inside.start_inputs
             ),
             "drawn_variables": tuple(
                 (flat[draw.name][draw.element or 0], number)

@@ -61,7 +61,7 @@ class PerEnvEngine(Engine):
         for env, column in zip(envs, self._columns, strict=True):
             env._use(column)
             env._prepare_hooks()  # its constructor may have set some as attributes
-        self._together = not any(env._own.step for env in envs)
+        self._together = not any(env.inside.own.step for env in envs)
         self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
@@ -73,7 +73,7 @@ class PerEnvEngine(Engine):
 
     def _make_stack(self) -> Stack | PoolStack:
         space, shared = self._envs[0].observation_space, self._pool.observations
-        is_default = self._together and all(env._pool_observes for env in self._envs)
+        is_default = self._together and all(env.inside.pool_observes for env in self._envs)
         fits = shared.dtype == space.dtype and shared.shape[1:] == space.shape
         return PoolStack(shared) if is_default and fits else make_stack(space, len(self._envs))
 
@@ -81,7 +81,8 @@ class PerEnvEngine(Engine):
         """Whether the actions are the inputs of all, so that no hook has to be asked for them."""
         if self._acts_directly is None:
             self._acts_directly = self._checks_all and all(
-                env._action_values is None and "_get_inputs" not in vars(env) for env in self._envs
+                env.inside.action_values is None and "_get_inputs" not in vars(env)
+                for env in self._envs
             )
         return self._acts_directly and type(self._envs[0])._get_inputs is FMUEnv._get_inputs
 
@@ -129,8 +130,8 @@ class PerEnvEngine(Engine):
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
-            env._interface = env._interface.with_parameter(name, values, index)
-            env._plan = env._plan_episode({})
+            env.inside.interface = env.inside.interface.with_parameter(name, values, index)
+            env.inside.plan = env._plan_episode({})
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
@@ -158,8 +159,10 @@ class PerEnvEngine(Engine):
             return self._results(items, idle, running, taken)
         except BaseException:
             for env in self._envs:
-                env._in_hooks = False
-                env._ended = env._ended or self.has_moved  # its FMU has stepped without a result
+                env.inside.in_hooks = False
+                env.inside.ended = (
+                    env.inside.ended or self.has_moved
+                )  # its FMU has stepped without a result
             raise
 
     def _results(
@@ -210,9 +213,9 @@ class PerEnvEngine(Engine):
         try:
             for index, inputs, values in zip(indices, in_time(taken.rows.T), told, strict=True):
                 env = envs[index]
-                read = env._readings
+                read = env.inside.readings
                 if actions is not None:
-                    env._in_hooks = True
+                    env.inside.in_hooks = True
                     read.previous_action, read.previous_state = read.action, read.state
                     read.action = actions[index]
                 read.inputs = inputs
@@ -221,7 +224,7 @@ class PerEnvEngine(Engine):
                     self._conclude_fully(outcomes, index, status_of[index], values)
                 else:
                     self._judge(outcomes, index, env, values)
-                env._in_hooks = False
+                env.inside.in_hooks = False
             for index in outcomes.faulty(self._stack.finite()):
                 self._fault(outcomes, index)
         except FMUGymError as error:
@@ -231,29 +234,29 @@ class PerEnvEngine(Engine):
         self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
     ) -> None:
         """Do what ``FMUEnv._conclude`` does, but leave numbers unchecked where no info follows."""
-        read = env._readings
+        read = env.inside.readings
         outcomes.values[index] = read.values
-        if env._own.update:
+        if env.inside.own.update:
             outcomes.variables[index] = read.variables.copy()
         read.values = values
-        read.state = values if env._no_monitors else values[: env._output_count]
+        read.state = values if env.inside.no_monitors else values[: env.inside.output_count]
         observed = self._observed
-        if observed is None and env._pool_observes:
-            observed = env._observation_row.copy()
+        if observed is None and env.inside.pool_observes:
+            observed = env.inside.observation_row.copy()
         steps = read.step_count
         observation, reward, ended, cut_off = conclude(
-            env, self._form, False, steps >= env._step_limit, observed
+            env, self._form, False, steps >= env.inside.step_limit, observed
         )
-        if env._has_info and _are_finite(env, reward, observation):
+        if env.inside.has_info and _are_finite(env, reward, observation):
             outcomes.infos[index] = env._info()
         if observation is not IN_POOL and not self._take(index, observation):
-            if env._is_finite(observation):
+            if env.inside.is_finite(observation):
                 self._stack.put(index, observation)
             else:
                 outcomes.misfits[index] = observation
         outcomes.rewards[index] = reward
         if ended or cut_off:
-            env._ended = True
+            env.inside.ended = True
             outcomes.terminated[index], outcomes.truncated[index] = ended, cut_off
         if steps >= self._limit:
             outcomes.truncated[index] = True
@@ -265,7 +268,7 @@ class PerEnvEngine(Engine):
         env = self._envs[index]
         result = env._conclude(self._columns[index], status, values, self._observed)
         self._note(outcomes, index, result)
-        env._in_hooks = False
+        env.inside.in_hooks = False
         if env.render_mode is not None:
             env._note_for_picture(result[1])
 
@@ -276,15 +279,15 @@ class PerEnvEngine(Engine):
         if observation is None:
             observation = self._stack.row(index)
         before = outcomes.values[index], outcomes.variables[index]
-        env._in_hooks = True
+        env.inside.in_hooks = True
         self._note(outcomes, index, env._fault_of_hooks(reward, observation, before))
-        env._in_hooks = False
+        env.inside.in_hooks = False
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
         env = self._envs[index]
-        is_first = not env._was_reset
+        is_first = not env.inside.was_reset
         try:
             result = env.reset(seed=seed, options=dict(options))
             self.has_moved = True
@@ -311,19 +314,19 @@ class PerEnvEngine(Engine):
 
         The environments learn of their actions when they conclude.
         """
-        return self._envs[0]._input_writer.of_actions(np.asarray(actions)[running])
+        return self._envs[0].inside.input_writer.of_actions(np.asarray(actions)[running])
 
     def _take_actions(self, actions: Sequence[Any], running: list[int]) -> FloatArray:
         """Ask environments for their inputs, shape (M, k)."""
-        writer, parts, index = self._envs[0]._input_writer, [], 0
+        writer, parts, index = self._envs[0].inside.input_writer, [], 0
         befores: list[tuple[Any, Any, Any, Any]] = []
         try:
             for index in running:
                 env, action = self._envs[index], actions[index]
-                env._in_hooks = True
+                env.inside.in_hooks = True
                 if not self._checks_all:
                     env._require_usable(action)
-                read = env._readings
+                read = env.inside.readings
                 state, before = read.state, read.action
                 befores.append((before, read.previous_action, read.previous_state, read.inputs))
                 read.previous_action, read.previous_state, read.action = before, state, action
@@ -386,8 +389,8 @@ class PerEnvEngine(Engine):
 def _are_finite(env: FMUEnv, reward: Any, observation: Any) -> bool:
     """Whether the numbers of a step are finite, so that no fault follows."""
     if observation is IN_POOL:
-        observation = env._observation_row
-    return isfinite(reward) and env._is_finite(observation)
+        observation = env.inside.observation_row
+    return isfinite(reward) and env.inside.is_finite(observation)
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:
@@ -399,7 +402,14 @@ def _share_constants(first: FMUEnv, env: FMUEnv) -> None:
 
     The objects of a thousand environments do not fit into the processor's caches.
     """
-    env._is_finite, env._input_writer = first._is_finite, first._input_writer
+    env.inside.is_finite, env.inside.input_writer = (
+        first.inside.is_finite,
+        first.inside.input_writer,
+    )
     env.out.share_names(first.out)
-    if env._own == first._own:
-        env._own, env._observe, env._elements = first._own, first._observe, first._elements
+    if env.inside.own == first.inside.own:
+        env.inside.own, env.inside.observe, env.inside.elements = (
+            first.inside.own,
+            first.inside.observe,
+            first.inside.elements,
+        )

@@ -79,7 +79,7 @@ def find_difference(
     obstacle = _obstacle(env)
     if obstacle is not None:
         return obstacle
-    hooks = [hook for hook in ORDER if hook not in _IDLE or hook in env._own]
+    hooks = [hook for hook in ORDER if hook not in _IDLE or hook in env.inside.own]
     with (
         np.errstate(all="ignore"),
         warnings.catch_warnings(),
@@ -100,7 +100,7 @@ def find_difference(
 
 def _obstacle(env: FMUEnv) -> str | None:
     """What keeps hooks from being called on arrays, whatever they compute."""
-    for method, is_own in (("step", env._own.step), ("reset", env._own.reset)):
+    for method, is_own in (("step", env.inside.own.step), ("reset", env.inside.own.reset)):
         if is_own:
             return f"{method} is overridden, which is for one environment only"
     if not is_array_space(env.action_space):
@@ -155,7 +155,7 @@ Visited = tuple[FloatArray, FloatArray, FloatArray]
 
 def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     """Run short episodes with small inputs; a slow FMU would take long for more."""
-    pool, plan = env._open_pool("the hook check"), env._plan
+    pool, plan = env._open_pool("the hook check"), env.inside.plan
     if pool.is_real:
         return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)
@@ -180,7 +180,7 @@ def states_around(env: FMUEnv, reaches: Sequence[float]) -> list[Visited]:
         env: The environment.
         reaches: How far each is from there, relative to the magnitudes of the values.
     """
-    rng, now = np.random.default_rng(0), env._readings
+    rng, now = np.random.default_rng(0), env.inside.readings
     centres = [np.array(values, np.float64) for values in (now.values, now.values, now.inputs)]
 
     def moved(reach: float) -> Any:
@@ -207,12 +207,12 @@ def _place_sample(
     rows: dict[str, list[Any]],
 ) -> None:
     before, batch.values[:, index], batch.inputs[:, index] = visited
-    batch.previous_state[:, index] = before[: env._output_count]
+    batch.previous_state[:, index] = before[: env.inside.output_count]
     batch.step_count[index] = 1 + index
     batch.done[index] = bool(rng.integers(2))
     for actions in (batch.action, batch.previous_action):
         actions[..., index] = sample_of(env.action_space, rng)
-    episode = env._plan.draw(rng)
+    episode = env.inside.plan.draw(rng)
     for name, value in {**episode.parameters, **episode.variables}.items():
         rows.setdefault(name, []).append(value)
 

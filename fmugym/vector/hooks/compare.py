@@ -79,7 +79,7 @@ class _Comparison:
         name: Any = rest[0]
         match kind:
             case "output":
-                return env._readings.values[index]
+                return env.inside.readings.values[index]
             case "kept":
                 return env.previous_state[index]
             case "input":
@@ -109,7 +109,7 @@ class _Comparison:
 
     def _typed(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         result = values.copy()
-        for index, variable in enumerate(self._env._interface.inputs):
+        for index, variable in enumerate(self._env.inside.interface.inputs):
             one = values[index : index + 1]
             try:
                 result[index] = fmu_spaces.to_input_types([variable], one)[0]
@@ -122,7 +122,7 @@ class _Comparison:
         env, count = self._env, self._count
         seen = tuple(np.zeros((count, *a.shape), a.dtype) for a in self._task.seen)
         judged = evaluate(self._task.judgement, self._find, self._actions, seen)
-        if env._own.update:
+        if env.inside.own.update:
             env._update()
             for name in self._task.updated:
                 kept = results.variable(name, env.variables[name], count)

@@ -35,7 +35,7 @@ def symbolic_readings(
         return loaded(graph, "row", element_names(shape, *head), dtype)
 
     values = rows((len(env.out),), "output")
-    state = values[: env._output_count]
+    state = values[: env.inside.output_count]
     names = EpisodeVariables(env.config.episode_variables)
     for name, dtype in variables.items():
         shape = np.shape(env.config.episode_variables[name])
@@ -45,8 +45,10 @@ def symbolic_readings(
         values=values,
         out=symbolic_outputs(env, values),
         state=state,
-        previous_state=rows((len(env.out),), "kept")[: env._output_count] if judging else state,
-        inputs=rows((len(env._interface.inputs),), "input"),
+        previous_state=rows((len(env.out),), "kept")[: env.inside.output_count]
+        if judging
+        else state,
+        inputs=rows((len(env.inside.interface.inputs),), "input"),
         action=_symbolic_action(env, graph, "action"),
         previous_action=_symbolic_action(env, graph, "previous_action"),
         step_count=rows((), "step_count", dtype=np.int64),
@@ -54,7 +56,7 @@ def symbolic_readings(
         after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
             SymbolicParameters(
-                {n: rows((), "parameter", n) for n in env._interface.parameters},
+                {n: rows((), "parameter", n) for n in env.inside.interface.parameters},
                 env.fmu.description.strings,
             )
         ),

@@ -109,7 +109,7 @@ def trace_hooks(
         UntraceableError: If ``_update`` or ``_is_done``, on which other hooks depend, do what a
             program cannot do; the text names the hook, the line and what it does.
     """
-    if env._pool_tells:
+    if env.inside.pool_tells:
         raise UntraceableError("the pool tells infos of its own")
     if np.dtype(env.action_space.dtype) not in map(np.dtype, TYPES):
         raise UntraceableError(f"its actions are {env.action_space.dtype}")
@@ -178,7 +178,9 @@ class Tracer:
         for name, row in self._attributes.items():
             names = element_names((), "attribute", name)
             vars(self._env)[name] = loaded(self._graph, "row", names, row.dtype)
-        self._env._readings = symbolic_readings(self._env, self._graph, self._variables, judging)
+        self._env.inside.readings = symbolic_readings(
+            self._env, self._graph, self._variables, judging
+        )
         self._contents = Contents(self._env, outside=True)
 
     def _call(self, name: str, of: Callable[[Any], Any]) -> Any:
@@ -230,7 +232,7 @@ class Tracer:
             return compile_graph(Graph(), [], [], 0)
 
     def _input_nodes(self, value: Any) -> list[int]:
-        variables = self._env._interface.inputs
+        variables = self._env.inside.interface.inputs
         is_list = isinstance(value, list | tuple)
         if not is_list:
             array = as_symbols(self._graph, value)
@@ -265,7 +267,7 @@ class Tracer:
 
     def _trace_update(self) -> tuple[list[Store], tuple[str, ...]]:
         """Trace ``_update``; environments that have not stepped keep their variables."""
-        if not self._env._own.update:
+        if not self._env.inside.own.update:
             return [], ()
         before = dict(self._env.variables)
         old = {name: symbols.copy() for name, symbols in before.items()}
@@ -290,7 +292,7 @@ class Tracer:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
-        self._variables[name] = type_of_variable(self._env._plan, name, symbols.dtype)
+        self._variables[name] = type_of_variable(self._env.inside.plan, name, symbols.dtype)
         symbols = symbols.cast(old.dtype)
         choose = self._graph.choose
         cells: Any = np.empty(old.shape, object)
@@ -322,8 +324,8 @@ class Tracer:
     def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
         """Trace the info if there is one, and the observation unless the pool makes it."""
         env = self._env
-        infos = self._seen("_get_info", self._see_info) if env._has_info else ([], [])
-        if env._pool_observes and not infos[0]:
+        infos = self._seen("_get_info", self._see_info) if env.inside.has_info else ([], [])
+        if env.inside.pool_observes and not infos[0]:
             return infos
         seen, stores = self._seen("_get_observation", self._see_observation)
         shift = len(seen)
