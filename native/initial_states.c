@@ -156,14 +156,18 @@ static Status start_anew(Pool *pool, Instance *me, const Call *call, bool again,
     return me->phase == PHASE_STEPPING ? STATUS_OK : initialize(pool, me, start, scratch);
 }
 
+static Status read_first_outputs(Pool *pool, Instance *me, Scratch scratch) {
+    instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
+    return instance_read_outputs(pool, me, scratch);
+}
+
 static Status restart(Pool *pool, Instance *me, const Call *call, bool again, Scratch scratch) {
     const Status status = start_anew(pool, me, call, again, scratch);
 
     if (status > STATUS_WARNING) {
         return me->phase == PHASE_DEAD ? STATUS_FATAL : STATUS_ERROR;
     }
-    instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    const Status got = instance_read_outputs(pool, me, scratch);
+    const Status got = read_first_outputs(pool, me, scratch);
     if (got == STATUS_OK && me->saved != NULL) {
         instance_copy_outputs(pool, me, first_outputs_of(pool, me));
     }
@@ -190,8 +194,7 @@ static Status return_to_start(Pool *pool, Instance *me, Scratch scratch) {
         give_state_up(pool, me);
         return status;
     }
-    instance_count_from(me, pool->settings.warm_up_steps * pool->settings.substeps);
-    const Status got = instance_read_outputs(pool, me, scratch);
+    const Status got = read_first_outputs(pool, me, scratch);
     if (got == STATUS_OK && !starts_like_the_saved_one(pool, me, scratch)) {
         give_state_up(pool, me);
     }

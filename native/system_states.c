@@ -6,8 +6,8 @@
 #include "system.h"
 
 typedef struct {
-    double *slots; /* the inputs, the outputs, and whether the outputs are fresh */
-    void *states[];
+    void **states;  /* of the parts; behind the slots */
+    double slots[]; /* the inputs, the outputs, and whether the outputs are fresh */
 } Saved;
 
 static size_t number_of_slots(const System *s) {
@@ -15,21 +15,13 @@ static size_t number_of_slots(const System *s) {
 }
 
 static Saved *make(const System *s) {
-    Saved *saved = calloc(1, sizeof *saved + s->count * sizeof(void *));
+    const size_t slots = number_of_slots(s);
+    Saved *saved = calloc(1, sizeof *saved + slots * sizeof(double) + s->count * sizeof(void *));
 
     if (saved != NULL) {
-        saved->slots = calloc(number_of_slots(s), sizeof(double));
-    }
-    if (saved != NULL && saved->slots == NULL) {
-        free(saved);
-        return NULL;
+        saved->states = (void **)(void *)(saved->slots + slots);
     }
     return saved;
-}
-
-static void drop(Saved *saved) {
-    free(saved->slots);
-    free(saved);
 }
 
 static Status free_states(Composite *me, Saved *saved) {
@@ -43,7 +35,7 @@ static Status free_states(Composite *me, Saved *saved) {
             worst = status > worst ? status : worst;
         }
     }
-    drop(saved);
+    free(saved);
     return worst;
 }
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import values_tools
 from gymnasium import spaces
+from process_tools import run_python
 from values_tools import VERSIONS, pools, versions
 
 import fmugym
@@ -198,6 +199,24 @@ def test_snapshots_hold_the_text(feedthrough, options):
     assert env.parameters["String_parameter"] == word
     env.close()
     envs.close()
+
+
+def test_another_process_learns_the_text_of_a_snapshot(feedthrough, tmp_path):
+    """A text that is not in the config, so that nothing else tells it."""
+    with Reading(feedthrough[3]) as env:
+        env.reset(seed=4, options={"model_parameters": {"String_parameter": "sixsix"}})
+        env.step(0)
+        (tmp_path / "state").write_bytes(pickle.dumps(env.save_state()))
+    code = f"""
+import pickle, test_strings
+env = test_strings.Reading({str(feedthrough[3])!r})
+with open({str(tmp_path / "state")!r}, "rb") as file:
+    env.restore_state(pickle.load(file))
+print(env.parameters["String_parameter"], *env.step(0)[0])
+env.close()
+"""
+    result = run_python("-c", code)
+    assert result.stdout.split() == ["sixsix", "6.0"], result.stderr
 
 
 def test_a_weighted_choice(feedthrough):

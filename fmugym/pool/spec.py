@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.texts import number_of, with_texts
+from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable
 
 __all__ = [
@@ -26,7 +25,6 @@ __all__ = [
     "PoolSpec",
     "ResetMethod",
     "is_start_time",
-    "start_variables",
     "whole_number_of_steps",
 ]
 
@@ -71,20 +69,6 @@ Without it, episodes begin at ``PoolSpec.start_time``.
 def is_start_time(variable: Variable) -> bool:
     """Whether a start variable is ``START_TIME``, which other processes have copies of."""
     return variable.type == START_TIME.type
-
-
-def start_variables(
-    find: Callable[[str], Variable], names: Iterable[str], texts: Sequence[str] = ()
-) -> tuple[Variable, ...]:
-    """Find start variables by name, ``START_TIME`` included.
-
-    Args:
-        find: Finds a variable of the FMU.
-        names: The names.
-        texts: Those that Strings among them may get.
-    """
-    found = (START_TIME if name == START_TIME.name else find(name) for name in names)
-    return tuple(with_texts(v, texts) if v.kind == "string" else v for v in found)
 
 
 class ResetMethod(StrEnum):

@@ -6,10 +6,6 @@
 #include "ends.h"
 #include "infos.h"
 
-static const char *const NAMES_AT_ENDS[] = {"final_obs", "_final_obs", "final_info", "_final_info"};
-
-enum { NAMES = sizeof NAMES_AT_ENDS / sizeof *NAMES_AT_ENDS };
-
 struct Results {
     PyObject *parts;
     PyTypeObject *class;
@@ -19,7 +15,6 @@ struct Results {
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
     Form observations, infos;
     Observed *observed;
-    PyObject *names_at_ends[NAMES];
 };
 
 /* Taking over */
@@ -64,12 +59,6 @@ static bool take_class(Results *r) {
 }
 
 static bool take_ends(Results *r) {
-    for (size_t i = 0; i < NAMES; i++) {
-        r->names_at_ends[i] = PyUnicode_InternFromString(NAMES_AT_ENDS[i]);
-        if (r->names_at_ends[i] == NULL) {
-            return false;
-        }
-    }
     r->observed = observed_take(r->last, r->number_of_seen, r->makers[MASK_ARRAY].size,
                                 &r->observations);
     return r->observed != NULL;
@@ -113,9 +102,6 @@ void results_free(Results *r) {
     }
     for (size_t i = 0; i < r->number_of_seen; i++) {
         maker_drop(&r->last[i]);
-    }
-    for (size_t i = 0; i < NAMES; i++) {
-        Py_XDECREF(r->names_at_ends[i]);
     }
     Py_XDECREF(r->parts);
     free(r);
@@ -219,17 +205,24 @@ static PyObject *infos_within(const Origin *origin, const Form *form) {
     return infos;
 }
 
+static bool set_named(PyObject *dict, const char *name, PyObject *object) {
+    const bool is_set = object != NULL && PyDict_SetItemString(dict, name, object) == 0;
+
+    Py_XDECREF(object);
+    return is_set;
+}
+
 static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
-    PyObject *const *names = r->names_at_ends;
     const char *mask = a->memory[MASK_ARRAY];
     Origin origin = origin_of(r, a);
 
     origin.memory = a->last_memory;
     origin.mask = mask;
-    return set_item(infos, names[0], observed_of(r->observed, mask, a->last, a->last_memory)) &&
-           set_item(infos, names[1], infos_mask(&origin)) &&
-           set_item(infos, names[2], infos_within(&origin, &r->infos)) &&
-           set_item(infos, names[3], infos_mask(&origin));
+    PyObject *observed = observed_of(r->observed, mask, a->last, a->last_memory);
+    return set_named(infos, "final_obs", observed) &&
+           set_named(infos, "_final_obs", infos_mask(&origin)) &&
+           set_named(infos, "final_info", infos_within(&origin, &r->infos)) &&
+           set_named(infos, "_final_info", infos_mask(&origin));
 }
 
 static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {
