@@ -19,6 +19,7 @@ from fmugym.pool.base import MaskArray, Pool
 from fmugym.signals import ordinary
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
+from fmugym.vector.alone import Turn, alone, in_use
 from fmugym.vector.arguments import (
     autoreset_mode_of,
     checked_hooks,
@@ -46,6 +47,9 @@ _SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 
 class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     """N environments of one class, whose FMU instances step in one call.
+
+    One thread at a time may use them. A method that another thread calls meanwhile raises a
+    ``SimulationError``; only ``close`` waits.
 
     Seeded with ``s``, environment i reproduces a single environment seeded with ``s + i``, step by
     step and episode after episode.
@@ -82,11 +86,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  (as in FMUEnv)
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    _turn: Turn
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUVectorEnv:
         """Keep the arguments for copies."""
         env = super().__new__(cls)
         env._arguments = args, kwargs
+        env._turn = Turn()
         return env
 
     def __init__(
@@ -153,6 +159,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Episodes and steps.
 
+    @alone
     def reset(
         self,
         *misplaced: object,
@@ -217,10 +224,20 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        if not self._is_ready or self.closed or self._background.is_pending:
-            self._refuse_step("step")
-        if not self._waits:
-            return self._step(actions)
+        turn = self._turn
+        if not turn.begin():
+            raise in_use(self, "step")
+        try:
+            if not self._is_ready or self.closed or self._background.is_pending:
+                self._refuse_step("step")
+            if not self._waits:
+                return self._step(actions)
+            return self._step_until_ends(actions)
+        finally:
+            turn.end()
+
+    def _step_until_ends(self, actions: Any) -> StepResult:
+        """Step in the mode ``DISABLED``, in which ended episodes wait for a reset."""
         engine = self._engine
         if engine.any_ended:
             self._require_ready("step")
@@ -230,6 +247,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             self._interrupt()
             raise
 
+    @alone
     def step_async(self, actions: Any) -> None:
         """Begin a step of all environments, which goes on while the caller computes.
 
@@ -332,6 +350,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         infos = merged(restricted(result.infos, ~ended), infos)
         return result._replace(observations=observations, infos=infos)
 
+    @alone
     def render(self) -> tuple[Any, ...] | None:
         """Draw all environments.
 
@@ -357,6 +376,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Snapshots.
 
+    @alone
     def save_state(self, where: Any = None) -> Snapshot:
         """Save the episodes of environments at this moment; see ``FMUEnv.save_state``.
 
@@ -372,6 +392,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._require_ready("save_state", ended=True)
         return self._episodes.save(chosen(where, self.num_envs))
 
+    @alone
     def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
         """Let environments go on from a snapshot, with their random streams.
 
@@ -403,6 +424,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._started = self._is_ready = True
         return self._engine.observe(indices)
 
+    @alone
     def rollout(
         self,
         snapshot: Snapshot | None,
@@ -457,6 +479,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Single environments.
 
+    @alone
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """Read an attribute, or else a parameter of the FMU, of each environment.
 
@@ -471,6 +494,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._open_pool("get_attr")
         return self._attributes.read(name, indices)
 
+    @alone
     def set_attr(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter of the FMU, of each environment.
 
@@ -489,11 +513,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._attributes.set(name, values)
 
     @property
+    @alone
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
         return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
 
     @property
+    @alone
     def health(self) -> dict[str, npt.NDArray[np.int64]]:
         """The counters of each environment's FMU, arrays of shape (N,); see ``FMUEnv``.
 
@@ -502,6 +528,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         return self._open_pool("health").health()
 
+    @alone
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method of each environment, or read an attribute.
 
@@ -534,11 +561,15 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
         if hasattr(self, "_engine"):  # otherwise the constructor has failed, and closed everything
-            self._background.stop()
+            self._turn.wait()
             try:
-                self._engine.close()
+                self._background.stop()
+                try:
+                    self._engine.close()
+                finally:
+                    self._pool.close()
             finally:
-                self._pool.close()
+                self._turn.end()
 
     # Copies.
 

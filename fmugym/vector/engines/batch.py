@@ -107,8 +107,8 @@ class BatchEngine(Engine):
         env = self.env
         own = {name: take(row, index) for name, row in self._columns.items()}
         with reading(env, column(Readings.of(env), index)):
-            _set_all(env, own | {"_pool": PoolColumn(self._pool, index)})
             try:
+                _set_all(env, own | {"_pool": PoolColumn(self._pool, index)})
                 yield env
             finally:
                 _set_all(env, self._columns | {"_pool": self._pool})

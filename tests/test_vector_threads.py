@@ -1,0 +1,142 @@
+"""A vector environment is for one thread at a time, and interrupts leave it whole."""
+
+import signal
+import threading
+import time
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from fmugym import SimulationError
+from fmugym.envs import CartPoleEnv
+from fmugym.vector import FMUVectorEnv
+
+ACTIONS = np.zeros(3, np.int64)
+
+
+ENTERED, MAY_GO = threading.Event(), threading.Event()
+
+
+class Lingering(CartPoleEnv):
+    """Has a method that takes a while."""
+
+    def linger(self):
+        ENTERED.set()
+        assert MAY_GO.wait(20)
+
+
+def methods(envs, snapshot):
+    return {
+        "reset": envs.reset,
+        "step": lambda: envs.step(ACTIONS),
+        "step_async": lambda: envs.step_async(ACTIONS),
+        "render": envs.render,
+        "save_state": envs.save_state,
+        "restore_state": lambda: envs.restore_state(snapshot),
+        "rollout": lambda: envs.rollout(snapshot, np.zeros((3, 2), np.int64)),
+        "get_attr": lambda: envs.get_attr("state"),
+        "set_attr": lambda: envs.set_attr("force_mag", 10.0),
+        "call": lambda: envs.call("linger"),
+        "health": lambda: envs.health,
+        "np_random_seed": lambda: envs.np_random_seed,
+    }
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_another_thread_is_refused_in_each_method(hooks):
+    ENTERED.clear()
+    MAY_GO.clear()
+    envs = FMUVectorEnv(Lingering, 3, hooks=hooks)
+    envs.reset(seed=0)
+    snapshot = envs.save_state()
+    worker = threading.Thread(target=envs.call, args=("linger",))
+    worker.start()
+    try:
+        assert ENTERED.wait(20)
+        for name, method in methods(envs, snapshot).items():
+            with pytest.raises(SimulationError, match=f"{name} .*one thread at a time"):
+                method()
+        closer = threading.Thread(target=envs.close)
+        closer.start()
+        closer.join(0.2)
+        assert closer.is_alive()
+        assert not envs.closed
+    finally:
+        MAY_GO.set()
+        worker.join(20)
+    closer.join(20)
+    assert envs.closed
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_threads_at_once_leave_it_whole(hooks):
+    """They get results or a refusal; afterwards, everything is as it was."""
+    envs = FMUVectorEnv(CartPoleEnv, 3, hooks=hooks)
+    envs.reset(seed=0)
+    snapshot, stop, wrong = envs.save_state(), time.monotonic() + 0.5, []
+    calls = methods(envs, snapshot)
+    del calls["step_async"]
+    calls["call"] = lambda: envs.call("state")
+
+    def play(seed):
+        rng = np.random.default_rng(seed)
+        while time.monotonic() < stop:
+            try:
+                calls[str(rng.choice(list(calls)))]()
+            except SimulationError:
+                continue
+            except BaseException as error:
+                wrong.append(error)
+                return
+
+    threads = [threading.Thread(target=play, args=(seed,)) for seed in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+    require_whole(envs)
+
+
+def require_whole(envs):
+    envs.set_attr("force_mag", 10.0)
+    with closing(FMUVectorEnv(CartPoleEnv, 3)) as other:
+        for one in (envs, other):
+            one.reset(seed=3)
+        for action in (0, 1, 1, 0):
+            first, second = (one.step(ACTIONS + action) for one in (envs, other))
+            np.testing.assert_array_equal(first.observations, second.observations)
+        assert envs.get_attr("state") == other.get_attr("state")
+    envs.close()
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
+@pytest.mark.parametrize("hooks", ["compiled", "array"])
+def test_interrupts_leave_it_whole(hooks):
+    envs = FMUVectorEnv(CartPoleEnv, 3, hooks=hooks)
+    envs.reset(seed=0)
+    calls = [
+        lambda: envs.get_attr("state"),
+        lambda: envs.call("time"),
+        lambda: envs.set_attr("force_mag", [9.0, 10.0, 11.0]),
+    ]
+
+    def ring(*_):
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, ring)
+    rng, interrupted = np.random.default_rng(0), 0
+    try:
+        for number in range(300):
+            try:
+                signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-6, 4e-4)))
+                while True:
+                    calls[number % len(calls)]()
+            except KeyboardInterrupt:
+                interrupted += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    assert interrupted == 300
+    require_whole(envs)
