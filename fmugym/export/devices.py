@@ -36,14 +36,13 @@ def without_imperfections(env: FMUEnv) -> Iterator[FMUEnv]:
         yield env
         return
     task: Any = replace(env.task, document=document)  # type: ignore[attr-defined]  # as above
-    other: Any = object.__new__(type(env))
+    other: Any = TaskEnv.__new__(type(env))
     TaskEnv.__init__(other, task)
     for name, value in vars(env).items():  # those that the class's own constructor has set
         if not name.startswith("_"):
             vars(other).setdefault(name, value)
-    other.inside.warm_up_steps = (
-        env.inside.warm_up_steps
-    )  # the first sample is taken when the warm-up is over
+    # the first sample is taken when the warm-up is over
+    other.inside.warm_up_steps = env.inside.warm_up_steps
     with closing(other):
         yield other
 
