@@ -9,6 +9,7 @@ import cart_poles
 import gymnasium as gym
 import single
 import tasks
+import training
 import vector
 from measure import Effort, Run, Sample, by_turns, make_runs
 from tables import Table
@@ -118,9 +119,20 @@ def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callab
     }
 
 
+def _training(effort: Effort) -> list[Table]:
+    """The table of docs/which-algorithm.md, which tells in its text who reached what is wanted."""
+    (table,) = training.tables(effort)
+    place = table.header.index("reached by")
+    table.header, *table.rows = (
+        row[:place] + row[place + 1 :] for row in (table.header, *table.rows)
+    )
+    return [table]
+
+
 DOCUMENTS: dict[str, Callable[[Effort], list[Table]]] = {
     "readme": _readme,
     "vector": _vector,
     "hooks": _hooks,
+    "training": _training,
 }
-"""What measures the tables of the README, of docs/vector.md and of docs/hooks.md."""
+"""What measures the tables of the README and of pages of docs/."""

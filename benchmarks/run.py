@@ -3,7 +3,7 @@
     python benchmarks/run.py
     python benchmarks/run.py --quick --only single
     python benchmarks/run.py --json benchmarks.json
-    python benchmarks/run.py --table readme --table vector --table hooks
+    python benchmarks/run.py --table readme --table vector --table hooks --table training
 
 In each section, the configurations take turns, in many rounds. The figures are medians over the
 rounds, and ratios are computed within a round, so that other work on the machine disturbs all
@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
         "--table",
         action="append",
         choices=DOCUMENTS,
-        help="the tables of the README, docs/vector.md or docs/hooks.md; may be repeated",
+        help="the tables of the README or of a page of docs/; may be repeated",
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures here")
     return parser

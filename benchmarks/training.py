@@ -77,13 +77,16 @@ GOALS = (
     Goal("drive.toml", None, 1.0),
     Goal("room.toml", None, 1.0),
 )
-QUICK = ("--rounds", "3", "--candidates", "8", "--steps", "20000", "--episodes", "1")
+HEADER = [
+    *("task", "minutes", "wanted", "reached, median", "worst of five", "reached by"),
+    *("baseline", "agent, most often"),
+]
+QUICK = ("--rounds", "9", "--candidates", "8", "--episodes", "1")
 
 
 def tables(effort: Effort) -> list[Table]:
     """Measure."""
-    header = ["task", "wanted", "reached, median", "worst", "reached by", "s", "baseline", "agent"]
-    table = Table("Rewards in test episodes, by `fmugym train TASK` from five seeds", header)
+    table = Table("Rewards in test episodes, by `fmugym train TASK` from five seeds", HEADER)
     with tempfile.TemporaryDirectory() as folder:
         _write_plants(Path(folder))
         for goal in GOALS[:1] if effort.quick else GOALS:
@@ -127,12 +130,12 @@ def _row(goal: Goal, runs: list[dict[str, Any]]) -> list[str]:
     wanted = [base if goal.target is None else goal.target for base in baselines]
     count = sum(one >= least for one, least in zip(reached, wanted, strict=True))
     return [
-        goal.task,
+        f"`{goal.task}`" if "/" in goal.task else f"the {Path(goal.task).stem}",
+        f"{goal.minutes:g}",
         f"{goal.target or 'its baseline'}",
         f"{statistics.median(reached):.4g}",
         f"{min(reached):.4g}",
         f"{count} of {len(runs)}",
-        f"{statistics.median(run['seconds'] for run in runs):.0f}",
         f"{statistics.median(baselines):.4g}",
         statistics.mode(run["agent"] for run in runs),
     ]
