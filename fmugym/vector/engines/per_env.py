@@ -160,9 +160,8 @@ class PerEnvEngine(Engine):
         except BaseException:
             for env in self._envs:
                 env.inside.in_hooks = False
-                env.inside.ended = (
-                    env.inside.ended or self.has_moved
-                )  # its FMU has stepped without a result
+                if self.has_moved:  # its FMU has stepped without a result
+                    env.inside.ended = True
             raise
 
     def _results(
