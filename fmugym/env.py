@@ -275,7 +275,8 @@ class FMUEnv(Constructed):
             self._player = import_module(_PLAYERS).player_of(self, self._way == "compiled")
 
     def _begin_episode(self, episode: Episode) -> None:
-        self._keep_readings()
+        if self._player is not None:
+            self._player.begin(self)
         read = self.inside.readings
         read.parameters = episode.parameters
         read.variables.update(episode.variables)

@@ -111,6 +111,8 @@ class Player:
         memory.parameters = dict(zip(plan.parameter_names, self._starts, strict=True))
         memory.hold(task)
         self._task, self.left = task, task.left
+        reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
+        self._parameters = frozenset(memory.parameters if reads else ())
         self.readings: Any = PoolReadings(env, self._own, self._rows, memory)
         self._prepare(env, task, memory)
 
@@ -136,6 +138,7 @@ class Player:
     def _watch(self) -> None:
         """Let the pool compare the attributes before each step."""
         *arrays, observe, inform = self._arrays
+        self._may_change = [one for one in self._watched if one.copy is not None]
         addresses = tuple(one.address for one in self._watched)
         self.step = self._pool.prepare_one(*arrays, addresses, observe, inform)
 
@@ -147,17 +150,19 @@ class Player:
         Returns:
             False if it keeps what programs cannot hold; Python must do the step.
         """
-        if any(one.has_changed() for one in self._watched) and not self.renew(env):
+        if any(one.has_changed() for one in self._may_change) and not self.renew(env):
             return False
         own, memory = self._own, self._memory
+        none = env.inside.no_action
         try:
             for name, row in memory.variables.items():
                 row[..., 0] = _exactly(own.variables[name], row.dtype)
             for row, action in zip(memory.actions, (own.action, own.previous_action), strict=True):
-                row[0] = _exactly(action, row.dtype).reshape(row.shape[1:])
-            for name, number in own.parameters.items():
-                if name in memory.parameters:
-                    memory.parameters[name][0] = np.nan if isinstance(number, str) else number
+                known = action is none  # an episode has begun
+                row[0] = none if known else _exactly(action, row.dtype).reshape(row.shape[1:])
+            for name in self._parameters.intersection(own.parameters):
+                number = own.parameters[name]
+                memory.parameters[name][0] = np.nan if isinstance(number, str) else number
         except ordinary(Exception):  # a user may have assigned anything
             return False
         self._rows.step_count[0], memory.ended[0] = own.step_count, False
@@ -177,6 +182,10 @@ class Player:
             setattr(own, name, getattr(now, name))
         for name in self._task.updated:
             own.variables[name] = _number_of(self._memory.variables[name][..., 0])
+
+    def begin(self, env: FMUEnv) -> None:
+        """Let the environment keep what hooks read, all of which an episode is about to set."""
+        env.inside.readings = self._own
 
     def go_back(self, env: FMUEnv) -> None:
         """Let the environment keep what hooks read when the FMU has stepped, but was not judged."""
