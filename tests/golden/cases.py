@@ -29,6 +29,7 @@ from plants import PLANTS
 import fmugym
 from fmugym import FMU, FMUGymError
 from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.envs.house import HOUSE_TASK
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import SOLVERS, START_TIME
@@ -256,9 +257,12 @@ def of_docs(name, folder):
         path.write_text((ROOT / page / title).read_text(encoding="utf-8"), encoding="utf-8")
     else:
         text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+        text = re.sub(r"^pi = .*\n", "", text, flags=re.M)  # 179b934 reads no ranges of its numbers
         found = re.findall(r"```toml\n(.*?)```", text, re.S)
         path.write_text(next(one for one in found if title in one), encoding="utf-8")
-        shutil.copy(bundled_fmu("House"), folder / "house.fmu")
+        for fmu in ("house.fmu", "House.fmu"):
+            shutil.copy(bundled_fmu("House"), folder / fmu)
+        shutil.copy(HOUSE_TASK.with_name("house_year.csv"), folder)
     return fmugym.load(path)
 
 
@@ -279,7 +283,7 @@ def tasks():
     found = {name: partial(made, name) for name in ids}
     names = ("SwingUp", "Tracking", "Uncompiled", "Goal", "Building")
     found |= {name: partial(of_user, name) for name in names}
-    pages = ("systems.md [system]", "task-file.md fmu =")
+    pages = ("systems.md [system]", "task-file.md fmu =", "from-fmu-to-agent.md fmu =")
     files = ("examples cart_pole.toml", "examples pendulum.toml")
     return found | {name: partial(of_docs, name) for name in (*pages, *files)}
 
