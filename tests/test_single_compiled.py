@@ -253,6 +253,19 @@ class TestAttributes:
                 assert same(one.step(action), other.step(action))
         assert one._player is not None
 
+    def test_several_numbers_may_be_assigned_between_two_steps(self):
+        one, other = compiled_cart(), fmugym.envs.CartPoleEnv(hooks="python")
+        other.reset(seed=0)
+        other.step(0)
+        for env in (one, other):
+            env.x_threshold = 2.3
+        assert same(one.step(1), other.step(1))
+        for env in (one, other):
+            env.force_mag, env.x_threshold = 4.0, 1e-9  # a new one, and one that was assigned
+        result = one.step(1)
+        assert same(result, other.step(1))
+        assert result[2]
+
     def test_what_hooks_read_has_names_of_its_own(self):
         class Shadow(fmugym.envs.CartPoleEnv):
             state = None

@@ -208,7 +208,8 @@ class Player:
             return False
         self.keep(env)
         try:
-            if all(self._takes(one.name, vars(env).get(one.name)) for one in changed):
+            taken = [self._takes(one.name, vars(env).get(one.name)) for one in changed]
+            if all(taken):
                 self._watched = tuple(_watched_in(env))
                 self._watch()
             else:
