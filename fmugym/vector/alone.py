@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from threading import RLock
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -20,21 +20,15 @@ class Turn:
     """Belongs to the thread that is in a method; the same thread may enter another one.
 
     Attributes:
-        begin: Returns whether this thread has the turn now; it never waits.
+        begin: Takes the turn and returns True, or False if another thread has it.
+        wait: Takes the turn, after waiting for another thread.
         end: Gives it back.
     """
 
     def __init__(self) -> None:
-        self._lock = RLock()
-        self.end = self._lock.release
-
-    def begin(self) -> bool:
-        """Take the turn, unless another thread has it."""
-        return self._lock.acquire(blocking=False)
-
-    def wait(self) -> None:
-        """Take the turn, after waiting for another thread."""
-        self._lock.acquire()
+        lock = RLock()
+        self.begin: Callable[[], bool] = partial(lock.acquire, False)
+        self.wait, self.end = lock.acquire, lock.release
 
 
 def in_use(env: Any, method: str) -> SimulationError:
