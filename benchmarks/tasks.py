@@ -129,7 +129,7 @@ def _add(table: Table, task: Task, sizes: tuple[int, ...], effort: Effort) -> No
 def _allowed_each(task: Task) -> float:
     """The time in s that an environment may take beyond its FMU, according to its programs."""
     with ExitStack() as stack:
-        programs = _fmugym(stack, task, 1, "auto")._engine._task
+        programs = _fmugym(stack, task, 1, "auto").inside.engine._task
     if programs is None:
         return float("nan")
     codes = np.concatenate([programs.inputs.code[:, 0], programs.judgement.code[:, 0]])
@@ -197,7 +197,7 @@ def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
     envs = _fmugym(stack, task, size, "per_env")
     actions = _actions(envs)
     envs.reset(seed=0)
-    engine = envs._engine
+    engine = envs.inside.engine
 
     def steps() -> None:
         for action in actions:
@@ -206,7 +206,7 @@ def per_env_runs(stack: ExitStack, task: Task, size: int) -> dict[str, Run]:
     def hooks() -> None:
         for env in engine._envs:
             env._get_inputs()
-        envs._pool.step(None, None, envs._pool.observations)
+        envs.inside.pool.step(None, None, envs.inside.pool.observations)
         for env in engine._envs:
             _call_hooks(env)
 

@@ -77,8 +77,8 @@ def _pool(stack: ExitStack, path: Path, size: int) -> Any:
     )
     stack.callback(env.close)
     plan = env.inside.plan
-    env._pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], size, axis=1))
-    return env._pool
+    env.inside.pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], size, axis=1))
+    return env.inside.pool
 
 
 def _add(table: Table, size: int, pools: list[Any], effort: Effort) -> None:

@@ -6,9 +6,8 @@ import copy
 import logging
 import os
 from collections.abc import Callable, Mapping
-from functools import cached_property
 from importlib import import_module
-from math import hypot, isfinite
+from math import isfinite
 from typing import Any, ClassVar, Final, Never
 
 import numpy as np
@@ -19,25 +18,24 @@ from fmugym.checks import check_misplaced, check_option, check_seed
 from fmugym.config import EnvConfig
 from fmugym.errors import (
     ConfigError,
-    FMUGymError,
     SimulationError,
     shortened,
-    shown,
     unknown_argument,
 )
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool import Pool
-from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
 from fmugym.systems import FMUSystem
-from fmugym.task.actions import has_nan, is_element, is_misfit
-from fmugym.task.construction import Constructed
+from fmugym.task.actions import blame, require_usable
+from fmugym.task.construction import Constructed, plan_of_reset, prepare_hooks
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import readable_named
-from fmugym.task.results import FLOAT32_LIMIT, as_flag, as_info, as_reward
+from fmugym.task.judging import Result, first_observation, info_of, judged
+from fmugym.task.pictures import note_for_picture
+from fmugym.task.results import as_flag, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
-from fmugym.task.step import conclude
+from fmugym.task.starting import start_time_of
 from fmugym.task.warm_up import WarmUps, rows_of_one
 
 __all__ = [
@@ -51,22 +49,14 @@ __all__ = [
 ]
 
 _INTEGERS: Final = frozenset({int, np.int64})
-_WARNING: Final = int(Status.WARNING)
-_TERMINATED: Final = int(Status.TERMINATED)
 _ARGUMENTS: Final = (
     *("fmu_path", "config", "log_level", "render_mode", "backend", "isolation", "hooks"),
 )
-
-IN_POOL: Final = object()
-"""Stands for the default observation of a step, which the pool has; see ``FMUEnv._conclude``."""
 
 _WAYS: Final = ("auto", "compiled", "python")
 
 _PLAYERS: Final = "fmugym.vector.one"
 """The module of players is imported late: it needs this one, and takes a while."""
-
-Result = tuple[Any, float, bool, bool, dict[str, Any]]
-"""Observation, reward, terminated, truncated and info."""
 
 
 class FMUEnv(Constructed):
@@ -141,8 +131,6 @@ class FMUEnv(Constructed):
     unphysical_keys: tuple[str, ...] = ()
     """The keys of a task for which observations or actions are not in its units."""
 
-    _way = "auto"
-
     def __init__(
         self,
         fmu_path: str | os.PathLike[str] | FMUSystem,
@@ -157,8 +145,8 @@ class FMUEnv(Constructed):
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
-        self._way = check_option("way of calling hooks", hooks, _WAYS)
-        self._construct(fmu_path, config, log_level, render_mode)
+        self.inside.way = check_option("way of calling hooks", hooks, _WAYS)
+        self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
 
     # Gymnasium's interface.
@@ -202,9 +190,9 @@ class FMUEnv(Constructed):
         check_misplaced(misplaced)
         pool = self._open_pool("reset")
         if not self.inside.was_reset:
-            self._prepare_hooks()  # the constructor of the class may have set some as attributes
+            prepare_hooks(self)  # the constructor of the class may have set some as attributes
             self._require_way(pool)
-        seed, plan = check_seed(seed), self._plan_of_reset(options)
+        seed, plan = check_seed(seed), plan_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
         episode = plan.draw(self.np_random if generator is None else generator)
@@ -215,12 +203,12 @@ class FMUEnv(Constructed):
                 self._begin_episode(episode)
             else:
                 self._begin_with_warm_up(self.inside.warm_ups, pool, plan, episode)
-            observation, info = self._observation_and_info()
-            if not self._has_chosen:
+            observation, info = first_observation(self)
+            if not self.inside.has_chosen:
                 self._choose_player(pool)
         except BaseException:
             self.inside.ended = True
-            self._halt()
+            self.inside.halt()
             raise
         info["drawn"] = episode.drawn
         if self.render_mode == "human":
@@ -250,8 +238,8 @@ class FMUEnv(Constructed):
             variables = {name: row[..., 0] for name, row in written.items()}
         read = self.inside.readings
         read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
-        read.inputs = tuple(self._input_row.tolist())
-        read.values = tuple(self._output_row.tolist())
+        read.inputs = tuple(self.inside.input_row.tolist())
+        read.values = tuple(self.inside.output_row.tolist())
         read.state = read.previous_state = read.values[: self.inside.output_count]
 
     def _obstacle(self, pool: Pool) -> str | None:
@@ -264,19 +252,21 @@ class FMUEnv(Constructed):
 
     def _require_way(self, pool: Pool) -> None:
         obstacle = self._obstacle(pool)
-        if obstacle is not None and self._way == "compiled":
+        if obstacle is not None and self.inside.way == "compiled":
             name = type(self).__name__
             raise ConfigError(f"the hooks of {name} cannot be compiled: {obstacle}")
 
     def _choose_player(self, pool: Pool) -> None:
         """Compile the hooks, where that is possible and asked for."""
-        self._has_chosen = True
-        if self._way != "python" and self._obstacle(pool) is None:
-            self._player = import_module(_PLAYERS).player_of(self, self._way == "compiled")
+        self.inside.has_chosen = True
+        if self.inside.way != "python" and self._obstacle(pool) is None:
+            self.inside.player = import_module(_PLAYERS).player_of(
+                self, self.inside.way == "compiled"
+            )
 
     def _begin_episode(self, episode: Episode) -> None:
-        if self._player is not None:
-            self._player.begin(self)
+        if self.inside.player is not None:
+            self.inside.player.begin(self.inside)
         read = self.inside.readings
         read.parameters = episode.parameters
         read.variables.update(episode.variables)
@@ -285,20 +275,10 @@ class FMUEnv(Constructed):
         given = episode.parameters.get
         read.inputs = tuple([given(name, start) for name, start in self.inside.start_inputs])
         read.done = read.after_end = False
-        read.values = tuple(self._output_row.tolist())
+        read.values = tuple(self.inside.output_row.tolist())
         read.state = read.previous_state = read.values[: self.inside.output_count]
-        self._last_reward, self._return = None, 0.0
+        self.inside.pictured = None, 0.0
         self.inside.was_reset, self.inside.ended = True, False
-
-    def _observation_and_info(self) -> tuple[Any, dict[str, Any]]:
-        self.inside.in_hooks = True
-        try:
-            observation = self._get_observation()
-            if not self.inside.is_finite(observation):
-                raise SimulationError(f"the first observation is not finite: {shown(observation)}")
-            return observation, self._info()
-        finally:
-            self.inside.in_hooks = False
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -318,33 +298,31 @@ class FMUEnv(Constructed):
             SimulationError: Before the first reset, after the end of an episode, after ``close``,
                 and, with ``on_fault="raise"``, after a fault.
         """
-        player = self._player
+        player = self.inside.player
         if player is not None:
             result = None if self.inside.ended else self._step_compiled(player, action)
             if result is not None:
                 return result
-            self._keep_readings()
-        read = self.inside.readings
-        pool = self._pool
-        if pool is None or self.inside.ended:
-            pool = self._checked_before_step()
+            self.inside.keep()
+        if self.inside.ended:
+            self._check_before_step()
         self.inside.in_hooks = True
         try:
             self._take_action(action)
             try:
-                troubled = self._step_pool()
-                read.step_count += 1
-                result = self._conclude(pool, pool.statuses.item(0) if troubled else 0)
+                troubled = self.inside.step_pool()
+                self.inside.readings.step_count += 1
+                result = judged(self, self.inside.pool.statuses.item(0) if troubled else 0)
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
                 self.inside.ended = True
                 raise
         except BaseException:  # a real system must not go on without its controller
-            self._halt()
+            self.inside.halt()
             raise
         finally:
             self.inside.in_hooks = False
         if self.render_mode is not None:
-            self._note_for_picture(result[1])
+            note_for_picture(self, result[1])
         return result
 
     def _step_compiled(self, player: Any, action: Any) -> Result | None:
@@ -357,7 +335,7 @@ class FMUEnv(Constructed):
                 result = player.step(action, self.__dict__)
         except BaseException:  # as in ``step``
             self.inside.ended = True
-            self._halt()
+            self.inside.halt()
             raise
         if result is None:
             return None
@@ -368,7 +346,7 @@ class FMUEnv(Constructed):
         if result[2] or result[3]:
             self.inside.ended = True
         if self.render_mode is not None:
-            self._note_for_picture(result[1])
+            note_for_picture(self, result[1])
         step: Result = result
         return step
 
@@ -376,7 +354,7 @@ class FMUEnv(Constructed):
         self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: dict[str, Any]
     ) -> Result | None:
         """Call the hooks that are not compiled; None if they make what is not finite."""
-        left = self._player.left
+        left = self.inside.player.left
         self.inside.in_hooks = True
         try:
             if "_is_truncated" in left:
@@ -391,10 +369,10 @@ class FMUEnv(Constructed):
             if not (isfinite(reward) and self.inside.is_finite(observation)):
                 return None
             if "_get_info" in left:
-                info = self._info()
+                info = info_of(self)
         except BaseException:  # as in ``step``
             self.inside.ended = True
-            self._halt()
+            self.inside.halt()
             raise
         finally:
             self.inside.in_hooks = False
@@ -402,26 +380,25 @@ class FMUEnv(Constructed):
 
     def _judged_again(self) -> Result:
         """Judge a step in Python: its status or a number is not good, or a hook raises."""
-        self._player.go_back(self)
+        self.inside.player.go_back(self.inside)
         if self.inside.pool_observes:
             with np.errstate(over="ignore"):  # what is infinite then is a fault
-                self.inside.observation_row[:] = self._output_row[: self.inside.output_count]
+                self.inside.observation_row[:] = self.inside.output_row[: self.inside.output_count]
         self.inside.in_hooks = True
         try:
-            pool = self._open_pool("step")
-            result = self._conclude(pool, pool.statuses.item(0))
+            result = judged(self, self.inside.pool.statuses.item(0))
         except BaseException:  # as in ``step``
             self.inside.ended = True
-            self._halt()
+            self.inside.halt()
             raise
         finally:
             self.inside.in_hooks = False
         if self.render_mode is not None:
-            self._note_for_picture(result[1])
+            note_for_picture(self, result[1])
         return result
 
-    def _checked_before_step(self) -> Pool:
-        pool = self._open_pool("step")
+    def _check_before_step(self) -> None:
+        self._open_pool("step")
         if not self.inside.was_reset:
             raise SimulationError("step was called before the first reset")
         if not self.steps_after_end:
@@ -429,14 +406,13 @@ class FMUEnv(Constructed):
         if not self.after_end:
             gymnasium_logger.warn("step was called after the end of the episode; call reset first")
         self.after_end = True
-        return pool
 
     def _take_action(self, action: Any) -> None:
         elements = self.inside.elements
         if elements is None or type(action) not in _INTEGERS or action not in elements:
-            self._require_usable(action)
+            require_usable(self, action)
         self._take_usable(action)
-        self.inside.input_writer.write(self.inside.readings.inputs, self._input_row)
+        self.inside.input_writer.write(self.inside.readings.inputs, self.inside.input_row)
 
     def _take_usable(self, action: Any) -> None:
         """Make the inputs for an action that was checked already."""
@@ -446,143 +422,19 @@ class FMUEnv(Constructed):
         try:
             read.inputs = self.inside.input_writer.checked(self._get_inputs(), action)
         except BaseException as error:  # the FMU was not touched: a better action may follow
-            self._give_up(before)
-            blaming = self._blame(action, error)
+            read.take_back(before)
+            blaming = blame(self, action, error)
             if blaming is not None:
                 raise blaming from error
             raise
-
-    def _give_up(self, before: tuple[Any, Any, Any, Any]) -> None:
-        """Return to before an action was taken, if the FMU has not stepped.
-
-        Args:
-            before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
-        """
-        read = self.inside.readings
-        read.action, read.previous_action, read.previous_state, read.inputs = before
-
-    def _require_usable(self, action: Any) -> None:
-        elements = self.inside.elements
-        if elements is not None:
-            if not is_element(action, elements):
-                raise ConfigError(f"action {shown(action)} is not in {self.action_space}")
-        elif has_nan(action):
-            raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
-
-    def _blame(self, action: Any, error: BaseException) -> ConfigError | None:
-        """The error if ``_get_inputs`` failed because of an action outside of the action space."""
-        if isinstance(error, FMUGymError) or not isinstance(error, Exception):
-            return None
-        if self.inside.own.step or not is_misfit(action, self.action_space, error):
-            return None  # with a step of its own, its actions may be others
-        return ConfigError(f"action {shown(action)} is not in {self.action_space}: {shown(error)}")
-
-    def _conclude(
-        self, pool: Pool, status: int, values: tuple[float, ...] | None = None, observed: Any = None
-    ) -> Result:
-        """Make the result of a step of the FMU.
-
-        Args:
-            pool: The FMU.
-            status: That of the step.
-            values: The outputs; None for those that the pool has.
-            observed: The default observation; None for a copy of the pool's. ``IN_POOL`` is
-                returned as it is unless the step fails.
-        """
-        stopped = False
-        if status:
-            stopped = status == _TERMINATED
-            if status > _WARNING and not stopped:
-                return self._fault(pool.failure(0))
-        read = self.inside.readings
-        variables = read.variables.copy() if self.inside.own.update else None
-        before = read.values
-        if values is None:
-            values = tuple(self._output_row.tolist())  # Python's floats are faster
-        read.values = values
-        read.state = values if self.inside.no_monitors else values[: self.inside.output_count]
-        if observed is None and self.inside.pool_observes:
-            observed = self.inside.observation_row.copy()
-        cut_off = read.step_count >= self.inside.step_limit
-        result = conclude(self, self._form, stopped, cut_off, observed)
-        observation, reward, terminated, truncated = result
-        # One call for all numbers, which is enough for nearly all steps.
-        is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
-        if not is_small:
-            if observation is IN_POOL:
-                observation = self.inside.observation_row.copy()
-            if not (isfinite(reward) and self.inside.is_finite(observation)):
-                return self._fault_of_hooks(reward, observation, (before, variables))
-        info = self._info() if self.inside.has_info else {}
-        if stopped:
-            info["fmu_terminated"] = True
-        if terminated or truncated:
-            self.inside.ended = True
-        return observation, reward, terminated, truncated, info
-
-    def _info(self) -> dict[str, Any]:
-        """Return the info of the hook and of the pool."""
-        info = as_info(self._get_info())
-        if self.inside.pool_tells:
-            info = info | {
-                name: value.item(0) for name, value in self._open_pool("info").info().items()
-            }
-        return info
 
     @property
     def time(self) -> float:
         """The FMU's time in seconds."""
         steps = (self.inside.warm_up_steps + self.step_count) * self.inside.spec.substeps
-        return self.inside.spec.communication_point(steps, self._start_time)
-
-    @property
-    def _start_time(self) -> Any:
-        """The first communication point of the episode."""
-        if self.config.draws_start_time:
-            return self.parameters["start_time"]
-        return self.inside.spec.start_time
-
-    def _fault_of_hooks(
-        self, reward: float, observation: Any, before: tuple[Any, dict[str, Any] | None]
-    ) -> Result:
-        """End the episode because of a number that is not finite, in the state before the step."""
-        reason = self._not_finite(reward, observation)
-        read = self.inside.readings
-        read.values, variables = before
-        read.state = read.previous_state
-        read.variables.update(variables or {})
-        self._open_pool("step").note_fault(0)
-        self._halt()
-        return self._fault(reason)
-
-    def _not_finite(self, reward: float, observation: Any) -> str:
-        """Say what is not finite, before the step is undone."""
-        fine = isfinite(reward)
-        what = f"the observation is {shown(observation)}" if fine else self._explain(reward)
-        return f"{what} at t = {self.time:g} s"
-
-    def _explain(self, reward: float) -> str:
-        """Say where a reward that is not finite comes from."""
-        return f"_reward_policy returned {reward}"
-
-    def _fault(self, reason: str) -> Result:
-        self.inside.ended = True
-        policy = self.config.on_fault
-        if policy == "raise":
-            raise SimulationError(reason)
-        self.logger.warning("%s", reason)
-        self.done = policy == "terminate"
-        info = self._info() | {"fault": reason, "fault_rate": self._fault_rate()}
-        observation = self._get_observation()
-        if not self.inside.is_finite(observation):
-            raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
-        return observation, as_reward(self._fault_reward()), self.done, not self.done, info
+        return self.inside.spec.communication_point(steps, start_time_of(self))
 
     # Snapshots.
-
-    @cached_property
-    def _scope(self) -> dict[str, str]:
-        return scope_of(self)
 
     def save_state(self) -> Snapshot:
         """Save the episode at this moment.
@@ -602,9 +454,9 @@ class FMUEnv(Constructed):
         pool = self._open_pool("save_state")
         if not self.inside.was_reset:
             raise SimulationError("save_state was called before the first reset")
-        self._keep_readings()
+        self.inside.keep()
         bundle = pool.save_instances(np.zeros(1, np.int64))
-        return Snapshot(self._scope, columns_of(self), bundle)
+        return Snapshot(scope_of(self), columns_of(self), bundle)
 
     def restore_state(self, snapshot: Snapshot) -> Any:
         """Go on from a snapshot, with its random generator, too; no reset is needed before.
@@ -620,36 +472,29 @@ class FMUEnv(Constructed):
             SimulationError: If the FMU fails, or if a real system stands in for it.
         """
         pool = self._open_pool("restore_state")
-        columns = checked_snapshot(snapshot, length=1).columns_for(self._scope)
+        columns = checked_snapshot(snapshot, length=1).columns_for(scope_of(self))
         if not self.inside.was_reset:
-            self._prepare_hooks()  # as in ``reset``
+            prepare_hooks(self)  # as in ``reset``
             self._require_way(pool)
         require_saving(pool)
-        self._keep_readings()
+        self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
         if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
-        observation = self._observation_and_info()[0]
-        if not self._has_chosen:
+        observation = first_observation(self)[0]
+        if not self.inside.has_chosen:
             self._choose_player(pool)
         return observation
-
-    def _keep_readings(self) -> None:
-        if self._player is not None:
-            self._player.keep(self)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUEnv:
         """Make a new environment in the middle of the same episode, if there is one."""
         args, kwargs = copy.deepcopy(self._constructor_arguments, memo)
         twin = type(self)(*args, **kwargs)
-        if self.inside.was_reset and self._pool is not None:
+        if self.inside.was_reset and self.inside.is_open:
             twin.restore_state(self.save_state())
         return twin
-
-    def _fault_rate(self) -> float:
-        return float(fault_rates(self._open_pool("health").health())[0])
 
     @property
     def health(self) -> dict[str, int]:
@@ -722,17 +567,14 @@ class FMUEnv(Constructed):
     def close(self) -> None:
         """Free the FMU and its temporary folder; more than one call is fine."""
         self._is_closed = True
-        self._close_pool()
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self.inside.close_pool()
+        if self.inside.renderer is not None:
+            self.inside.renderer.close()
+            self.inside.renderer = None
         super().close()
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
         return _rebuild, (type(self), *self._constructor_arguments)
-
-
-FMUEnv._base = FMUEnv
 
 
 class FMI1CSEnv(FMUEnv):

@@ -20,7 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import lacking
 from fmugym.recording import FACTS, Recording, element_from, flat_element
-from fmugym.task.snapshot import require_scope
+from fmugym.task.snapshot import require_scope, scope_of
 
 try:
     import minari
@@ -57,7 +57,7 @@ def write_dataset(
     if not recordings:
         raise ConfigError("a dataset needs at least one recording")
     for recording in recordings:
-        require_scope(recording.scope, env._scope, "recording")
+        require_scope(recording.scope, scope_of(env), "recording")
     episodes = [_buffer(number, one, env) for number, one in enumerate(recordings)]
     spec = {"env": env.spec} if env.spec is not None else {}
     spaces = {"observation_space": env.observation_space, "action_space": env.action_space}

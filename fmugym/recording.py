@@ -35,7 +35,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.signals import ordinary
 from fmugym.task.generators import row_of, state_of
-from fmugym.task.snapshot import require_scope
+from fmugym.task.snapshot import require_scope, scope_of
 
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
 
@@ -213,10 +213,8 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         text, seed = _as_json(options), check_seed(seed)
         self._start = None
-        if seed is not None:
-            self._inner._np_random, self._inner._np_random_seed = np_random(seed)
-        stream = _stream_of(self._inner)
-        observation, info = self.env.reset(options=options)
+        stream = _stream_of(self._inner.np_random if seed is None else np_random(seed)[0])
+        observation, info = self.env.reset(seed=seed, options=options)
         first = flat_element(self.env.observation_space, observation)
         self._start = {"seed": seed, "stream": stream, "options": text, "first": first}
         self._start["drawn"] = {name: float(value) for name, value in info["drawn"].items()}
@@ -243,7 +241,7 @@ class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         start = self._start
         actions, seen, rewards, *ends = zip(*self._rows, strict=True) if self._rows else [()] * 5
         return Recording(
-            scope=self._inner._scope,
+            scope=scope_of(self._inner),
             surroundings=surroundings(),
             **{name: start[name] for name in ("seed", "stream", "options", "drawn")},
             actions=np.array(actions),
@@ -292,7 +290,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
         ConfigError: If the FMU or the config is another one.
     """
     inner, now = _inner(env), surroundings()
-    require_scope(recording.scope, inner._scope, "recording")
+    require_scope(recording.scope, scope_of(inner), "recording")
     then = recording.surroundings
     others = {n: (then.get(n, ""), now[n]) for n in now if then.get(n) != now[n]}
     inner.np_random = _generator_of(recording.stream)
@@ -349,8 +347,8 @@ def _inner(env: Any) -> FMUEnv:
     return inner
 
 
-def _stream_of(env: FMUEnv) -> tuple[int, ...]:
-    state: Any = env.np_random.bit_generator.state
+def _stream_of(generator: np.random.Generator) -> tuple[int, ...]:
+    state: Any = generator.bit_generator.state
     if state["bit_generator"] != "PCG64":
         raise ConfigError(
             f"the environment has a generator {state['bit_generator']!r}; reset it with a seed"

@@ -22,6 +22,7 @@ from fmugym.pool.base import MaskArray
 from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
+from fmugym.vector.env import require_open
 from fmugym.vector.libraries import make_vector_env
 
 try:
@@ -131,7 +132,7 @@ class FMUVecEnv(VecEnv):
             The observations; the infos are in ``reset_infos``.
         """
         groups = self._groups_of_options()
-        if len(groups) > 1 and not self.vector_env._started:
+        if len(groups) > 1 and not self.vector_env.inside.started:
             self._outer.reset()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for mask, options in groups:
@@ -204,7 +205,8 @@ class FMUVecEnv(VecEnv):
         Raises:
             ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
-        return self.vector_env._get_attr(attr_name, self._numbers(indices))
+        require_open(self.vector_env, "get_attr")
+        return self.vector_env.inside.attributes.read(attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute, or a parameter of the FMU from the next episode on.
@@ -218,10 +220,11 @@ class FMUVecEnv(VecEnv):
             ConfigError: If there is nothing of this name, or it is a parameter that the other
                 environments draw in each episode.
         """
-        env = self.vector_env
+        env, attributes = self.vector_env, self.vector_env.inside.attributes
+        require_open(env, "set_attr")
         given = dict.fromkeys(self._numbers(indices), value)
-        if not env._attributes.is_parameter(attr_name):
-            env._attributes.set_attribute(attr_name, given)
+        if not attributes.is_parameter(attr_name):
+            attributes.set_attribute(attr_name, given)
             return
         complete = self._all_values(attr_name, given)
         env.set_attr(attr_name, complete)
@@ -235,7 +238,7 @@ class FMUVecEnv(VecEnv):
     def _present_values(self, name: str) -> list[Any]:
         if name in self._set_parameters:
             return self._set_parameters[name]
-        env = self.vector_env._prototype
+        env = self.vector_env.inside.prototype
         if name in env.inside.plan.drawn_names:
             raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
         variable = env.fmu.variable(name)
@@ -254,7 +257,9 @@ class FMUVecEnv(VecEnv):
                 they cannot have each for itself.
         """
         numbers = self._numbers(indices)
-        return self.vector_env._call(method_name, numbers, method_args, method_kwargs)
+        require_open(self.vector_env, "call")
+        attributes = self.vector_env.inside.attributes
+        return attributes.call(method_name, numbers, method_args, method_kwargs)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
         """Return False for each: single environments have no wrappers."""

@@ -304,7 +304,7 @@ def test_its_own_thread_may_close_a_pool():
     rig = Held()
     env = RigEnv(rig)
     env.reset()
-    pool = env._pool
+    pool = env.inside.pool
     pool._threads[0].ask(lambda _: pool.close(), None).result(10)
     assert rig.calls == ["reset", "stop"]
     env.close()
@@ -410,7 +410,7 @@ def test_what_is_no_backend(backend, text):
 
 def test_a_name_chooses_how_the_fmu_is_stepped():
     env = RigEnv("fmpy")
-    assert not env._pool.is_real
+    assert not env.inside.pool.is_real
     env.close()
 
 
@@ -701,7 +701,7 @@ class TestPacing:
         clock.advance(1.0)
         assert not rig.has_held.wait(0.05)
         env.reset()
-        env._halt()
+        env.inside.halt()
         clock.advance(1.0)
         assert not rig.has_held.wait(0.05)
         env.close()

@@ -102,7 +102,7 @@ class TestExamples:
     def test_every_hook_is_compiled(self, name):
         make = partial(fmugym.load, EXAMPLES / f"{name}.toml")
         envs = FMUVectorEnv(make, 2, hooks="compiled")
-        assert envs._engine._task.left == {}
+        assert envs.inside.engine._task.left == {}
         envs.close()
 
     @each_file
@@ -191,7 +191,7 @@ def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
 
 def test_all_hooks_of_a_task_with_memory_and_costs_are_compiled():
     envs = FMUVectorEnv(partial(fmugym.load, TANK), 2, hooks="compiled")
-    assert envs._engine._task.left == {}
+    assert envs.inside.engine._task.left == {}
     envs.close()
 
 

@@ -107,7 +107,7 @@ def test_many_environments_equal_single_ones_to_the_last_bit(kind, hooks):
     make = partial(fmugym.load, task(kind, history={"of": "u", "length": "0.2s"}))
     envs, singles = FMUVectorEnv(make, 3, hooks=hooks), [make() for _ in range(3)]
     if hooks == "compiled":
-        assert envs._engine._task.left == {}
+        assert envs.inside.engine._task.left == {}
     observations, _ = envs.reset(seed=2)
     for i, env in enumerate(singles):
         np.testing.assert_array_equal(env.reset(seed=2 + i)[0], observations[i])

@@ -181,7 +181,7 @@ def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
 
 def test_all_hooks_are_compiled():
     envs = FMUVectorEnv(partial(fmugym.load, EVERYTHING), 2, hooks="compiled")
-    assert envs._engine._task.left == {}
+    assert envs.inside.engine._task.left == {}
     envs.close()
 
 

@@ -76,7 +76,7 @@ def test_figures_of_many_environments(hooks, mode):
     make = partial(fmugym.load, TASK)
     envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
     if hooks == "compiled":
-        assert envs._engine._task.left == {}
+        assert envs.inside.engine._task.left == {}
     envs.reset(seed=4)
     for i in range(3):
         singles.append(make())

@@ -118,7 +118,7 @@ class TestLimits:
 def test_many_environments_are_compiled_and_equal_single_ones(kind):
     make = partial(fmugym.load, formed(TASKS[kind], **FORMS["both"]), physical=True)
     envs = FMUVectorEnv(make, 2, hooks="compiled")
-    assert envs._engine._task.left == {}
+    assert envs.inside.engine._task.left == {}
     controller = CONTROLLERS["pid"]().bind(envs)
     observations, _ = envs.reset(seed=[3, 4])
     rewards = []

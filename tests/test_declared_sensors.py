@@ -294,7 +294,7 @@ def test_many_environments_equal_single_ones(parameters, sensors, actuators, hoo
     make = partial(fmugym.load, declared)
     envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
     if hooks == "compiled":
-        assert envs._engine._task.left == {}
+        assert envs.inside.engine._task.left == {}
     observations, infos = envs.reset(seed=2)
     for i in range(3):
         singles.append(make())

@@ -150,7 +150,7 @@ def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
     make = partial(fmugym.load, task)
     envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
     if hooks == "compiled":
-        assert envs._engine._task.left == {}
+        assert envs.inside.engine._task.left == {}
     observations, _ = envs.reset(seed=2)
     for i in range(3):
         singles.append(make())
@@ -182,10 +182,10 @@ def test_those_that_go_on_do_not_change(controller):
     envs.reset(seed=2)
     envs.action_space.seed(1)
     envs.step(envs.action_space.sample())
-    before, outputs = envs.call("inputs"), envs._pool.outputs.copy()
+    before, outputs = envs.call("inputs"), envs.inside.pool.outputs.copy()
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     assert envs.call("inputs")[1] == before[1] != envs.call("inputs")[0]
-    assert (envs._pool.outputs == outputs).all(axis=0).tolist() == [False, True, False]
+    assert (envs.inside.pool.outputs == outputs).all(axis=0).tolist() == [False, True, False]
     envs.close()
 
 

@@ -3,9 +3,12 @@
 import ast
 from pathlib import Path
 
+import gymnasium
 import pytest
 
 import fmugym
+from fmugym import FMUEnv, FMUVectorEnv, TaskEnv
+from fmugym.task.hooks import Hooks
 
 PACKAGE = Path(fmugym.__file__).parent
 
@@ -77,3 +80,57 @@ def test_no_module_imports_itself_by_a_detour():
     while leaves := {module for module, targets in graph.items() if not targets}:
         graph = {m: targets - leaves for m, targets in graph.items() if m not in leaves}
     assert graph == {}
+
+
+ROOT = PACKAGE.parent
+FOLDERS = ("fmugym", "examples", "benchmarks", "tests")
+ENVIRONMENTS = {cls for env in (TaskEnv, FMUEnv, FMUVectorEnv) for cls in env.__mro__}
+
+
+def names_given_in(cls):
+    """The names of the methods of a class, and of the attributes that it declares and assigns."""
+    tree = ast.parse(MODULES[cls.__module__].read_text(encoding="utf-8"))
+    (body,) = (n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)
+    for node in ast.walk(body):
+        if isinstance(node, ast.FunctionDef):
+            yield node.name
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            yield node.attr
+    for node in body.body:
+        targets = getattr(node, "targets", [getattr(node, "target", None)])
+        yield from (target.id for target in targets if isinstance(target, ast.Name))
+
+
+def private_names():
+    """The private names of environments, and the modules that give them.
+
+    Hooks are called by others, and the names of Gymnasium are known to its own tools.
+    """
+    modules, known = {}, vars(Hooks).keys() | vars(gymnasium.Env).keys()
+    for cls in ENVIRONMENTS:
+        for name in names_given_in(cls) if cls.__module__ in MODULES else ():
+            if name.startswith("_") and not name.endswith("__") and name not in known:
+                modules.setdefault(name, set()).add(MODULES[cls.__module__])
+    return modules
+
+
+def names_read_in(tree):
+    """The names of attributes of others that a module reads or writes, with their places."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) not in {"self", "cls"}:
+            yield node.attr, node.lineno
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {"getattr", "setattr"}:
+            name = node.args[1] if len(node.args) > 1 else None
+            if isinstance(name, ast.Constant) and ast.unparse(node.args[0]) != "self":
+                yield name.value, node.lineno
+
+
+def test_nobody_else_uses_private_attributes_of_environments():
+    """What others need is in ``inside``, or is a function that takes the environment."""
+    private, found = private_names(), []
+    for path in (path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+        for name, line in names_read_in(ast.parse(path.read_text(encoding="utf-8"))):
+            if path not in private.get(name, {path}):
+                found.append(f"{path.relative_to(ROOT)}:{line}: {name}")
+    assert {"_step_compiled", "_open_pool", "_background"} <= private.keys()
+    assert not found, "\n".join(found)

@@ -34,7 +34,7 @@ def fixture_make():
         if workers:
             options |= {"isolation": "process", "workers": workers}
         made.append(FMUVectorEnv(cls, num_envs, hooks=hooks, **options))
-        assert isinstance(made[-1]._pool, ProcessPool) == bool(workers)
+        assert isinstance(made[-1].inside.pool, ProcessPool) == bool(workers)
         return made[-1]
 
     yield make
@@ -97,7 +97,7 @@ def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""
     isolated = make(cls, 70, autoreset_mode=mode)
     here = make(cls, 70, workers=None, autoreset_mode=mode)
-    assert isinstance(isolated._engine, CompiledEngine)
+    assert isinstance(isolated.inside.engine, CompiledEngine)
     assert run_side_by_side(isolated, here, mode, 40)
     for name in ("variables", "previous_state", "action", "inputs", "step_count"):
         np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
@@ -114,7 +114,7 @@ class Halves(Short):
 def test_one_hook_may_stay_in_python(make, mode):
     isolated = make(Halves, hooks="auto", autoreset_mode=mode)
     here = make(Halves, hooks="auto", workers=None, autoreset_mode=mode)
-    assert isolated._engine._left
+    assert isolated.inside.engine._left
     assert run_side_by_side(isolated, here, mode, 40)
 
 
@@ -146,7 +146,7 @@ def test_a_process_that_is_killed(make):
     for envs in (isolated, here):
         envs.reset(seed=2)
         envs.step(actions)
-    os.kill(isolated._pool.processes()[0], signal.SIGKILL)
+    os.kill(isolated.inside.pool.processes()[0], signal.SIGKILL)
     found, wanted = (envs.step(actions) for envs in (isolated, here))
     assert found[3].tolist() == [True, True, False, False]
     assert "SIGKILL" in found[4]["fault"][0]
@@ -220,19 +220,19 @@ def test_a_pool_without_a_library_steps_nothing(make):
     """Whatever is asked of the native pool that runs the programs, nothing crashes."""
     envs = make(Short, 3)
     envs.reset(seed=0)
-    around = PlayAround(envs._pool._setup, envs._pool._arrays, lambda *_: None)
+    around = PlayAround(envs.inside.pool._setup, envs.inside.pool._arrays, lambda *_: None)
     arrays = np.zeros((3, 1), np.float32), np.zeros((2, 3))
     for name in ("play", "play_before", "play_after"):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around._pool, name)(*arrays)
     with pytest.raises(TypeError, match="not prepared"):
         around._pool.step_one(0, {})
-    before = envs._pool.outputs.copy()
+    before = envs.inside.pool.outputs.copy()
     assert around._pool.step_own() == 3
     nothing = around._access(())
     assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
     assert around._pool.read(nothing, np.zeros((0, 3))) == 0
-    np.testing.assert_array_equal(envs._pool.outputs, before)
+    np.testing.assert_array_equal(envs.inside.pool.outputs, before)
     around._pool.close()
     with pytest.raises(SimulationError, match="closed"):
         around._pool.step_own()

@@ -102,7 +102,7 @@ def test_a_new_worker_gets_the_programs(make):
     envs = make(CART_POLE)
     actions = begun(envs)
     expected = envs.rollout(None, actions)
-    os.kill(envs._pool.processes()[1], signal.SIGKILL)
+    os.kill(envs.inside.pool.processes()[1], signal.SIGKILL)
     envs.step(actions[:, 0])
     begun(envs)
     for ours, theirs in zip(envs.rollout(None, actions), expected, strict=True):
@@ -146,7 +146,7 @@ def test_a_hang_ends_after_the_time_limit_of_a_call(make, tmp_path):
         make, path, "compiled", ("none", "hang", "none"), (0, 2, 0), call_timeout=0.5
     )
     assert found.lengths.tolist() == [6, 2, 6]
-    assert envs._pool.health()["deaths"][1] > 0
+    assert envs.inside.pool.health()["deaths"][1] > 0
 
 
 @pytest.mark.usefixtures("in_workers")
@@ -158,7 +158,7 @@ def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
         make, path, "compiled", pauses, (1, 2, 3), call_timeout=0.35, workers=1
     )
     assert found.lengths.tolist() == [6, 6, 6]
-    assert envs._pool.health()["deaths"].tolist() == [0, 0, 0]
+    assert envs.inside.pool.health()["deaths"].tolist() == [0, 0, 0]
 
 
 def test_an_index_outside_of_its_table(make):

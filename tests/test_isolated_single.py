@@ -25,14 +25,14 @@ from fmugym.vector.making import make_with_pool
 def isolated(make_env):
     """A new environment with a worker process."""
     env = make_with_pool(make_env, isolation="process")
-    assert isinstance(env._pool, ProcessPool)
+    assert isinstance(env.inside.pool, ProcessPool)
     return env
 
 
 def here(make_env):
     """The same in this process, with its hooks in Python, too."""
     env = make_env()
-    env._way = "python"
+    env.inside.way = "python"
     return env
 
 
@@ -75,7 +75,7 @@ def test_a_process_that_is_killed(cart):
     other = fmugym.envs.CartPoleEnv(hooks="python")
     other.reset(seed=0)
     before = other.step(0)
-    os.kill(cart._pool.processes()[0], signal.SIGKILL)
+    os.kill(cart.inside.pool.processes()[0], signal.SIGKILL)
     observation, _, terminated, truncated, info = cart.step(1)
     assert (terminated, truncated) == (False, True)
     assert "SIGKILL" in info["fault"]
@@ -96,7 +96,7 @@ def test_interrupts_in_a_step_end_the_episode(cart):
 
     usual = signal.signal(signal.SIGALRM, ring)
     try:
-        os.kill(env._pool.processes()[0], signal.SIGSTOP)
+        os.kill(env.inside.pool.processes()[0], signal.SIGSTOP)
         signal.setitimer(signal.ITIMER_REAL, 0.2)
         with pytest.raises(KeyboardInterrupt):
             env.step(1)
@@ -132,7 +132,7 @@ def test_series_and_pictures():
 
 
 def test_closing(cart):
-    state, worker = cart.state, cart._pool.processes()[0]
+    state, worker = cart.state, cart.inside.pool.processes()[0]
     cart.close()
     assert cart.state == state
     with pytest.raises(SimulationError, match="closed"):

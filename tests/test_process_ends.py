@@ -71,7 +71,7 @@ class TestForks:
         env.reset()
         for _ in range(2):
             assert not env.step([1.0])[3]
-        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
         assert "SIGKILL" in env.step([1.0])[4]["fault"]
 
     @pytest.mark.parametrize("fault", ["fork", "fork_and_loop"])
@@ -116,7 +116,7 @@ from fmugym.pool.process.launcher import _fork_server
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()
 env.step([1.0])
-print(*env._pool.processes(), _fork_server().pid, flush=True)
+print(*env.inside.pool.processes(), _fork_server().pid, flush=True)
 """
 
 
@@ -207,7 +207,7 @@ class TestEndOfParent:
                 sys.exit(0)
             os.waitpid(child, 0)
             print(env.step([1.0])[0])
-            os.kill(env._pool.processes()[0], signal.SIGKILL)
+            os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
             print("SIGKILL" in env.step([1.0])[4]["fault"])
             env.reset()
             print(env.step([1.0])[0])

@@ -161,7 +161,7 @@ class TestSingle:
     def test_a_worker_that_is_killed_between_two_calls(self, make_env):
         env = make_env()
         env.reset()
-        os.kill(env._pool.processes()[0], signal.SIGKILL)
+        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
         assert "SIGKILL" in env.step([1.0])[4]["fault"]
         env.reset()
         assert not env.step([1.0])[3]
@@ -176,7 +176,7 @@ class TestSingle:
     def test_the_end_of_an_instance(self, make_env, stage, caplog):
         env = make_env("crash", stage)
         env.reset()
-        (pid,) = env._pool.processes()
+        (pid,) = env.inside.pool.processes()
         env.close()
         assert not is_alive(pid)
         assert "SIGSEGV in its end" in caplog.text
@@ -205,7 +205,7 @@ class TestSingle:
     def test_pickles_with_its_isolation(self, make_env, opened):
         env = make_env("crash")
         twin = opened(pickle.loads(pickle.dumps(env)))
-        assert twin._pool.processes() != env._pool.processes()
+        assert twin.inside.pool.processes() != env.inside.pool.processes()
         for one in (env, twin):
             one.reset()
             assert one.step([1.0])[0] == [0.5]
@@ -217,8 +217,8 @@ class TestSingle:
             opened(gymnasium.make(f"fmugym/{name}-v0", isolation=isolation))
             for isolation in (None, "process")
         )
-        assert isinstance(apart.unwrapped._pool, ProcessPool)
-        assert not isinstance(here.unwrapped._pool, ProcessPool)
+        assert isinstance(apart.unwrapped.inside.pool, ProcessPool)
+        assert not isinstance(here.unwrapped.inside.pool, ProcessPool)
         both = [env.reset(seed=1)[0].tolist() for env in (here, apart)]
         assert both[0] == both[1]
 

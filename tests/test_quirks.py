@@ -356,9 +356,9 @@ class TestPromiseAboutStates:
         env = QuirkEnv(make_fmu("well behaved"), reset_method="reset")
         env.reset()
         assert self.returns(env) == 0.0
-        snapshot = env._pool.save()
+        snapshot = env.inside.pool.save()
         assert self.returns(env) == 1.0
-        env._pool.restore(snapshot)
+        env.inside.pool.restore(snapshot)
         env.close()
 
 

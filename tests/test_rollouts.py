@@ -89,7 +89,7 @@ class TestValues:
     def test_from_the_present_episodes_which_go_on_afterwards(self, way):
         envs = vector_of(Track, N, **way)
         envs.reset(seed=0)
-        actions = actions_for(envs._prototype)
+        actions = actions_for(envs.inside.prototype)
         envs.step(actions[:, 0])
         before = envs.save_state()
         found = envs.rollout(None, actions)
@@ -161,8 +161,9 @@ def test_from_one_root_no_state_is_serialized(monkeypatch):
     """Planning costs one saved state, however many candidates there are."""
     env, envs = halfway(), vector_of(Track, N)
     snapshot, saved = env.save_state(), []
-    kept = envs._pool.save_states
-    monkeypatch.setattr(envs._pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
+    pool = envs.inside.pool
+    kept = pool.save_states
+    monkeypatch.setattr(pool, "save_states", lambda i, r: saved.append(len(i)) or kept(i, r))
     envs.rollout(snapshot, actions_for(env, 3 * N))
     assert not saved
     envs.reset(seed=0)  # now there are episodes to return to

@@ -59,7 +59,7 @@ def require_readings(one, other):
 def with_hooks(cls, hooks, *args, **keywords):
     """An environment of a class whose constructor does not pass arguments on."""
     env = cls(*args, **keywords)
-    env._way = hooks
+    env.inside.way = hooks
     return env
 
 
@@ -74,7 +74,7 @@ def require_same(make, steps=250, reads=5, options=({},)):
         with np.errstate(all="ignore"):
             first, second = one.step(action), other.step(action)
         assert same(first, second), (index, first, second)
-        compiled += one._player is not None
+        compiled += one.inside.player is not None
         if index % reads == 0:
             require_readings(one, other)
         if first[2] or first[3]:
@@ -221,7 +221,7 @@ def compiled_cart(**options):
     env = fmugym.envs.CartPoleEnv(hooks="compiled", **options)
     env.reset(seed=0)
     env.step(0)
-    assert env._player is not None
+    assert env.inside.player is not None
     return env
 
 
@@ -251,7 +251,7 @@ class TestAttributes:
             one.force_mag = other.force_mag = force
             for action in (1, 0):
                 assert same(one.step(action), other.step(action))
-        assert one._player is not None
+        assert one.inside.player is not None
 
     def test_several_numbers_may_be_assigned_between_two_steps(self):
         one, other = compiled_cart(), fmugym.envs.CartPoleEnv(hooks="python")
@@ -288,7 +288,7 @@ class TestAttributes:
         env = with_hooks(Bound, "compiled")
         env.reset(seed=0)
         assert env.step(env.inside.no_action)[1] == 2.0 * env.state[0]
-        assert env._player is not None
+        assert env.inside.player is not None
         env._reward_policy = MethodType(lambda env: 3.0 * env.state[0], env)
         env.reset()
         assert env.step(env.inside.no_action)[1] == 3.0 * env.state[0]
@@ -318,7 +318,7 @@ class TestAttributes:
             return env
 
         one, other = make("compiled"), make("python")
-        assert one._player is not None
+        assert one.inside.player is not None
         for change in ("weights", "gains", "weights"):
             for env in (one, other):
                 getattr(env, change)[0] += 1.5
@@ -444,12 +444,12 @@ class TestFaults:
 class TestWays:
     def test_the_first_reset_compiles(self):
         env = fmugym.envs.CartPoleEnv()
-        assert env._player is None
+        assert env.inside.player is None
         env.reset(seed=0)
-        assert env._player is not None
-        player = env._player
+        assert env.inside.player is not None
+        player = env.inside.player
         env.reset(seed=1)
-        assert env._player is player
+        assert env.inside.player is player
         env.close()
 
     def test_what_cannot_be_compiled_is_told_once(self, caplog):
@@ -490,7 +490,7 @@ class TestWays:
             env.reset(seed=0)
         finally:
             sys.settrace(usual)
-        assert env._player is None
+        assert env.inside.player is None
         env.close()
 
     def test_names(self):
@@ -514,7 +514,7 @@ class TestWays:
         require_same(lambda hooks: with_hooks(Other, "auto"), steps=30)
         env = with_hooks(Other, "auto")
         env.reset(seed=0)
-        assert env._player is None or list(env._player.left) == ["_reward_policy"]
+        assert env.inside.player is None or list(env.inside.player.left) == ["_reward_policy"]
         env = with_hooks(Other, "compiled")
         with pytest.raises(ConfigError, match="cannot be compiled"):
             env.reset(seed=0)
@@ -570,7 +570,7 @@ class TestLife:
             env.reset(seed=1)
             for _ in range(3):
                 env.step(np.array([1.0], np.float32))
-        assert one._player is not None
+        assert one.inside.player is not None
         assert np.array_equal(one.render(), other.render())
 
     def test_checkers(self):
@@ -622,7 +622,7 @@ class TestSideEffects:
         SEEN.clear()
         env = self.play(expression)
         assert count(env) == 20
-        assert env._player is None
+        assert env.inside.player is None
 
     def test_output(self, capsys):
         self.play("print('once') or self.state[0]")
@@ -641,13 +641,13 @@ class TestSideEffects:
         assert after == (random.random(), np.random.random())  # noqa: NPY002
 
     def test_constants_may_be_global(self):
-        assert self.play("TABLE[1] * self.state[0]")._player is not None
+        assert self.play("TABLE[1] * self.state[0]").inside.player is not None
 
     def test_another_environment(self):
         other = fmugym.envs.CartPoleEnv(hooks="python")
         other.reset(seed=0)
         env = self.play("self.other.state[0] + self.state[0]", {"other": other})
-        assert env._player is None
+        assert env.inside.player is None
         other.close()
 
 

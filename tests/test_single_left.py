@@ -131,7 +131,7 @@ LEFT = {
 
 def pair(cls):
     one, other = cls(), cls()
-    other._way = "python"
+    other.inside.way = "python"
     one.reset(seed=5)
     other.reset(seed=5)
     return one, other
@@ -146,14 +146,14 @@ def test_it_equals_python(cls):
         action = one.action_space.sample()
         first, second = one.step(action), other.step(action)
         assert same(first, second), (index, first, second)
-        compiled += one._player is not None
+        compiled += one.inside.player is not None
         if index % 4 == 0:
             require_readings(one, other)
         if first[2] or first[3]:
             ends += 1
             require_readings(one, other)
             assert same(one.reset(), other.reset())
-    assert set(one._player.left) == LEFT[cls]
+    assert set(one.inside.player.left) == LEFT[cls]
     assert ends > 5
     assert compiled > 80
     one.close()
@@ -165,7 +165,7 @@ def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
     env = cls()
     env.reset(seed=5)
     env.step(env.action_space.sample())
-    assert env._player is not None
+    assert env.inside.player is not None
     calls = []
     for name in LEFT[cls]:
         hook = getattr(cls, name)
@@ -176,7 +176,7 @@ def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
 
         monkeypatch.setattr(cls, name, counted)
     env.step(env.action_space.sample())
-    assert env._player is not None
+    assert env.inside.player is not None
     order = ["_is_truncated", "_reward_policy", "_get_observation"]
     expected = [name for name in order if name in LEFT[cls]]
     if cls is GoalSeen:
@@ -296,7 +296,7 @@ def test_each_hook_is_named_once(caplog):
 
 def test_compiled_is_an_error_and_names_the_hook():
     env = Reward()
-    env._way = "compiled"
+    env.inside.way = "compiled"
     with pytest.raises(ConfigError, match=r"Reward.*_reward_policy, line"):
         env.reset(seed=0)
     env.close()
@@ -344,10 +344,10 @@ def test_other_hooks_keep_all_in_python(cls):
         action = one.action_space.sample()
         first, second = one.step(action), other.step(action)
         assert same(first, second)
-        assert one._player is None
+        assert one.inside.player is None
         if first[2] or first[3]:
             assert same(one.reset(), other.reset())
-    assert one._player is None
+    assert one.inside.player is None
     one.close()
     other.close()
 

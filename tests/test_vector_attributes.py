@@ -298,7 +298,7 @@ def test_values_that_are_no_numbers(values, hooks):
 @each_way
 def test_what_the_environments_keep_themselves_cannot_be_set(hooks):
     vector = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
-    for name in ("state", "step_count", "time", "action_space", "_pool", "step", "_is_done", "fmu"):
+    for name in ("state", "time", "action_space", "inside", "step", "_is_done", "fmu"):
         with pytest.raises(ConfigError, match=f"{name!r} cannot be set"):
             vector.set_attr(name, 1.0)
     vector.close()

@@ -186,7 +186,7 @@ def test_hooks_with_rare_functions_run_on_arrays_beside_compiled_ones(reason, ca
 
     with caplog.at_level("INFO", "fmugym"):
         ours, theirs = (FMUVectorEnv(Other, 5, hooks=hooks) for hooks in ("auto", "array"))
-    assert list(ours._engine._task.left) == ["_reward_policy"]
+    assert list(ours.inside.engine._task.left) == ["_reward_policy"]
     assert reason in caplog.text
     run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 40)
     ours.close()
@@ -205,7 +205,7 @@ def test_a_program_that_differs_leaves_only_its_own_hook_to_arrays(caplog):
         require_pair_equal(Differing, steps=40, hooks="auto")
         envs = FMUVectorEnv(Differing, 3)
     assert "the program gives other values than _is_truncated. It runs on arrays" in caplog.text
-    assert list(envs._engine._task.left) == ["_is_truncated"]
+    assert list(envs.inside.engine._task.left) == ["_is_truncated"]
     envs.close()
 
 

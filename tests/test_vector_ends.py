@@ -365,14 +365,14 @@ class Failing:
 def with_failing(task, monkeypatch):
     """Environments, and what lets their calls fail."""
     envs, made_of = made(task), []
-    prepare = envs._pool.prepare_play
+    prepare = envs.inside.pool.prepare_play
 
     def prepared(*parts):
         made_of.append(Failing(prepare(*parts)))
         return made_of[-1]
 
-    monkeypatch.setattr(envs._pool, "prepare_play", prepared)
-    envs._engine._prepare(envs._engine._task)
+    monkeypatch.setattr(envs.inside.pool, "prepare_play", prepared)
+    envs.inside.engine._prepare(envs.inside.engine._task)
     envs.reset(seed=0)
     return envs, made_of[-1]
 

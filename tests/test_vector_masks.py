@@ -116,8 +116,8 @@ def play_both(first, second, steps=40):
             require_same(quick, second.reset(options={"reset_mask": mask.tolist()}))
     require_same(first.get_attr("step_count"), second.get_attr("step_count"))
     require_same(
-        tuple(first._engine.columns(np.arange(first.num_envs))["streams"]),
-        tuple(second._engine.columns(np.arange(first.num_envs))["streams"]),
+        tuple(first.inside.engine.columns(np.arange(first.num_envs))["streams"]),
+        tuple(second.inside.engine.columns(np.arange(first.num_envs))["streams"]),
     )
     return resets
 
@@ -126,7 +126,7 @@ def play_both(first, second, steps=40):
 @pytest.mark.parametrize("num_envs", [1, 5, 140])
 def test_both_ways_do_the_same(task, num_envs):
     first, second = made(task, num_envs), made(task, num_envs)
-    assert isinstance(first._engine, CompiledEngine)
+    assert isinstance(first.inside.engine, CompiledEngine)
     assert play_both(first, second) >= 5
     first.close()
     second.close()
@@ -336,7 +336,7 @@ def test_a_first_observation_that_is_not_finite():
 
 def test_references_do_not_leak():
     envs, mask = made(CART_POLE), np.array([True, False, False, True, False])
-    engine, options = envs._engine, {"reset_mask": mask}
+    engine, options = envs.inside.engine, {"reset_mask": mask}
     watched = (
         mask,
         options,

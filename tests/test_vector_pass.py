@@ -208,7 +208,7 @@ class TestGuards:
     def pool(self):
         envs = FMUVectorEnv(CART_POLE, 4, hooks="compiled")
         envs.reset(seed=0)
-        yield envs._engine._pool._pool
+        yield envs.inside.engine._pool._pool
         envs.close()
 
     def test_fitting_ones(self, pool):

@@ -139,12 +139,12 @@ def test_a_step_that_one_environment_refuses_changes_none():
     envs.step(good)
     names = ("action", "previous_action", "state", "previous_state", "inputs", "step_count")
     before = [envs.get_attr(name) for name in names]
-    given = envs._pool.inputs.copy()
+    given = envs.inside.pool.inputs.copy()
     with pytest.raises(ConfigError, match="environment 2"):
         envs.step(np.float32([[0.004], [0.005], [0.01]]))
     for name, values in zip(names, before, strict=True):
         np.testing.assert_array_equal(envs.get_attr(name), values, err_msg=name)
-    np.testing.assert_array_equal(envs._pool.inputs, given)
+    np.testing.assert_array_equal(envs.inside.pool.inputs, given)
     envs.close()
 
 
@@ -154,7 +154,7 @@ def test_inputs_reach_the_environments_that_go_on():
     alone = Failing()
     envs.reset(seed=[1, 2, 3])
     actions = np.float32([[0.001], [0.002], [0.003]])
-    envs._engine.ended[1] = envs._engine.any_ended = True
+    envs.inside.engine.ended[1] = envs.inside.engine.any_ended = True
     for _ in range(2):
         envs.step(actions)
     alone.reset(seed=3)
@@ -250,7 +250,7 @@ def test_inputs_are_asked_of_a_hook_that_was_set_later():
     envs.call("replace")
     envs.step(actions)
     assert envs.get_attr("inputs") == ((0.5 * plain,), (0.5 * plain,))
-    np.testing.assert_array_equal(envs._pool.inputs, [[0.5 * plain] * 2])
+    np.testing.assert_array_equal(envs.inside.pool.inputs, [[0.5 * plain] * 2])
     envs.close()
 
 
@@ -269,8 +269,8 @@ def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments():
     envs.reset(seed=0)
     actions = np.zeros((2, 1), np.float32)
     envs.step(actions)
-    envs._engine.ended[:] = [False, True]
-    envs._engine.any_ended = True
+    envs.inside.engine.ended[:] = [False, True]
+    envs.inside.engine.any_ended = True
     infos = envs.step(actions)[-1]
     assert infos["part"].tolist() == [1.0, 0.0]
     assert infos["part"].dtype == np.float64

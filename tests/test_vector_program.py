@@ -14,6 +14,7 @@ from vector_tools import (
 )
 
 from fmugym import ConfigError, Uniform
+from fmugym.task.construction import prepare_hooks
 from fmugym.task.readings import reading
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.contents import borrowed
@@ -41,7 +42,7 @@ def require_same(cls, num_envs=40, steps=25, mode="next_step", ways=("compiled",
         require_same_infos(one[4], other[4])
         require_variables(first, second)
         ended += int((one[2] | one[3]).sum())
-    assert isinstance(first._engine, CompiledEngine)
+    assert isinstance(first.inside.engine, CompiledEngine)
     first.close()
     second.close()
     return ended
@@ -176,7 +177,7 @@ def test_generated_expressions(prototype, reward, observed, variable):
     cls = task_of(reward, observed, variable)
     for name in ("_update", "_get_observation", "_reward_policy"):
         setattr(env, name, getattr(cls, name).__get__(env))
-    env._prepare_hooks()
+    prepare_hooks(env)
     try:
         with np.errstate(all="ignore"), borrowed(env), reading(env, copied(batch)):
             env._update(), env._get_observation(), env._reward_policy()

@@ -199,7 +199,7 @@ def test_a_recorded_series_tells_the_state_before(hooks):
     def function(env):
         return [env.previous_state[0], env.previous_action[0]]
 
-    told = envs._engine.evaluate(function, actions, np.arange(COUNT))
+    told = envs.inside.engine.evaluate(function, actions, np.arange(COUNT))
     alone, ended = singles(), [False] * COUNT
     advance(alone, ended, actions, AutoresetMode.NEXT_STEP)
     expected = [[env.previous_state[0], env.previous_action[0]] for env in alone]

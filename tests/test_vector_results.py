@@ -200,12 +200,12 @@ def test_results_that_do_not_fit_are_refused(results, monkeypatch):
 
 def require_refused(results, monkeypatch, *, refused=True):
     envs = make(CART_POLE)
-    prepare = envs._pool.prepare_play
+    prepare = envs.inside.pool.prepare_play
 
     def with_others(*parts):
         return prepare(*parts[:-1], parts[-1] | {"results": results})
 
-    monkeypatch.setattr(envs._pool, "prepare_play", with_others)
+    monkeypatch.setattr(envs.inside.pool, "prepare_play", with_others)
     with pytest.raises((TypeError, ValueError)) if refused else contextlib.nullcontext():
-        envs._engine._prepare(envs._engine._task)
+        envs.inside.engine._prepare(envs.inside.engine._task)
     envs.close()

@@ -12,6 +12,7 @@ import pytest
 from test_vector_program import Task, require_same
 from vector_tools import Drawing
 
+from fmugym.task.construction import prepare_hooks
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.check import find_difference, sample_states
 from fmugym.vector.hooks.compare import require_same as require_same_programs
@@ -166,7 +167,7 @@ def compiled(prototype, body):
     """The programs of an environment with this reward, compared with the hook on arrays."""
     env, *batches = prototype
     env._reward_policy = hook_of(body).__get__(env)
-    env._prepare_hooks()
+    prepare_hooks(env)
     assert find_difference(env) is None
     task = trace_hooks(env)
     assert task.left == {}
@@ -292,6 +293,6 @@ def test_a_table_is_the_array_that_it_stands_for():
 def test_what_is_refused_says_why(prototype, body, reason):
     env = prototype[0]
     env._reward_policy = hook_of(body).__get__(env)
-    env._prepare_hooks()
+    prepare_hooks(env)
     (why,) = trace_hooks(env).left.values()
     assert re.search(reason, why), why

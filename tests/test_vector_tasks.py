@@ -254,7 +254,7 @@ def test_observations_that_overflow_are_faults(caplog):
         results.append((result[0].tolist(), result[1].tolist(), result[4]["fault"].tolist()))
         results[-1] += (envs.get_attr("variables"),)
         envs.close()
-    assert isinstance(one._engine, CompiledEngine)
+    assert isinstance(one.inside.engine, CompiledEngine)
     assert results[0] == results[1]
 
 
@@ -324,7 +324,7 @@ def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(hook, mode, 
     ours, theirs = (
         FMUVectorEnv(cls, 20, hooks=way, autoreset_mode=mode) for way in ("auto", "array")
     )
-    monkeypatch.setattr(ours._engine, "_begin", None)
+    monkeypatch.setattr(ours.inside.engine, "_begin", None)
     require_equal(*(one.reset(seed=3)[0] for one in (ours, theirs)))
     ended = np.zeros(20, np.bool_)
     for actions in sampled_actions(ours, 25):

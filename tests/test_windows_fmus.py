@@ -399,7 +399,7 @@ class TestInWine:
     def test_compiled_hooks_of_a_single_environment(self, cart_pole, opened):
         """To the last bit, and rollouts go step by step."""
         compiled, python = opened(ForcedCartPole(cart_pole)), opened(ForcedCartPole(cart_pole))
-        compiled._way, python._way = "compiled", "python"
+        compiled.inside.way, python.inside.way = "compiled", "python"
         compiled.action_space.seed(2)
         for env in (compiled, python):
             env.reset(seed=4)
@@ -408,7 +408,7 @@ class TestInWine:
             ours, theirs = compiled.step(action), python.step(action)
             np.testing.assert_array_equal(ours[0], theirs[0])
             assert ours[1:4] == theirs[1:4]
-        assert compiled._player is not None
+        assert compiled.inside.player is not None
         assert compiled.previous_state == python.previous_state
         envs = opened(fmugym.FMUVectorEnv(partial(ForcedCartPole, cart_pole), 3, workers=2))
         rolled = envs.rollout(compiled.save_state(), np.full((3, 5, 1), 2.0, np.float32))
@@ -434,7 +434,7 @@ class TestInWine:
         monkeypatch.setenv("FMUGYM_PROBE", "on")
         with caplog.at_level(logging.INFO, "fmugym"):
             env = opened(fmugym.FMUVectorEnv(lambda: ForcedCartPole(cart_pole), 2))
-        assert isinstance(env._pool, ProcessPool)
+        assert isinstance(env.inside.pool, ProcessPool)
         (line,) = (r.getMessage() for r in caplog.records if "was tried with 2" in r.getMessage())
         assert " 0 initialization" not in line
 

@@ -135,9 +135,9 @@ def test_messages_of_earlier_episodes_explain_nothing(make_env, way):
     fault(env)
     env.reset()
     env.step(np.array([0.5], np.float32))
-    env._pool.inputs[:] = np.nan
-    env._pool.step_own()
-    assert "stuck" not in env._pool.failure(0)
+    env.inside.pool.inputs[:] = np.nan
+    env.inside.pool.step_own()
+    assert "stuck" not in env.inside.pool.failure(0)
 
 
 def test_environments_of_a_vector_say_their_own(tmp_path):

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 
 from fmugym.checks import KnownArguments, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -224,4 +225,4 @@ def require_physical(env: Any) -> None:
 def attribute_of(env: Any, name: str) -> Any:
     """An attribute of an environment, or of the first of many."""
     base = env.unwrapped
-    return base._get_attr(name, [0])[0] if hasattr(base, "_get_attr") else getattr(base, name)
+    return getattr(base.inside.prototype if isinstance(base, VectorEnv) else base, name)

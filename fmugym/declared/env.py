@@ -66,7 +66,7 @@ class TaskEnv(FMUEnv):
         source = fmu_of(self.task, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
         plan = Plan(self.task, describe(self.task, source), needs_reward)
-        self._quantities_of_task = plan.quantities
+        self.inside.quantities = plan.quantities
         self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
         self.unphysical_keys = plan.unphysical_keys
         if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):

@@ -135,7 +135,7 @@ def _varies(variable: Variable) -> bool:
 
 def quantities_of(env: FMUEnv) -> Quantities:
     """Everything in a task that has a name and a value: as declared, or else the config's."""
-    of_task = getattr(env, "_quantities_of_task", None)
+    of_task = env.inside.quantities
     return _of_config(env) if of_task is None else of_task()
 
 

@@ -143,7 +143,7 @@ class _One:
 
     @property
     def pool(self) -> Pool:
-        return self.prototype._open_pool("a recorder")
+        return self.prototype.inside.pool
 
 
 class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -232,15 +232,15 @@ class _Many:
     """The environments of a vector environment, as ``Episodes``."""
 
     def __init__(self, envs: FMUVectorEnv) -> None:
-        self._envs, self.prototype, self.count = envs, envs._prototype, envs.num_envs
+        self._inside, self.prototype, self.count = envs.inside, envs.inside.prototype, envs.num_envs
         self.actions: Any = np.zeros(envs.action_space.shape, envs.action_space.dtype)
 
     def evaluate(self, function: Callable[[Any], Sequence[Any]], indices: Any) -> FloatArray:
-        return self._envs._engine.evaluate(function, self.actions, indices)
+        return self._inside.engine.evaluate(function, self.actions, indices)
 
     @property
     def pool(self) -> Pool:
-        return self._envs._pool  # also within a step in the background
+        return self._inside.pool  # also within a step in the background
 
 
 class RecordVectorSeries(VectorWrapper):
@@ -279,7 +279,7 @@ class RecordVectorSeries(VectorWrapper):
         )
         self._at_end: FloatArray | None = None
         if self._mode is AutoresetMode.SAME_STEP:
-            env._look_at_ends(self._look)
+            env.inside.look_at_ends(self._look)
 
     def _look(self, actions: Any) -> None:
         """Read what environments have before the next episodes begin."""
@@ -318,7 +318,7 @@ class RecordVectorSeries(VectorWrapper):
     def _go_on(self) -> None:
         """Begin in the middle of episodes, if there was no reset."""
         envs: Any = self.env
-        if not self._recorder.has_begun and envs._started:
+        if not self._recorder.has_begun and envs.inside.started:
             counts = self._envs.evaluate(lambda env: (env.step_count,), np.arange(self.num_envs))
             self._recorder.go_on(counts[0])
 

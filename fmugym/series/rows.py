@@ -14,6 +14,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.series.choice import Choice, flat
 from fmugym.series.store import Block
 from fmugym.task.quantity import TEXT_KINDS, Quantity
+from fmugym.task.starting import start_time_of
 
 __all__ = ["Episodes", "Infos", "Outcome", "Rows", "present"]
 
@@ -186,7 +187,7 @@ class Rows:
         self._number[mask] += 1
         self._steps[mask] = 0
         begun = np.flatnonzero(mask)
-        self._starts[begun] = self._episodes.evaluate(lambda env: (env._start_time,), begun)[0]
+        self._starts[begun] = self._episodes.evaluate(lambda env: (start_time_of(env),), begun)[0]
         self._sums[mask] = 0.0
         no = np.zeros(len(mask), np.bool_)
         return self._block(mask, self._values(observations), (no, no), infos)

@@ -6,18 +6,21 @@ import operator
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from math import hypot, isfinite, isnan
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.signals import ordinary
 from fmugym.task.spaces import to_input_types
 
-__all__ = ["elements_of", "flat_inputs", "has_nan", "is_element", "is_misfit", "no_action"]
+if TYPE_CHECKING:
+    from fmugym.task.hooks import Hooks
+
+__all__ = ["blame", "elements_of", "flat_inputs", "no_action", "require_usable"]
 
 _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 """The exceptions that indexing and arithmetic raise for values of a wrong kind or shape."""
@@ -53,7 +56,30 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def is_element(action: Any, elements: Collection[int]) -> bool:
+def require_usable(env: Hooks, action: Any) -> None:
+    """Refuse an action that is no element of a ``Discrete``, or that has a NaN.
+
+    Raises:
+        ConfigError: If it is one.
+    """
+    elements = env.inside.elements
+    if elements is not None:
+        if not _is_element(action, elements):
+            raise ConfigError(f"action {shown(action)} is not in {env.action_space}")
+    elif _has_nan(action):
+        raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
+
+
+def blame(env: Hooks, action: Any, error: BaseException) -> ConfigError | None:
+    """The error if ``_get_inputs`` failed because of an action outside of the action space."""
+    if isinstance(error, FMUGymError) or not isinstance(error, Exception):
+        return None
+    if env.inside.own.step or not _is_misfit(action, env.action_space, error):
+        return None  # with a step of its own, its actions may be others
+    return ConfigError(f"action {shown(action)} is not in {env.action_space}: {shown(error)}")
+
+
+def _is_element(action: Any, elements: Collection[int]) -> bool:
     """Whether an action is one of the elements of a ``Discrete``."""
     if type(action) is int:
         return action in elements
@@ -63,7 +89,7 @@ def is_element(action: Any, elements: Collection[int]) -> bool:
         return False
 
 
-def has_nan(action: Any) -> bool:
+def _has_nan(action: Any) -> bool:
     """Whether an action contains NaN, however the hooks would treat it."""
     if isinstance(action, np.ndarray):
         return action.dtype.kind == "f" and _holds_nan(action)
@@ -72,12 +98,12 @@ def has_nan(action: Any) -> bool:
     if not isinstance(action, list | tuple | Mapping):
         return False
     try:
-        return any(map(has_nan, action.values() if isinstance(action, Mapping) else action))
+        return any(map(_has_nan, action.values() if isinstance(action, Mapping) else action))
     except ordinary(Exception):  # a list that contains itself, or an object whose methods fail
         return False
 
 
-def is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
+def _is_misfit(action: Any, space: spaces.Space[Any], error: Exception) -> bool:
     """Whether a hook raised an exception because the action is not in the action space.
 
     Hooks may accept more than the elements of the space: a bare number for an array of one, for

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from inspect import getattr_static
 from math import floor, isfinite, nan
 from types import MappingProxyType
-from typing import Any, ClassVar, Final, Self, cast
+from typing import Any, ClassVar, Final, Self
 from weakref import WeakSet
 
 import numpy as np
@@ -36,13 +36,14 @@ from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
-from fmugym.task.step import NUMBERS
 from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
-__all__ = ["Constructed"]
+__all__ = ["Constructed", "plan_of", "plan_of_reset", "prepare_hooks", "require_construction"]
 
 _FASTEST_FPS: Final = 1_000_000
+
+_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 
 
 class Constructed(Pictured):
@@ -53,49 +54,30 @@ class Constructed(Pictured):
     reset_options: ClassVar[tuple[str, ...]]
     metadata: dict[str, Any]
 
-    _base: ClassVar[type]
-    """``FMUEnv``, with whose methods those of an environment are compared."""
-
-    _number: int
     _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
-
-    _own_names: frozenset[str] = frozenset()
-    """The attributes that are not a subclass's own."""
-
-    _as_constructed: dict[str, Any]
-    """The plain attributes of a subclass when its hooks were prepared."""
 
     _warm_up: WarmUp | None = None
     """What happens in warm-ups with moving inputs; the pool knows of others only."""
 
-    _pool: Pool | None = None
     _is_closed = False
-    _player: Any = None
-    """Steps the environment if its hooks are compiled, see ``fmugym.vector.one``; or None."""
-
-    _has_chosen = False
-    """Whether it is known if there is a player."""
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Keep the arguments, because an environment pickles as its class and arguments.
-
-        The number tells a vector environment which environments are new.
-        """
+        """Keep the arguments, because an environment pickles as its class and arguments."""
         env = super().__new__(cls)
         env._constructor_arguments = args, kwargs
-        env._number = next(env_numbers)
-        env.inside = Inside()
+        env.inside = Inside(next(env_numbers))
         return env
 
     def _construct(
         self,
+        base: type,
         fmu_path: str | os.PathLike[str] | FMUSystem,
         config: Mapping[str, Any] | EnvConfig,
         log_level: int,
         render_mode: str | None,
     ) -> None:
         """Do everything that a constructor does before there is a pool."""
-        foreign = set(vars(self))
+        foreign, self.inside.base = set(vars(self)), base
         _require_readings(type(self))
         self.logger = logging.getLogger(f"fmugym.{type(self).__name__}")
         _set_level(self.logger, log_level)
@@ -113,9 +95,8 @@ class Constructed(Pictured):
         self._prepare_values()
         self._prepare_episodes()
         self._prepare_spaces()
-        self._prepare_hooks()
-        self._own_names = _names_of(self._base)
-        self._note_own_names(foreign)
+        prepare_hooks(self)
+        self.inside.own_names = _names_of(self.inside.base) | vars(self).keys() - foreign
 
     def _open(self, backend: Any, isolation: str | None) -> None:
         """Open the pool, unless a vector environment is going to give one."""
@@ -129,44 +110,18 @@ class Constructed(Pictured):
             isolation,
         )
         if not pools_are_deferred():
-            self._use(self.inside.opening.open())
-
-    def _use(self, pool: Pool) -> None:
-        """Let a pool of one step this environment, or one of N if a vector environment does it."""
-        foreign = set(vars(self))
-        self._pool = pool
-        self._step_pool, self._halt = pool.step_own, pool.halt
-        self._input_row, self._output_row = pool.inputs[:, 0], pool.outputs[:, 0]
-        self.inside.observation_row = pool.observations[0]
-        self.inside.pool_tells = bool(pool.info())
-        self.inside.has_info = self.inside.has_info or self.inside.pool_tells
-        self._note_own_names(foreign)
-
-    def _note_own_names(self, foreign: Collection[str]) -> None:
-        """Note that all present attributes but those are not a subclass's own."""
-        self._own_names |= vars(self).keys() - foreign
+            self.inside.use(self.inside.opening.open())
 
     def _open_pool(self, method: str) -> Pool:
-        if self._pool is None:
-            self._require_construction()
+        """The pool, which is opened now if that has been deferred."""
+        if not self.inside.is_open:
+            require_construction(self)
             if self._is_closed:
                 raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
             self.inside.opening = self.inside.opening.apart()
             self.fmu = self.inside.opening.fmu
-            self._use(self.inside.opening.open())
-        return cast(Pool, self._pool)
-
-    def _require_construction(self) -> None:
-        if not hasattr(self.inside, "opening"):
-            name = type(self).__name__
-            raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
-
-    def _close_pool(self) -> None:
-        if self._pool is not None:
-            self._keep_readings()
-            self._player, self._has_chosen = None, False
-            self._pool.close()
-            self._pool = None
+            self.inside.use(self.inside.opening.open())
+        return self.inside.pool
 
     @property
     def reset_method(self) -> str:
@@ -193,7 +148,7 @@ class Constructed(Pictured):
                 internal,
                 self.fmu.path.name,
             )
-        for method, hook in _misspelt(type(self), self._base):
+        for method, hook in _misspelt(type(self), self.inside.base):
             self.logger.warning(
                 "%s has a method %r, but no hook %r: is its name misspelt?",
                 *(type(self).__name__, method, hook),
@@ -238,13 +193,10 @@ class Constructed(Pictured):
         )
 
     def _prepare_episodes(self) -> None:
-        self.inside.plan = self._plan_episode({})
+        self.inside.plan = plan_of(self)
         self.inside.step_limit = _step_limit(
             self.config, self.inside.spec, self.inside.warm_up_steps
         )
-        self.inside.ended = True
-        self.inside.in_hooks = False
-        self.inside.was_reset = False
 
     def _prepare_spaces(self) -> None:
         self.action_space = self._get_action_space()
@@ -257,63 +209,93 @@ class Constructed(Pictured):
                 )
         self.inside.no_action = no_action(self.action_space)
 
-    def _prepare_hooks(self) -> None:
-        """Find out which hooks the class overrides, and prepare the defaults of the others."""
-        interface, space = self.inside.interface, self.observation_space
-        self.inside.own = own = OwnHooks.of(self, self._base)
-        if self.config.draws_start_time and self.config.stop_time is not None:
-            self._let_stop_time_end_episodes()
-            self.inside.own = own = OwnHooks.of(self, self._base)
-        self._form = NUMBERS
-        # A subclass with its own step may take other actions.
-        self.inside.elements = None if own.step else elements_of(self.action_space)
-        derived = not own.get_action_space
-        values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
-        self.inside.action_values = values
-        default = not own.get_observation
-        make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
-        self.inside.observe = make(interface, space)
-        self.inside.is_finite = finiteness_of(space)
-        # The pool writes this observation in the pass that steps the FMU.
-        self.inside.pool_observes = (
-            default and isinstance(space, spaces.Box) and space.dtype == np.float32
-        )
-        self.inside.has_info = own.get_info or self.inside.pool_tells
-        self.inside.input_writer = InputWriter(interface.inputs)
-        self._as_constructed = plain_attributes(vars(self), self._own_names)
 
-    def _let_stop_time_end_episodes(self) -> None:
-        """Each episode has its own last step, as each has its own start time."""
-        hook = self._is_truncated if self.inside.own.is_truncated else None
-        if not isinstance(hook, _StopTime):
-            vars(self)["_is_truncated"] = _StopTime(self, hook)
+def require_construction(env: Constructed) -> None:
+    """Refuse an environment whose class has not called the constructor of its base class.
 
-    def _plan_of_reset(self, options: Mapping[str, Any] | None, *also_known: str) -> EpisodePlan:
-        if options is None:
-            return self.inside.plan
-        options = check_mapping("the options of reset", options)
-        for name in options:
-            if name not in self.reset_options:
-                raise unknown_name("reset option", name, (*self.reset_options, *also_known))
-        if not options:
-            return self.inside.plan
-        parameters = self._get_episode_parameters(options)
-        return self._plan_episode(
-            check_mapping("what _get_episode_parameters returned", parameters)
-        )
+    Raises:
+        ConfigError: If it has not.
+    """
+    if not hasattr(env.inside, "opening"):
+        name = type(env).__name__
+        raise ConfigError(f"{name}.__init__ must call super().__init__(fmu_path, config)")
 
-    def _plan_episode(self, overrides: Mapping[str, Any]) -> EpisodePlan:
-        """Prepare the draws of episodes in which these parameters replace the config's."""
-        parameters = dict(self.inside.interface.parameters)
-        given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
-        own = self.inside.interface.start_values(given)
-        parameters |= own
-        return EpisodePlan(
-            tuple(map(self.inside.interface.parameter, parameters, parameters.values())),
-            parameters,
-            self.config.episode_variables,
-            own.keys(),
-        )
+
+def prepare_hooks(env: Constructed) -> None:
+    """Find out which hooks an environment overrides, and prepare the defaults of the others."""
+    inside, space, base = env.inside, env.observation_space, env.inside.base
+    inside.own = own = OwnHooks.of(env, base)
+    if env.config.draws_start_time and env.config.stop_time is not None:
+        _let_stop_time_end_episodes(env)
+        inside.own = own = OwnHooks.of(env, base)
+    # A subclass with its own step may take other actions.
+    inside.elements = None if own.step else elements_of(env.action_space)
+    interface, derived = inside.interface, not own.get_action_space
+    values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
+    inside.action_values = values
+    default = not own.get_observation
+    make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation
+    inside.observe = make(interface, space)
+    inside.is_finite = finiteness_of(space)
+    # The pool writes this observation in the pass that steps the FMU.
+    inside.pool_observes = default and isinstance(space, spaces.Box) and space.dtype == np.float32
+    inside.has_info = own.get_info or inside.pool_tells
+    inside.input_writer = InputWriter(interface.inputs)
+    inside.as_constructed = plain_attributes(vars(env), inside.own_names)
+
+
+def _let_stop_time_end_episodes(env: Constructed) -> None:
+    """Each episode has its own last step, as each has its own start time."""
+    hook = env._is_truncated if env.inside.own.is_truncated else None
+    if not isinstance(hook, _StopTime):
+        vars(env)["_is_truncated"] = _StopTime(env, hook)
+
+
+def plan_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodePlan:
+    """Prepare the draws of an environment's episodes.
+
+    Args:
+        env: The environment.
+        overrides: Parameters by name that replace those of the config, values or distributions.
+
+    Raises:
+        ConfigError: If a parameter does not fit.
+    """
+    interface = env.inside.interface
+    given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
+    own = interface.start_values(given)
+    parameters = {**interface.parameters, **own}
+    return EpisodePlan(
+        tuple(map(interface.parameter, parameters, parameters.values())),
+        parameters,
+        env.config.episode_variables,
+        own.keys(),
+    )
+
+
+def plan_of_reset(
+    env: Constructed, options: Mapping[str, Any] | None, *also_known: str
+) -> EpisodePlan:
+    """Prepare the draws of the episodes that a reset with options begins.
+
+    Args:
+        env: The environment.
+        options: Those of ``reset``.
+        also_known: Names of options that are dealt with elsewhere.
+
+    Raises:
+        ConfigError: If an option does not fit.
+    """
+    if options is None:
+        return env.inside.plan
+    options = check_mapping("the options of reset", options)
+    for name in options:
+        if name not in env.reset_options:
+            raise unknown_name("reset option", name, (*env.reset_options, *also_known))
+    if not options:
+        return env.inside.plan
+    parameters = env._get_episode_parameters(options)
+    return plan_of(env, check_mapping("what _get_episode_parameters returned", parameters))
 
 
 _checked: Final[WeakSet[type[Any]]] = WeakSet()

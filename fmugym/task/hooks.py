@@ -99,9 +99,6 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
 
     # In the order of a step.
 
-    def _keep_readings(self) -> None:
-        """Keep what hooks read in the environment itself until the next step."""
-
     def _get_inputs(self) -> Any:
         """Turn ``self.action`` into the values of the inputs, in the order of the config.
 
@@ -204,6 +201,10 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
         ``desired_goal``. The default reward and ``compute_reward`` then call it.
         """
         raise SimulationError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
+
+    def _explain(self, reward: float) -> str:
+        """Say where a reward that is not finite comes from."""
+        return f"_reward_policy returned {reward}"
 
     def _get_episode_parameters(self, options: Mapping[str, Any]) -> Mapping[str, Any]:
         """The parameters that the options of ``reset`` override for one episode, by name."""

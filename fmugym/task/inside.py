@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool import PoolSpec
+from fmugym.pool import Pool, PoolSpec
+from fmugym.pool.base import FloatArray
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import Interface
 from fmugym.task.opening import PoolOpening
 from fmugym.task.readings import Readings
 from fmugym.task.warm_up import WarmUps
+
+if TYPE_CHECKING:
+    from fmugym.rendering import Renderer
 
 __all__ = ["Inside", "OwnHooks"]
 
@@ -59,10 +63,22 @@ class Inside:
     An environment in a batch has the fields of its class, and those of the batch where hooks read.
 
     Attributes:
+        number: Tells which environments are newer.
+        base: ``FMUEnv``, with whose methods those of an environment are compared.
+        way: The way of calling hooks, see ``FMUEnv``.
+        own_names: The attributes that are not a subclass's own.
+        as_constructed: The plain attributes of a subclass when its hooks were prepared.
         interface: The variables of the config, as the FMU has them.
         spec: What the pool does at each reset and step.
         opening: Opens pools.
+        pool: The open pool: of one, or of N if a vector environment steps it.
+        step_pool, halt, input_row, output_row: Parts of the pool that each step needs.
+        observation_row: The pool's observation of this environment.
+        pool_tells: Whether the pool adds to the info of a step.
+        player: Steps the environment if its hooks are compiled; or None.
+        has_chosen: Whether it is known if there is a player.
         plan: What is drawn for an episode.
+        quantities: Lists what a declared task has names for; None for other tasks.
         own: The hooks that the class has itself.
         readings: What hooks read now.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -78,45 +94,97 @@ class Inside:
         warm_ups: What happens in warm-ups with moving inputs, or None.
         warm_up_steps: The steps of a warm-up.
         has_info: Whether a step has an info.
-        pool_tells: Whether the pool adds to it.
         pool_observes: Whether the pool makes the observation.
         observe: Makes the default observation from the outputs.
-        observation_row: The pool's observation of this environment.
         is_finite: Whether all numbers of an observation are finite.
+        scope: What snapshots of it fit; None until there is one, see ``scope_of``.
+        renderer: Draws the pictures, once there are any.
+        pictured: The reward and the return that a picture shows.
     """
 
     __slots__ = (
-        *("action_values", "elements", "ended", "has_info", "in_hooks", "input_writer"),
-        *("interface", "is_finite", "no_action", "no_monitors", "observation_row", "observe"),
-        *("opening", "output_count", "own", "plan", "pool_observes", "pool_tells", "readings"),
-        *("spec", "start_inputs", "step_limit", "warm_up_steps", "warm_ups", "was_reset"),
+        *("action_values", "as_constructed", "base", "elements", "ended", "halt"),
+        *("has_chosen", "has_info", "in_hooks", "input_row", "input_writer", "interface"),
+        *("is_finite", "no_action", "no_monitors", "number", "observation_row", "observe"),
+        *("opening", "output_count", "output_row", "own", "own_names", "pictured", "plan"),
+        *("player", "pool", "pool_observes", "pool_tells", "quantities", "readings"),
+        *("renderer", "scope", "spec", "start_inputs", "step_limit", "step_pool"),
+        *("warm_up_steps", "warm_ups", "was_reset", "way"),
     )
 
     action_values: Sequence[int] | None
+    as_constructed: dict[str, Any]
+    base: type
     elements: Any
     ended: bool
+    halt: Callable[[], None]
+    has_chosen: bool
     has_info: bool
     in_hooks: bool
+    input_row: FloatArray
     input_writer: InputWriter
     interface: Interface
     is_finite: Callable[[Any], bool]
     no_action: Any
     no_monitors: bool
+    number: int
     observation_row: npt.NDArray[np.float32]
     observe: Callable[[Any], Any]
     opening: PoolOpening
     output_count: int
+    output_row: FloatArray
     own: OwnHooks
+    own_names: frozenset[str]
+    pictured: tuple[float | None, float]
     plan: EpisodePlan
+    player: Any
+    pool: Pool
     pool_observes: bool
     pool_tells: bool
+    quantities: Callable[[], Any] | None
     readings: Readings
+    renderer: Renderer[Any] | None
+    scope: dict[str, str] | None
     spec: PoolSpec
     start_inputs: list[tuple[str, float]]
     step_limit: int
+    step_pool: Callable[[], int]
     warm_up_steps: int
     warm_ups: WarmUps | None
     was_reset: bool
+    way: str
 
-    def __init__(self) -> None:
-        self.pool_tells, self.warm_ups = False, None
+    def __init__(self, number: int) -> None:
+        self.number, self.own_names, self.way = number, frozenset(), "auto"
+        self.pool_tells = self.has_info = self.has_chosen = False
+        self.in_hooks = self.was_reset = False
+        self.ended = True
+        self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
+        self.pictured = None, 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is an open pool."""
+        return hasattr(self, "pool")
+
+    def use(self, pool: Pool) -> None:
+        """Let a pool of one step the environment, or one of N if a vector environment does it."""
+        self.pool = pool
+        self.step_pool, self.halt = pool.step_own, pool.halt
+        self.input_row, self.output_row = pool.inputs[:, 0], pool.outputs[:, 0]
+        self.observation_row = pool.observations[0]
+        self.pool_tells = bool(pool.info())
+        self.has_info = self.has_info or self.pool_tells
+
+    def close_pool(self) -> None:
+        """Close the pool, if one is open; hooks then read what the latest step has left."""
+        if self.is_open:
+            self.keep()
+            self.player, self.has_chosen, self.ended = None, False, True
+            self.pool.close()
+            del self.pool
+
+    def keep(self) -> None:
+        """Keep what hooks read in an object of its own, not in the pool, until the next step."""
+        if self.player is not None:
+            self.player.keep(self)

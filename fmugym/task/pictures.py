@@ -13,7 +13,7 @@ from fmugym.task.hooks import Hooks
 if TYPE_CHECKING:
     from fmugym.rendering import Overlay, Renderer
 
-__all__ = ["Pictured"]
+__all__ = ["Pictured", "note_for_picture"]
 
 _GYMNASIUM_MODES = ("human", "rgb_array", "ansi", "rgb_array_list", "ansi_list")
 
@@ -23,10 +23,6 @@ class Pictured(Hooks):
 
     render_size: ClassVar[tuple[int, int]] = (600, 400)
     """Width and height of the pictures in pixels."""
-
-    _renderer: Renderer[Any] | None = None
-    _last_reward: float | None = None
-    _return: float = 0.0
 
     @property
     def time(self) -> float:
@@ -52,11 +48,6 @@ class Pictured(Hooks):
         )
         return None
 
-    def _note_for_picture(self, reward: float) -> None:
-        self._last_reward, self._return = reward, self._return + reward
-        if self.render_mode == "human":
-            self.render()
-
     def render(self) -> Any:
         """Draw the current state.
 
@@ -73,9 +64,9 @@ class Pictured(Hooks):
             return None
         if not self.inside.was_reset:
             raise SimulationError("render was called before the first reset")
-        if self._renderer is None:
-            self._renderer = self._make_renderer(self.render_mode)
-        return self._renderer.render(self._get_frame(), self._overlay())
+        if self.inside.renderer is None:
+            self.inside.renderer = self._make_renderer(self.render_mode)
+        return self.inside.renderer.render(self._get_frame(), self._overlay())
 
     def _make_renderer(self, mode: str) -> Renderer[Any]:
         from fmugym.rendering import Renderer  # pygame takes a while to import
@@ -92,4 +83,11 @@ class Pictured(Hooks):
         action = self._describe_action() if self.step_count else ""
         if not isinstance(action, str):
             raise ConfigError(f"_describe_action returned {shown(action)}, expected text")
-        return Overlay(self.time, action, self._last_reward, self._return)
+        return Overlay(self.time, action, *self.inside.pictured)
+
+
+def note_for_picture(env: Pictured, reward: float) -> None:
+    """Note the reward of a step of an environment with pictures; a window shows it at once."""
+    env.inside.pictured = reward, env.inside.pictured[1] + reward
+    if env.render_mode == "human":
+        env.render()

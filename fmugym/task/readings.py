@@ -44,9 +44,17 @@ class Readings:
     @classmethod
     def of(cls, env: Any) -> Readings:
         """Return what the hooks of an environment read now; the values are not copied."""
-        env._keep_readings()
+        env.inside.keep()
         present: Readings = env.inside.readings
         return replace(present)
+
+    def take_back(self, before: tuple[Any, Any, Any, Any]) -> None:
+        """Return to before an action was taken, if the FMU has not stepped.
+
+        Args:
+            before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
+        """
+        self.action, self.previous_action, self.previous_state, self.inputs = before
 
 
 READINGS: Final = tuple(field.name for field in fields(Readings) if field.name != "values")
@@ -62,7 +70,7 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
     """
 
     def put(env: Any, value: Any) -> None:
-        env._keep_readings()
+        env.inside.keep()
         setattr(env.inside.readings, name, value)
 
     return property(get, put)

@@ -41,14 +41,14 @@ def columns_of(env: Constructed) -> Columns:
     Returns:
         Columns of one environment.
     """
-    attributes = plain_attributes(vars(env), env._own_names)
+    attributes = plain_attributes(vars(env), env.inside.own_names)
     streams, seeds = _stream_of(env)
     return read_columns(env, lambda value: [copy.deepcopy(value)]) | {
         "ended": np.array([env.inside.ended]),
         "streams": streams,
         "seeds": seeds,
-        "pictured": [(env._last_reward, env._return)],
-        "attributes": [changed(attributes, env._as_constructed)],
+        "pictured": [env.inside.pictured],
+        "attributes": [changed(attributes, env.inside.as_constructed)],
     }
 
 
@@ -96,7 +96,7 @@ def place_columns(env: Constructed, columns: Columns, place: int) -> None:
         {name: _native_value(column, place) for name, column in columns["variables"].items()}
     )
     pictured, attributes = columns["pictured"], columns["attributes"]
-    env._last_reward, env._return = (None, 0.0) if pictured is None else pictured[place]
+    env.inside.pictured = (None, 0.0) if pictured is None else pictured[place]
     vars(env).update({} if attributes is None else copy.deepcopy(attributes[place]))
     _place_stream(env, columns, place)
     env.inside.was_reset, env.inside.ended = True, bool(columns["ended"][place])

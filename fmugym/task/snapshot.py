@@ -271,6 +271,12 @@ def _shown(text: str) -> str:
 
 def scope_of(env: Constructed) -> Scope:
     """What a snapshot's environment must have in common with this one."""
+    if env.inside.scope is None:
+        env.inside.scope = _find_scope(env)
+    return env.inside.scope
+
+
+def _find_scope(env: Constructed) -> Scope:
     config, fmu = env.config, env.fmu.description
     scope = {
         "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} "

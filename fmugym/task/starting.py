@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +15,16 @@ from fmugym.distributions import Choice, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.roles import require_not_driven, require_numeric
 
+if TYPE_CHECKING:
+    from fmugym.task.hooks import Hooks
+
 __all__ = [
     "check_rest_is_known",
     "checked",
     "checked_column",
     "checked_value",
     "spread",
+    "start_time_of",
     "start_values",
     "start_variable",
     "structural_values",
@@ -241,3 +245,10 @@ def _check_integer(variable: Variable, number: float) -> None:
     if values and number not in values:
         listing = ", ".join(f"{value} ({name})" for name, value in variable.items)
         raise ConfigError(f"{variable.name!r}: expected one of {listing}, got {number:g}")
+
+
+def start_time_of(env: Hooks) -> Any:
+    """The first communication point of an environment's episode, in s; or of N as hooks read it."""
+    if env.config.draws_start_time:
+        return env.parameters["start_time"]
+    return env.inside.spec.start_time

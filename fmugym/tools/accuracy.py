@@ -85,7 +85,7 @@ class Replay:
         """Play the beginning of an episode with random actions, and keep what the FMU got."""
         env.action_space.seed(0)
         env.reset(seed=0)
-        plan, pool = env.inside.plan, env._open_pool("a repetition")
+        plan, pool = env.inside.plan, env.inside.pool
         pairs = zip(plan.model_variables, plan.parameter_names, strict=True)
         starts = [checked_value(variable, env.parameters[name]) for variable, name in pairs]
         inputs: list[Any] = []

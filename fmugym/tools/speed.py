@@ -114,7 +114,7 @@ def _of_single(env: FMUEnv, seconds: float) -> Speed:
     env.reset(seed=0)
     _fastest(step, seconds / 4)
     took = _fastest(step, seconds)
-    hooks = "python" if env._player is None else "compiled"
+    hooks = "python" if env.inside.player is None else "compiled"
     env.reset(seed=0)
     return Speed(0, hooks, 1.0 / took, took * 1e6, _share(env, seconds, took))
 
@@ -126,8 +126,8 @@ def _of_vector(make_env: Callable[[], FMUEnv], size: int, seconds: float) -> Spe
         actions = [envs.action_space.sample() for _ in range(16)]
         took = _fastest(lambda number: envs.step(actions[number % 16]), seconds)
         envs.reset(seed=0)
-        share = _share(envs._prototype, seconds, took)
-        hooks = type(envs._engine).__name__.removesuffix("Engine").lower()
+        share = _share(envs.inside.prototype, seconds, took)
+        hooks = type(envs.inside.engine).__name__.removesuffix("Engine").lower()
         named = {"batch": "array", "perenv": "per_env"}.get(hooks, hooks)
         return Speed(size, named, size / took, took * 1e6, share)
     finally:
@@ -165,7 +165,7 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     The FMUs go on from the beginning of an episode with their first inputs, for as many steps as an
     episode may have, so that they stay near states that occur.
     """
-    pool = env._open_pool("a measurement")
+    pool = env.inside.pool
     variables = tuple(env.inside.plan.model_variables)
     rng = np.random.default_rng(0)
     limit = min(env.inside.step_limit, 1000)

@@ -1,33 +1,35 @@
-"""Attributes and parameters of the single environments of a vector environment, by name."""
+"""Attributes, parameters and methods of the single environments of a vector environment."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.signals import ordinary
+from fmugym.task.construction import plan_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
-from fmugym.vector.calls import checked_name, require_settable
-from fmugym.vector.engines.base import Engine
+from fmugym.vector.calls import TOGETHER, checked_name, require_settable
+
+if TYPE_CHECKING:
+    from fmugym.vector.inside import VectorInside
 
 __all__ = ["Attributes"]
 
 
 class Attributes:
-    """What ``get_attr`` and ``set_attr`` of a vector environment read and set.
+    """What ``get_attr``, ``set_attr`` and ``call`` of a vector environment read, set and call.
 
     Args:
-        prototype: The environment whose class and FMU all have.
-        engine: Keeps the values of each environment.
+        inside: That of the vector environment.
     """
 
-    def __init__(self, prototype: FMUEnv, engine: Engine) -> None:
-        self._prototype, self._engine = prototype, engine
+    def __init__(self, inside: VectorInside) -> None:
+        self._inside = inside
+        self._prototype, self._engine = inside.prototype, inside.engine
 
     def read(self, name: str, indices: Sequence[int]) -> list[Any]:
         """Read an attribute, or else a parameter, of some environments.
@@ -37,6 +39,35 @@ class Attributes:
         """
         name = checked_name(name)
         return [self._engine.read(name, index) for index in indices]
+
+    def call(
+        self, name: str, indices: Sequence[int], args: Sequence[Any], kwargs: Mapping[str, Any]
+    ) -> list[Any]:
+        """Call a method of some environments; see ``FMUVectorEnv.call``."""
+        name = checked_name(name)
+        if name in TOGETHER:
+            raise ConfigError(f"{name!r} cannot be called on single environments of many")
+        if name == "render":
+            return self.render(indices)
+        return self._engine.call(name, indices, args, kwargs)
+
+    def render(self, indices: Sequence[int]) -> list[Any]:
+        """Draw some environments; all have the same renderer.
+
+        Raises:
+            SimulationError: Before the first reset.
+        """
+        if self._prototype.render_mode is None:
+            return [None for _ in indices]
+        if not self._inside.started:
+            raise SimulationError("render was called before the first reset")
+        first, pictures = self._prototype.inside, []
+        for index in indices:
+            with self._engine.single(index) as env:
+                env.inside.renderer = env.inside.renderer or first.renderer
+                pictures.append(env.render())
+                first.renderer = env.inside.renderer
+        return pictures
 
     def set(self, name: str, values: Any) -> None:
         """Set an attribute, or a parameter, of all environments; see ``FMUVectorEnv.set_attr``."""
@@ -68,7 +99,7 @@ class Attributes:
 
     def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
         """Set a parameter of all environments, from their next episodes on."""
-        self._prototype._plan_episode({name: values[0]})  # it refuses what cannot be set
+        plan_of(self._prototype, {name: values[0]})  # it refuses what cannot be set
         scalars = self._prototype.fmu.description.scalars(name)
         rows = [spread(name, scalars, value) for value in values]
         columns = {

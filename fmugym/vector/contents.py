@@ -22,8 +22,8 @@ from fmugym.vector.hooks.tables import functions_of, places_of
 
 __all__ = ["Contents", "borrowed", "differs"]
 
-_NOT_COMPARED: Final = frozenset({"inside", "_input_row", "_output_row", "_observation_row"})
-"""Attributes that the caller of hooks and the pool change."""
+_NOT_COMPARED: Final = "inside"
+"""The attribute that the caller of hooks and the pool change."""
 
 _LARGEST_OUTSIDE: Final = 2000
 """Global variables with more elements are taken for data, which no hook changes."""
@@ -70,7 +70,7 @@ class Contents:
         self._kept: list[_Kept] = []
         seen = {id(env)}
         for name, value in self._before.items():
-            if name not in _NOT_COMPARED:
+            if name != _NOT_COMPARED:
                 self._keep(name, value, seen)
         places = _places_outside(env) if outside else ()
         self._outside = [(place, name, place[name]) for place, name in places]
@@ -98,7 +98,7 @@ class Contents:
         """The name of an attribute that was set, or whose value has changed in place."""
         before, in_place = self._before, self.changed_in_place()
         for name, value in self._attributes.items():
-            if name in _NOT_COMPARED:
+            if name == _NOT_COMPARED:
                 continue
             if name in in_place or name not in before or differs(before[name], value):
                 return name

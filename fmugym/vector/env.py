@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
 from fmugym.checks import check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.pool.base import MaskArray, Pool
+from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
+from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.alone import Turn, alone, in_use
@@ -30,17 +30,17 @@ from fmugym.vector.arguments import (
     split_options,
 )
 from fmugym.vector.attributes import Attributes
-from fmugym.vector.calls import TOGETHER, checked_name
 from fmugym.vector.choosing import make_engine
 from fmugym.vector.engines.base import StepResult
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
+from fmugym.vector.inside import VectorInside
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
 from fmugym.vector.rollouts import Candidates, Rollout, tunable_values
 from fmugym.vector.saving import chosen, sources_for
 
-__all__ = ["FMUVectorEnv"]
+__all__ = ["FMUVectorEnv", "require_open"]
 
 _SAME_STEP = AutoresetMode.SAME_STEP  # each look-up takes time
 
@@ -87,12 +87,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
     _turn: Turn
+    inside: VectorInside
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUVectorEnv:
         """Keep the arguments for copies."""
         env = super().__new__(cls)
         env._arguments = args, kwargs
         env._turn = Turn()
+        env.inside = VectorInside()
         return env
 
     def __init__(
@@ -114,9 +116,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         way, limit = checked_hooks(hooks), checked_step_limit(max_episode_steps)
         options = checked_pool_options(pool_options, self.num_envs)
         try:
-            self._maker = EnvMaker(make_env)
-            self._prototype = self._maker.make()
-            self._prototype._require_construction()
+            self.inside.maker = EnvMaker(make_env)
+            self.inside.prototype = self.inside.maker.make()
+            require_construction(self.inside.prototype)
             self._set_up_or_close(way, limit, options)
         except MemoryError:
             raise ConfigError(f"there is not enough memory for num_envs = {num_envs}") from None
@@ -124,38 +126,36 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _set_up_or_close(
         self, hooks: str, max_episode_steps: int | None, pool_options: Mapping[str, Any]
     ) -> None:
-        env = self._prototype
+        env = self.inside.prototype
         try:
-            self._pool = env.inside.opening.open(self.num_envs, **pool_options)
+            self.inside.pool = env.inside.opening.open(self.num_envs, **pool_options)
             try:
-                env._use(self._pool)
-                env._has_chosen = True  # to be stepped by an engine
+                env.inside.use(self.inside.pool)
+                env.inside.has_chosen = True  # to be stepped by an engine
                 self._set_up(hooks, max_episode_steps)
             except BaseException:
-                self._pool.close()
+                self.inside.pool.close()
                 raise
         except BaseException:
             env.close()
             raise
 
     def _set_up(self, hooks: str, max_episode_steps: int | None) -> None:
-        env, count = self._prototype, self.num_envs
-        env._prepare_hooks()  # its constructor may have set some as attributes
+        inside, env, count = self.inside, self.inside.prototype, self.num_envs
+        prepare_hooks(env)  # its constructor may have set some as attributes
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.render_mode = env.render_mode
         self.single_action_space = env.action_space
         self.single_observation_space = env.observation_space
         self.action_space = batch_space(env.action_space, count)
         self.observation_space = batch_space(env.observation_space, count)
-        self._started = self._is_ready = False
         self._waits = self.autoreset_mode is AutoresetMode.DISABLED  # for a reset after an end
         self._background = Background()
-        self._engine = make_engine(self._maker, env, self._pool, hooks, max_episode_steps)
-        self._episodes = Episodes(env, self._engine, self._pool)
-        self._attributes = Attributes(env, self._engine)
-        self._engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self._at_ends: list[Callable[[Any], None]] = []
-        self._pool.forget_health()  # that of the hook check
+        inside.engine = make_engine(inside.maker, env, inside.pool, hooks, max_episode_steps)
+        inside.episodes = Episodes(env, inside.engine, inside.pool)
+        inside.attributes = Attributes(inside)
+        inside.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
+        inside.pool.forget_health()  # that of the hook check
 
     # Episodes and steps.
 
@@ -183,26 +183,26 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
-            self._open_pool("reset")
-        if seed is None and self._is_ready:
+            require_open(self, "reset")
+        if seed is None and self.inside.is_ready:
             try:
-                result = self._engine.reset_by(options)
+                result = self.inside.engine.reset_by(options)
             except BaseException:
                 self._interrupt()
                 raise
             if result is not None:
                 return result
         remaining, mask = split_options(options, self.num_envs)
-        if not self._is_ready and not mask.all():
-            when = "reset after an exception" if self._started else "first reset"
+        if not self.inside.is_ready and not mask.all():
+            when = "reset after an exception" if self.inside.started else "first reset"
             raise ConfigError(f"the {when} must be of all environments")
         seeds = None if seed is None else checked_seeds(seed, self.num_envs)
         try:
-            observations, infos = self._engine.reset(mask, seeds, remaining)
+            observations, infos = self.inside.engine.reset(mask, seeds, remaining)
         except BaseException:
             self._interrupt()
             raise
-        self._started = self._is_ready = True
+        self.inside.started = self.inside.is_ready = True
         return observations, infos
 
     def step(self, actions: Any) -> StepResult:
@@ -228,7 +228,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         if not turn.begin():
             raise in_use(self, "step")
         try:
-            if not self._is_ready or self.closed or self._background.is_pending:
+            if not self.inside.is_ready or self.closed or self._background.is_pending:
                 self._refuse_step("step")
             if not self._waits:
                 return self._step(actions)
@@ -238,7 +238,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _step_until_ends(self, actions: Any) -> StepResult:
         """Step in the mode ``DISABLED``, in which ended episodes wait for a reset."""
-        engine = self._engine
+        engine = self.inside.engine
         if engine.any_ended:
             self._require_ready("step")
         try:
@@ -291,19 +291,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _require_ready(self, method: str, *, ended: bool = False) -> None:
         """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
-        if not self._is_ready or self.closed or self._background.is_pending:
+        if not self.inside.is_ready or self.closed or self._background.is_pending:
             self._refuse_step(method)
-        engine = self._engine
+        engine = self.inside.engine
         if not ended and engine.any_ended and self._waits:
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
     def _step(self, actions: Any) -> StepResult:
-        engine = self._engine
+        engine = self.inside.engine
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
             if engine.any_ended and self.autoreset_mode is _SAME_STEP:
-                for look in self._at_ends:
+                for look in self.inside.at_ends:
                     look(actions)
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment
@@ -311,41 +311,24 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             raise
         return result
 
-    def _look_at_ends(self, look: Callable[[Any], None]) -> None:
-        """Call a function of the actions where episodes have ended and the next have not begun.
-
-        That moment is within a step in the mode ``SAME_STEP``.
-        """
-        self._engine.leave_starts()
-        self._at_ends.append(look)
-
     def _interrupt(self) -> None:
         """After an exception, end the episodes whose FMUs have stepped without a result."""
-        self._pool.halt()
-        self._is_ready = self._is_ready and not self._engine.has_moved
+        self.inside.pool.halt()
+        self.inside.is_ready = self.inside.is_ready and not self.inside.engine.has_moved
 
     def _refuse_step(self, method: str) -> None:
-        self._open_pool(method)
-        if self._started:
+        require_open(self, method)
+        if self.inside.started:
             raise SimulationError(
                 f"{method} was called after an exception that has ended all episodes; call reset "
                 "first"
             )
         raise SimulationError(f"{method} was called before the first reset")
 
-    def _open_pool(self, method: str) -> Pool:
-        if self.closed:
-            raise SimulationError(f"{method} was called on a closed {type(self).__name__}")
-        if self._background.is_pending:
-            raise PendingStepError(
-                f"{method} was called while a step is under way; call step_wait first"
-            )
-        return self._pool
-
     def _start_again(self, result: StepResult, ended: MaskArray) -> StepResult:
         """Start the next episodes in the step that ended some, where the engine has not."""
         last = observations_of(result.observations, ended)
-        observations, infos = self._engine.reset(ended, None, {})
+        observations, infos = self.inside.engine.reset(ended, None, {})
         infos |= final_infos(last, restricted(result.infos, ended), ended)
         infos = merged(restricted(result.infos, ~ended), infos)
         return result._replace(observations=observations, infos=infos)
@@ -360,19 +343,10 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             SimulationError: Before the first reset, and after ``close``.
         """
-        self._open_pool("render")
+        require_open(self, "render")
         if self.render_mode is None:
             return None
-        if not self._started:
-            raise SimulationError("render was called before the first reset")
-        pictures = []
-        for index in range(self.num_envs):
-            with self._engine.single(index) as env:
-                if env._renderer is None:
-                    env._renderer = self._prototype._renderer
-                pictures.append(env.render())
-                self._prototype._renderer = env._renderer
-        return tuple(pictures)
+        return tuple(self.inside.attributes.render(range(self.num_envs)))
 
     # Snapshots.
 
@@ -390,7 +364,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 the FMUs, or if an FMU fails.
         """
         self._require_ready("save_state", ended=True)
-        return self._episodes.save(chosen(where, self.num_envs))
+        return self.inside.episodes.save(chosen(where, self.num_envs))
 
     @alone
     def restore_state(self, snapshot: Snapshot, where: Any = None) -> Any:
@@ -410,19 +384,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 environments before the first reset.
             SimulationError: If an FMU fails, or if real systems stand in for the FMUs.
         """
-        self._open_pool("restore_state")
+        require_open(self, "restore_state")
         indices = chosen(where, self.num_envs)
         sources = sources_for(checked_snapshot(snapshot), indices)
-        columns = self._episodes.columns_of(snapshot)
-        if not self._is_ready and len(indices) < self.num_envs:
+        columns = self.inside.episodes.columns_of(snapshot)
+        if not self.inside.is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
-        self._engine.require_fit(columns)
-        require_saving(self._pool)
-        self._is_ready = False
-        self._episodes.restore(snapshot.bundle, sources, indices)
-        self._engine.place(columns, sources, indices)
-        self._started = self._is_ready = True
-        return self._engine.observe(indices)
+        self.inside.engine.require_fit(columns)
+        require_saving(self.inside.pool)
+        self.inside.is_ready = False
+        self.inside.episodes.restore(snapshot.bundle, sources, indices)
+        self.inside.engine.place(columns, sources, indices)
+        self.inside.started = self.inside.is_ready = True
+        return self.inside.engine.observe(indices)
 
     @alone
     def rollout(
@@ -455,27 +429,13 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             SimulationError: If an episode of the snapshot has ended, an FMU cannot be restored, or,
                 with ``on_fault="raise"``, a step fails.
         """
-        self._open_pool("rollout")
+        require_open(self, "rollout")
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
-        candidates.parameters = tunable_values(self._prototype, parameters, candidates.count)
-        present = self.save_state() if self._is_ready else None
-        start = self._episodes.start_of_rollout(snapshot, present, candidates.count)
-        with self._returning_to(present):
-            return self._episodes.roll_out(start, candidates)
-
-    @contextmanager
-    def _returning_to(self, present: Snapshot | None) -> Iterator[None]:
-        """Return to the present episodes afterwards, or to none; nothing starts in between."""
-        engine = self._engine
-        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
-        try:
-            yield
-        finally:
-            engine.starts_at_ends = starts_at_ends
-            self._is_ready = False
-            if present is not None:
-                self._episodes.place(present, np.arange(self.num_envs))
-                self._is_ready = True
+        candidates.parameters = tunable_values(self.inside.prototype, parameters, candidates.count)
+        present = self.save_state() if self.inside.is_ready else None
+        start = self.inside.episodes.start_of_rollout(snapshot, present, candidates.count)
+        with self.inside.returning_to(present):
+            return self.inside.episodes.roll_out(start, candidates)
 
     # Single environments.
 
@@ -487,12 +447,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If there is nothing of this name (it is an ``AttributeError``, too).
             SimulationError: After ``close``.
         """
-        return tuple(self._get_attr(name, range(self.num_envs)))
-
-    def _get_attr(self, name: str, indices: Sequence[int]) -> list[Any]:
-        """Read an attribute or a parameter of some environments."""
-        self._open_pool("get_attr")
-        return self._attributes.read(name, indices)
+        require_open(self, "get_attr")
+        return tuple(self.inside.attributes.read(name, range(self.num_envs)))
 
     @alone
     def set_attr(self, name: str, values: Any) -> None:
@@ -509,14 +465,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 number of values is wrong, or they do not fit.
             SimulationError: After ``close``.
         """
-        self._open_pool("set_attr")
-        self._attributes.set(name, values)
+        require_open(self, "set_attr")
+        self.inside.attributes.set(name, values)
 
     @property
     @alone
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]  # one each
         """The seeds of the environments' generators, as in Gymnasium's ``SyncVectorEnv``."""
-        return tuple(self._engine.seed_of(index) for index in range(self.num_envs))
+        return tuple(self.inside.engine.seed_of(index) for index in range(self.num_envs))
 
     @property
     @alone
@@ -526,7 +482,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         Raises:
             SimulationError: After ``close``.
         """
-        return self._open_pool("health").health()
+        require_open(self, "health")
+        return self.inside.pool.health()
 
     @alone
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
@@ -539,35 +496,19 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 environments, or it changes what they cannot have each for itself.
             SimulationError: After ``close``.
         """
-        return tuple(self._call(name, range(self.num_envs), args, kwargs))
-
-    def _call(
-        self,
-        name: str,
-        indices: Sequence[int],
-        args: Sequence[Any],
-        kwargs: Mapping[str, Any],
-    ) -> list[Any]:
-        """Call a method of some environments."""
-        self._open_pool("call")
-        name = checked_name(name)
-        if name in TOGETHER:
-            raise ConfigError(f"{name!r} cannot be called on single environments of many")
-        if name == "render":
-            pictures = self.render() or [None] * self.num_envs
-            return [pictures[index] for index in indices]
-        return self._engine.call(name, indices, args, kwargs)
+        require_open(self, "call")
+        return tuple(self.inside.attributes.call(name, range(self.num_envs), args, kwargs))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
-        if hasattr(self, "_engine"):  # otherwise the constructor has failed, and closed everything
+        if hasattr(self.inside, "engine"):  # otherwise the constructor has closed everything
             self._turn.wait()
             try:
                 self._background.stop()
                 try:
-                    self._engine.close()
+                    self.inside.engine.close()
                 finally:
-                    self._pool.close()
+                    self.inside.pool.close()
             finally:
                 self._turn.end()
 
@@ -579,7 +520,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
         arguments = copy.deepcopy(self._arguments, memo)
         twin = _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
-        if self._is_ready and not self.closed:
+        if self.inside.is_ready and not self.closed:
             twin.restore_state(self.save_state())
         return twin
 
@@ -594,7 +535,22 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ) from None
 
     def __repr__(self) -> str:
-        return f"<FMUVectorEnv of {self.num_envs}: {self._prototype!r}>"
+        return f"<FMUVectorEnv of {self.num_envs}: {self.inside.prototype!r}>"
+
+
+def require_open(envs: FMUVectorEnv, method: str) -> None:
+    """Refuse a closed vector environment, and one in which a step is under way.
+
+    Raises:
+        SimulationError: If it is closed.
+        PendingStepError: If a step is under way; a ``SimulationError``, too.
+    """
+    if envs.closed:
+        raise SimulationError(f"{method} was called on a closed {type(envs).__name__}")
+    if envs._background.is_pending:
+        raise PendingStepError(
+            f"{method} was called while a step is under way; call step_wait first"
+        )
 
 
 def _rebuilt(

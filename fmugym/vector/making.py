@@ -11,6 +11,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import PoolSpec
 from fmugym.signals import Ignoring
+from fmugym.task.construction import require_construction
 from fmugym.task.opening import deferred_pools, env_numbers
 
 __all__ = ["EnvMaker", "make_with_pool"]
@@ -29,8 +30,8 @@ def make_with_pool(make_env: Callable[[], Any], num_instances: int = 1, **option
         FMULoadError: If the FMU cannot be used on this machine.
     """
     env = EnvMaker(make_env).make()
-    env._require_construction()
-    env._use(env.inside.opening.open(num_instances, **options))
+    require_construction(env)
+    env.inside.use(env.inside.opening.open(num_instances, **options))
     return env
 
 
@@ -61,12 +62,12 @@ class EnvMaker:
             raise ConfigError(
                 f"make_env must return an unwrapped environment of fmugym, got {type(env).__name__}"
             )
-        if env._number < first:
+        if env.inside.number < first:
             raise ConfigError(
                 "make_env must make a new environment in each call, but it returned a "
                 f"{type(env).__name__} that was there before; let it call the class"
             )
-        env._close_pool()  # of a constructor that has used it, or in another thread
+        env.inside.close_pool()  # of a constructor that has used it, or in another thread
         return env
 
     def make_like(self, prototype: FMUEnv, index: int) -> FMUEnv:

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
+from fmugym.task.inside import Inside
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.vector.contents import borrowed, differs
@@ -95,9 +96,9 @@ class Player:
     step: Callable[[Any, dict[str, Any]], Any]
 
     def __init__(self, env: FMUEnv) -> None:
-        env._keep_readings()
+        env.inside.keep()
         self._own = env.inside.readings
-        self._pool: Any = env._open_pool("step")
+        self._pool: Any = env.inside.pool
         self._numbers: dict[str, npt.NDArray[Any]] = {}
         self._compile(env)
 
@@ -170,12 +171,12 @@ class Player:
         env.inside.readings = self.readings
         return True
 
-    def keep(self, env: FMUEnv) -> None:
+    def keep(self, inside: Inside) -> None:
         """Let the environment keep again what hooks read, as after the latest step."""
         own, now = self._own, self.readings
-        if env.inside.readings is not now:
+        if inside.readings is not now:
             return
-        env.inside.readings = own
+        inside.readings = own
         if now.step_count == own.step_count:
             return  # nothing has happened
         for name in _KEPT:
@@ -183,13 +184,13 @@ class Player:
         for name in self._task.updated:
             own.variables[name] = _number_of(self._memory.variables[name][..., 0])
 
-    def begin(self, env: FMUEnv) -> None:
+    def begin(self, inside: Inside) -> None:
         """Let the environment keep what hooks read, all of which an episode is about to set."""
-        env.inside.readings = self._own
+        inside.readings = self._own
 
-    def go_back(self, env: FMUEnv) -> None:
+    def go_back(self, inside: Inside) -> None:
         """Let the environment keep what hooks read when the FMU has stepped, but was not judged."""
-        self.keep(env)
+        self.keep(inside)
         own, memory = self._own, self._memory
         own.values = tuple(memory.kept[:, 0].tolist())
         own.state = own.previous_state
@@ -206,7 +207,7 @@ class Player:
         changed = [one for one in self._watched if one.differs_in(env) or one.has_changed()]
         if not changed:
             return False
-        self.keep(env)
+        self.keep(env.inside)
         try:
             taken = [self._takes(one.name, vars(env).get(one.name)) for one in changed]
             if all(taken):
@@ -215,7 +216,7 @@ class Player:
             else:
                 self._compile(env)
         except ordinary(Exception) as reason:  # as in ``player_of``
-            env._player = None
+            env.inside.player = None
             text = f"the hooks of {type(env).__name__} cannot be compiled any more: {reason}"
             logger.info("%s. They run in Python, which is slower", text)
             return False
@@ -266,7 +267,7 @@ class PoolReadings:
     @property
     def variables(self) -> Any:
         env: Any = self._env()
-        env._keep_readings()
+        env.inside.keep()
         return self._own.variables
 
 
@@ -302,7 +303,7 @@ def _watched_in(env: FMUEnv) -> Iterator[Watched]:
     attributes, names = vars(env), names_in_hooks(env)
     if "getattr" in names:
         names |= attributes.keys()
-    for name in sorted((names - env._own_names) | set(ORDER)):
+    for name in sorted((names - env.inside.own_names) | set(ORDER)):
         value = attributes.get(name, _NOTHING)
         if value is not _NOTHING or hasattr(type(env), name):
             can_change = isinstance(value, (list, dict, set, tuple, np.ndarray))

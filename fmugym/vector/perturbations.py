@@ -85,8 +85,8 @@ def differentiate_by_starts(
     Raises:
         SimulationError: See ``linearize_along``.
     """
-    present = envs.save_state() if envs._is_ready else None
-    with envs._returning_to(present):
+    present = envs.save_state() if envs.inside.is_ready else None
+    with envs.inside.returning_to(present):
         return _Perturbation(envs, states, start).differentiate(nominal, steps)
 
 
@@ -94,8 +94,9 @@ class _Perturbation:
     """Plays a trajectory, and single steps beside it."""
 
     def __init__(self, envs: FMUVectorEnv, states: Mapping[str, str], start: Snapshot) -> None:
-        env = envs._prototype
-        self._envs, self._engine, self._pool = envs, envs._engine, envs._pool
+        env, inside = envs.inside.prototype, envs.inside
+        self._engine, self._pool, self._episodes = inside.engine, inside.pool, inside.episodes
+        self._spec = env.inside.spec
         self._space = float_box(envs.single_action_space, "action")
         self._x = tuple(map(env.fmu.variable, states))
         self._count_of_y = env.inside.output_count
@@ -104,7 +105,7 @@ class _Perturbation:
         self._everywhere = np.arange(envs.num_envs)
         given = {
             name: column[0]
-            for name, column in start.columns_for(envs._episodes.scope)["parameters"].items()
+            for name, column in start.columns_for(self._episodes.scope)["parameters"].items()
             if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
         fixed = [env.inside.interface.parameter(name, value) for name, value in given.items()]
@@ -157,7 +158,7 @@ class _Perturbation:
     def _follow(self, nominal: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Play the trajectory, and keep each moment of it; returns x and y."""
         count = len(self._everywhere)
-        self._envs._episodes.place(self._start, np.zeros(count, np.int64))
+        self._episodes.place(self._start, np.zeros(count, np.int64))
         x, y = [self._pool.read(self._x)[:, 0]], []
         bundles, columns = [], []
         for index, action in enumerate(nominal):
@@ -174,7 +175,7 @@ class _Perturbation:
             y.append(self._pool.outputs[: self._count_of_y, 0].copy())
         self._bundle: Bundle = Bundle.of_all(bundles)
         self._columns: Columns = stacked(columns)
-        spec = self._envs._prototype.inside.spec
+        spec = self._spec
         heads = self._bundle.heads
         self._times = np.array([spec.communication_point(h.steps, h.start_time) for h in heads])
         return np.array(x), np.array(y)
@@ -224,7 +225,7 @@ class _Perturbation:
         """Do one step of each; returns the states before, and the states and outputs after."""
         starting, going = np.flatnonzero(trials.starts), np.flatnonzero(~trials.starts)
         if len(going):
-            self._envs._episodes.restore(self._bundle, trials.at[going], going)
+            self._episodes.restore(self._bundle, trials.at[going], going)
         columns = taken(self._columns, trials.at)
         if len(starting):
             self._start_at(trials)

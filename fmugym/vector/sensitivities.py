@@ -12,7 +12,7 @@ from fmugym.checks import check_number
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
-from fmugym.vector.env import FMUVectorEnv
+from fmugym.vector.env import FMUVectorEnv, require_open
 
 __all__ = [
     "Derivatives",
@@ -142,7 +142,7 @@ def require_vector(envs: Any, name: str) -> None:
     """
     if not isinstance(envs, FMUVectorEnv):
         raise ConfigError(f"{name} needs an FMUVectorEnv, got {shown(envs)}")
-    envs._open_pool(name)
+    require_open(envs, name)
 
 
 def _moved(

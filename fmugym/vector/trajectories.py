@@ -124,10 +124,10 @@ def linearize_along(
             do not determine what follows.
     """
     require_vector(envs, "linearize_along")
-    env = envs._prototype
+    env = envs.inside.prototype
     space = float_box(envs.single_action_space, "action")
     nominal = checked_trajectory(space, actions)
-    start = envs._episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
+    start = envs.inside.episodes.start_of_rollout(checked_snapshot(snapshot, length=1), None, 1)
     chosen = _states(env, states)
     if method is not None:
         check_option("method", method, _METHODS)
@@ -225,9 +225,9 @@ def _by_directional_derivatives(
     envs: FMUVectorEnv, start: Snapshot, nominal: npt.NDArray[Any], states: States
 ) -> Matrices:
     """Play the trajectory with an instance of its own, and ask that for derivatives."""
-    env = envs._maker.make()
+    env = envs.inside.maker.make()
     try:
-        env._use(env.inside.opening.open(1))
+        env.inside.use(env.inside.opening.open(1))
         env.restore_state(start)
         follower = _Follower(env, states)
         found = follower.follow(nominal)
@@ -255,7 +255,7 @@ class _Follower:
 
     def __init__(self, env: FMUEnv, states: States) -> None:
         description = env.fmu.description
-        self._env, self._pool = env, env._open_pool("linearize_along")
+        self._env, self._pool = env, env.inside.pool
         spec = env.inside.spec
         self._time_step = spec.substeps * spec.communication_step_size
         self._x = tuple(map(description.variable, states))
@@ -375,14 +375,16 @@ def _replaced(action: npt.NDArray[Any], place: tuple[int, ...], value: Any) -> n
 
 def _inputs_of(env: FMUEnv, action: Any) -> tuple[float, ...]:
     """What the FMU's inputs would be with an action; they stay in the pool."""
-    env._keep_readings()
-    before = env.action, env.previous_action, env.previous_state, env.inputs
+    env.inside.keep()
+    read, writer = env.inside.readings, env.inside.input_writer
+    before = read.action, read.previous_action, read.previous_state, read.inputs
+    read.previous_action, read.previous_state, read.action = read.action, read.state, action
     try:
-        env._take_action(action)
-        inputs: tuple[float, ...] = env.inputs
+        inputs = writer.checked(env._get_inputs(), action)
+        writer.write(inputs, env.inside.input_row)
         return inputs
     finally:
-        env.action, env.previous_action, env.previous_state, env.inputs = before
+        read.take_back(before)
 
 
 def discrete(slopes: FloatArray, time_step: float) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,9 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
+from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
+from fmugym.task.construction import plan_of, plan_of_reset
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
@@ -57,7 +59,7 @@ class BatchEngine(Engine):
         super().__init__(num_envs)
         self.env = env
         self._n = num_envs
-        self._pool = env._open_pool("a vector environment")
+        self._pool = env.inside.pool
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._longest = 0
@@ -87,7 +89,7 @@ class BatchEngine(Engine):
         env, before = self.env, self._parameters
         self._given[name] = numbers_of(values) if values.dtype == object else values
         env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
-        env.inside.plan = env._plan_episode({})
+        env.inside.plan = plan_of(env)
         self._make_parameters(env.inside.plan)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
@@ -108,10 +110,12 @@ class BatchEngine(Engine):
         own = {name: take(row, index) for name, row in self._columns.items()}
         with reading(env, column(Readings.of(env), index)):
             try:
-                _set_all(env, own | {"_pool": PoolColumn(self._pool, index)})
+                _set_all(env, own)
+                env.inside.pool = PoolColumn(self._pool, index)
                 yield env
             finally:
-                _set_all(env, self._columns | {"_pool": self._pool})
+                _set_all(env, self._columns)
+                env.inside.pool = self._pool
 
     def read(self, name: str, index: int) -> Any:
         """See ``Engine.read``; a method that is called later reads the values of that moment."""
@@ -207,7 +211,7 @@ class BatchEngine(Engine):
         self.has_moved = False
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
-        plan = self.env._plan_of_reset(options, "reset_mask")
+        plan = plan_of_reset(self.env, options, "reset_mask")
         drawn = self._begin(mask, indices, plan)
         self.env.inside.in_hooks = True
         try:
@@ -600,7 +604,7 @@ class BatchEngine(Engine):
     def _not_finite(self, result: StepResult, index: int) -> str:
         observation = observation_of(result.observations, index)
         with self.single(index) as env:
-            return env._not_finite(result.rewards[index], observation)
+            return judging.not_finite(env, result.rewards[index], observation)
 
     def _end_with_faults(
         self, result: StepResult, reasons: Mapping[int, str], failed: MaskArray
@@ -635,7 +639,7 @@ class BatchEngine(Engine):
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
             self._pool.note_fault(index)
-        self.env._halt()
+        self._pool.halt()
 
     def _see_again(self, result: StepResult, mask: MaskArray, reasons: Mapping[int, str]) -> None:
         """Observe environments in the state before a step, with ``done`` of their fault."""

@@ -16,11 +16,22 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector.utils import iterate
 
-from fmugym.env import IN_POOL, FMUEnv, Result
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
+from fmugym.task.actions import blame, require_usable
+from fmugym.task.construction import plan_of, prepare_hooks
+from fmugym.task.judging import (
+    IN_POOL,
+    Result,
+    fault_of_hooks,
+    first_observation,
+    info_of,
+    judged,
+)
+from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.task.step import conclude
@@ -59,8 +70,8 @@ class PerEnvEngine(Engine):
         self._envs, self._pool = envs, pool
         self._columns = [PoolColumn(pool, index) for index in range(len(envs))]
         for env, column in zip(envs, self._columns, strict=True):
-            env._use(column)
-            env._prepare_hooks()  # its constructor may have set some as attributes
+            env.inside.use(column)
+            prepare_hooks(env)  # its constructor may have set some as attributes
         self._together = not any(env.inside.own.step for env in envs)
         self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
@@ -131,7 +142,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
             env.inside.interface = env.inside.interface.with_parameter(name, values, index)
-            env.inside.plan = env._plan_episode({})
+            env.inside.plan = plan_of(env)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
@@ -232,7 +243,7 @@ class PerEnvEngine(Engine):
     def _judge(
         self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
     ) -> None:
-        """Do what ``FMUEnv._conclude`` does, but leave numbers unchecked where no info follows."""
+        """Do what ``judged`` does, but leave numbers unchecked where no info follows."""
         read = env.inside.readings
         outcomes.values[index] = read.values
         if env.inside.own.update:
@@ -247,7 +258,7 @@ class PerEnvEngine(Engine):
             env, self._form, False, steps >= env.inside.step_limit, observed
         )
         if env.inside.has_info and _are_finite(env, reward, observation):
-            outcomes.infos[index] = env._info()
+            outcomes.infos[index] = info_of(env)
         if observation is not IN_POOL and not self._take(index, observation):
             if env.inside.is_finite(observation):
                 self._stack.put(index, observation)
@@ -265,11 +276,11 @@ class PerEnvEngine(Engine):
     ) -> None:
         """Let an environment conclude alone: it has pictures, or its FMU a status."""
         env = self._envs[index]
-        result = env._conclude(self._columns[index], status, values, self._observed)
+        result = judged(env, status, values, self._observed)
         self._note(outcomes, index, result)
         env.inside.in_hooks = False
         if env.render_mode is not None:
-            env._note_for_picture(result[1])
+            note_for_picture(env, result[1])
 
     def _fault(self, outcomes: Outcomes, index: int) -> None:
         """End an episode because of a number that is not finite."""
@@ -279,7 +290,7 @@ class PerEnvEngine(Engine):
             observation = self._stack.row(index)
         before = outcomes.values[index], outcomes.variables[index]
         env.inside.in_hooks = True
-        self._note(outcomes, index, env._fault_of_hooks(reward, observation, before))
+        self._note(outcomes, index, fault_of_hooks(env, reward, observation, before))
         env.inside.in_hooks = False
 
     def _reset(
@@ -324,7 +335,7 @@ class PerEnvEngine(Engine):
                 env, action = self._envs[index], actions[index]
                 env.inside.in_hooks = True
                 if not self._checks_all:
-                    env._require_usable(action)
+                    require_usable(env, action)
                 read = env.inside.readings
                 state, before = read.state, read.action
                 befores.append((before, read.previous_action, read.previous_state, read.inputs))
@@ -339,8 +350,8 @@ class PerEnvEngine(Engine):
             return rows
         except BaseException as error:
             for place, taken in zip(running, befores, strict=False):
-                self._envs[place]._give_up(taken)
-            blaming = self._envs[index]._blame(actions[index], error) or error
+                self._envs[place].inside.readings.take_back(taken)
+            blaming = blame(self._envs[index], actions[index], error) or error
             if isinstance(blaming, FMUGymError):
                 raise _located(blaming, index) from error
             raise
@@ -381,7 +392,7 @@ class PerEnvEngine(Engine):
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
         for index in indices.tolist():
-            self._stack.put(index, self._envs[index]._observation_and_info()[0])
+            self._stack.put(index, first_observation(self._envs[index])[0])
         return self._stack.joined()
 
 

@@ -88,5 +88,5 @@ def compile_hooks(
 
 def _require_playable(env: FMUEnv) -> None:
     """Refuse environments that the native pool cannot play, whatever their hooks are."""
-    if not env._open_pool("a vector environment").can_play:
+    if not env.inside.pool.can_play:
         raise UntraceableError("the pool is not the native one")

@@ -155,7 +155,7 @@ Visited = tuple[FloatArray, FloatArray, FloatArray]
 
 def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     """Run short episodes with small inputs; a slow FMU would take long for more."""
-    pool, plan = env._open_pool("the hook check"), env.inside.plan
+    pool, plan = env.inside.pool, env.inside.plan
     if pool.is_real:
         return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)

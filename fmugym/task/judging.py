@@ -1,0 +1,153 @@
+"""What a step of the FMU means for a single environment: the result, the info and faults."""
+
+from __future__ import annotations
+
+from math import hypot, isfinite
+from typing import Any, Final
+
+from fmugym.errors import SimulationError, shown
+from fmugym.fmi.status import WARNING_CODE, Status
+from fmugym.pool.health import fault_rates
+from fmugym.task.construction import Constructed
+from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
+from fmugym.task.step import NUMBERS, conclude
+
+__all__ = [
+    "IN_POOL",
+    "Result",
+    "fault_of_hooks",
+    "first_observation",
+    "info_of",
+    "judged",
+    "not_finite",
+]
+
+Result = tuple[Any, float, bool, bool, dict[str, Any]]
+"""Observation, reward, terminated, truncated and info."""
+
+IN_POOL: Final = object()
+"""Stands for the default observation of a step, which the pool has; see ``judged``."""
+
+_TERMINATED: Final = int(Status.TERMINATED)
+
+
+def judged(
+    env: Constructed, status: int, values: tuple[float, ...] | None = None, observed: Any = None
+) -> Result:
+    """Make the result of a step of the FMU.
+
+    Args:
+        env: The environment.
+        status: That of the step.
+        values: The outputs; None for those that the pool has.
+        observed: The default observation; None for a copy of the pool's. ``IN_POOL`` is returned
+            as it is unless the step fails.
+
+    Raises:
+        ConfigError: If a hook returns something unusable.
+        SimulationError: After a fault with ``on_fault="raise"``.
+    """
+    inside = env.inside
+    stopped = False
+    if status:
+        stopped = status == _TERMINATED
+        if status > WARNING_CODE and not stopped:
+            return _fault(env, inside.pool.failure(0))
+    read = inside.readings
+    variables = read.variables.copy() if inside.own.update else None
+    before = read.values
+    if values is None:
+        values = tuple(inside.output_row.tolist())  # Python's floats are faster
+    read.values = values
+    read.state = values if inside.no_monitors else values[: inside.output_count]
+    if observed is None and inside.pool_observes:
+        observed = inside.observation_row.copy()
+    cut_off = read.step_count >= inside.step_limit
+    observation, reward, terminated, truncated = conclude(env, NUMBERS, stopped, cut_off, observed)
+    # One call for all numbers, which is enough for nearly all steps.
+    is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
+    if not is_small:
+        if observation is IN_POOL:
+            observation = inside.observation_row.copy()
+        if not (isfinite(reward) and inside.is_finite(observation)):
+            return fault_of_hooks(env, reward, observation, (before, variables))
+    info = info_of(env) if inside.has_info else {}
+    if stopped:
+        info["fmu_terminated"] = True
+    if terminated or truncated:
+        inside.ended = True
+    return observation, reward, terminated, truncated, info
+
+
+def info_of(env: Constructed) -> dict[str, Any]:
+    """The info of the hook and of the pool."""
+    info = as_info(env._get_info())
+    if env.inside.pool_tells:
+        info = info | {name: value.item(0) for name, value in env.inside.pool.info().items()}
+    return info
+
+
+def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
+    """The observation and the info of an episode that begins, or goes on from a snapshot.
+
+    Raises:
+        ConfigError: If a hook returns something unusable.
+        SimulationError: If the observation is not finite.
+    """
+    env.inside.in_hooks = True
+    try:
+        observation = env._get_observation()
+        if not env.inside.is_finite(observation):
+            raise SimulationError(f"the first observation is not finite: {shown(observation)}")
+        return observation, info_of(env)
+    finally:
+        env.inside.in_hooks = False
+
+
+def fault_of_hooks(
+    env: Constructed,
+    reward: float,
+    observation: Any,
+    before: tuple[Any, dict[str, Any] | None],
+) -> Result:
+    """End the episode because of a number that is not finite, in the state before the step.
+
+    Args:
+        env: The environment.
+        reward: That of the step.
+        observation: The one after the step.
+        before: The outputs before the step, and the episode variables if it has changed them.
+
+    Raises:
+        SimulationError: With ``on_fault="raise"``.
+    """
+    reason = not_finite(env, reward, observation)
+    read = env.inside.readings
+    read.values, variables = before
+    read.state = read.previous_state
+    read.variables.update(variables or {})
+    env.inside.pool.note_fault(0)
+    env.inside.halt()
+    return _fault(env, reason)
+
+
+def not_finite(env: Constructed, reward: float, observation: Any) -> str:
+    """Say what is not finite, before the step is undone."""
+    fine = isfinite(reward)
+    what = f"the observation is {shown(observation)}" if fine else env._explain(reward)
+    return f"{what} at t = {env.time:g} s"
+
+
+def _fault(env: Constructed, reason: str) -> Result:
+    env.inside.ended = True
+    policy = env.config.on_fault
+    if policy == "raise":
+        raise SimulationError(reason)
+    env.logger.warning("%s", reason)
+    env.done = policy == "terminate"
+    rate = float(fault_rates(env.inside.pool.health())[0])
+    info = info_of(env) | {"fault": reason, "fault_rate": rate}
+    observation = env._get_observation()
+    if not env.inside.is_finite(observation):
+        raise SimulationError(f"{reason}; before it the observation is {shown(observation)}")
+    return observation, as_reward(env._fault_reward()), env.done, not env.done, info
