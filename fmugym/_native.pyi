@@ -5,11 +5,13 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, TypedDict, final
+from typing import Any, Final, ParamSpec, TypedDict, TypeVar, final
 
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
+P = ParamSpec("P")
+R = TypeVar("R")
 
 MOST_REGISTERS: Final[int]
 """The most registers of a program."""
@@ -53,6 +55,16 @@ def seed(states: Array, indices: Array, words: bytes, /) -> None:
         indices: Which of them, int64, shape (M,).
         words: The seeds, the same number of 32-bit words for each, the lowest first.
     """
+
+@final
+class Guard:
+    """See ``fmugym.task.alone.Guard``."""
+
+    def run(self, name: str, function: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R:
+        """Call a function."""
+
+    def __enter__(self) -> None: ...
+    def __exit__(self, *reason: object) -> None: ...
 
 def statistics() -> dict[str, int]:
     """What helper threads have done in this process.

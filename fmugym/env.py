@@ -7,7 +7,6 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from math import isfinite
 from typing import Any, ClassVar, Final, Never
 
 import numpy as np
@@ -22,17 +21,17 @@ from fmugym.errors import (
     shortened,
     unknown_argument,
 )
-from fmugym.fmi.status import WARNING_CODE, Status
+from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.patience import failed_reset
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import blame, require_usable
+from fmugym.task.alone import alone
 from fmugym.task.construction import Constructed, plan_of_reset, prepare_hooks
 from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import readable_named
-from fmugym.task.judging import Result, first_observation, info_of, judged
+from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
-from fmugym.task.results import as_flag, as_reward
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.starting import start_time_of
@@ -160,6 +159,7 @@ class FMUEnv(Constructed):
             f"{shortened(outputs)} every {self.inside.spec.time_step:g} s>"
         )
 
+    @alone
     def reset(
         self,
         *misplaced: object,
@@ -299,11 +299,24 @@ class FMUEnv(Constructed):
                 and, with ``on_fault="raise"``, after a fault.
         """
         player = self.inside.player
-        if player is not None:
-            result = None if self.inside.ended else self._step_compiled(player, action)
+        if player is not None and self.render_mode is None:
+            result: Result | None = player.step(action, self.__dict__)
             if result is not None:
                 return result
+        return self.inside.guard.run("step", FMUEnv._step, self, action)
+
+    def _step(self, action: Any) -> Result:
+        """Let the pool do the whole step where it can, and note what a picture shows."""
+        player = self.inside.player
+        result: Result | None = None if player is None else player.play(self, action)
+        if result is None:
             self.inside.keep()
+            result = self._step_in_python(action)
+        if self.render_mode is not None:
+            note_for_picture(self, result[1])
+        return result
+
+    def _step_in_python(self, action: Any) -> Result:
         if self.inside.ended:
             self._check_before_step()
         self.inside.in_hooks = True
@@ -312,7 +325,7 @@ class FMUEnv(Constructed):
             try:
                 troubled = self.inside.step_pool()
                 self.inside.readings.step_count += 1
-                result = judged(self, self.inside.pool.statuses.item(0) if troubled else 0)
+                return judged(self, self.inside.pool.statuses.item(0) if troubled else 0)
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
                 self.inside.ended = True
                 raise
@@ -321,81 +334,6 @@ class FMUEnv(Constructed):
             raise
         finally:
             self.inside.in_hooks = False
-        if self.render_mode is not None:
-            note_for_picture(self, result[1])
-        return result
-
-    def _step_compiled(self, player: Any, action: Any) -> Result | None:
-        """Let the pool do the whole step; None if Python must do it."""
-        if self.inside.readings is not player.readings and not player.take_over(self):
-            return None
-        try:
-            result = player.step(action, self.__dict__)
-            if result is None and player.renew(self) and player.take_over(self):
-                result = player.step(action, self.__dict__)
-        except BaseException:  # as in ``step``
-            self.inside.ended = True
-            self.inside.halt()
-            raise
-        if result is None:
-            return None
-        if result and player.left:
-            result = self._with_hooks_left(*result)
-        if not result:
-            return self._judged_again()
-        if result[2] or result[3]:
-            self.inside.ended = True
-        if self.render_mode is not None:
-            note_for_picture(self, result[1])
-        step: Result = result
-        return step
-
-    def _with_hooks_left(
-        self, observation: Any, reward: Any, terminated: bool, truncated: bool, info: dict[str, Any]
-    ) -> Result | None:
-        """Call the hooks that are not compiled; None if they make what is not finite."""
-        left = self.inside.player.left
-        self.inside.in_hooks = True
-        try:
-            if "_is_truncated" in left:
-                truncated = as_flag("_is_truncated", self._is_truncated()) | truncated
-            if "_reward_policy" in left and "_get_observation" in left:
-                reward, observation = self._reward_and_observation()
-            elif "_reward_policy" in left:
-                reward = self._reward_policy()
-            elif "_get_observation" in left:
-                observation = self._get_observation()
-            reward = as_reward(reward)
-            if not (isfinite(reward) and self.inside.is_finite(observation)):
-                return None
-            if "_get_info" in left:
-                info = info_of(self)
-        except BaseException:  # as in ``step``
-            self.inside.ended = True
-            self.inside.halt()
-            raise
-        finally:
-            self.inside.in_hooks = False
-        return observation, reward, terminated, truncated, info
-
-    def _judged_again(self) -> Result:
-        """Judge a step in Python: its status or a number is not good, or a hook raises."""
-        self.inside.player.go_back(self.inside)
-        if self.inside.pool_observes:
-            with np.errstate(over="ignore"):  # what is infinite then is a fault
-                self.inside.observation_row[:] = self.inside.output_row[: self.inside.output_count]
-        self.inside.in_hooks = True
-        try:
-            result = judged(self, self.inside.pool.statuses.item(0))
-        except BaseException:  # as in ``step``
-            self.inside.ended = True
-            self.inside.halt()
-            raise
-        finally:
-            self.inside.in_hooks = False
-        if self.render_mode is not None:
-            note_for_picture(self, result[1])
-        return result
 
     def _check_before_step(self) -> None:
         self._open_pool("step")
@@ -436,6 +374,7 @@ class FMUEnv(Constructed):
 
     # Snapshots.
 
+    @alone
     def save_state(self) -> Snapshot:
         """Save the episode at this moment.
 
@@ -458,6 +397,7 @@ class FMUEnv(Constructed):
         bundle = pool.save_instances(np.zeros(1, np.int64))
         return Snapshot(scope_of(self), columns_of(self), bundle)
 
+    @alone
     def restore_state(self, snapshot: Snapshot) -> Any:
         """Go on from a snapshot, with its random generator, too; no reset is needed before.
 
@@ -480,7 +420,7 @@ class FMUEnv(Constructed):
         self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails
         first = np.zeros(1, np.int64)
-        if pool.restore_instances(snapshot.bundle, first, first)[0] > Status.WARNING:
+        if pool.restore_instances(snapshot.bundle, first, first)[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         observation = first_observation(self)[0]
@@ -497,6 +437,7 @@ class FMUEnv(Constructed):
         return twin
 
     @property
+    @alone
     def health(self) -> dict[str, int]:
         """Counts of what happened since the environment was made, by name.
 
@@ -527,8 +468,10 @@ class FMUEnv(Constructed):
         """
         if not self.inside.own.goal_reward:
             raise AttributeError(f"{type(self).__name__} is no goal task: it has no _goal_reward")
-        return lambda achieved, desired, info: self._goal_reward(achieved, desired)
+        run = self.inside.guard.run
+        return lambda one, other, _: run("compute_reward", self._goal_reward, one, other)
 
+    @alone
     def read_variables(self, *names: str) -> dict[str, Any]:
         """Read any variables of the FMU now, for inspection outside of an episode's loop.
 
@@ -550,6 +493,7 @@ class FMUEnv(Constructed):
         }
 
     @property
+    @alone
     def np_random(self) -> np.random.Generator:
         """The environment's generator; hooks must not use it."""
         if self.inside.in_hooks:
@@ -560,17 +504,28 @@ class FMUEnv(Constructed):
         return super().np_random
 
     @np_random.setter
+    @alone
     def np_random(self, value: np.random.Generator) -> None:
         self._np_random = value
         self._np_random_seed = -1
 
+    @property
+    @alone
+    def np_random_seed(self) -> int:
+        """The seed of the generator; -1 if it was given as a whole."""
+        return super().np_random_seed
+
     def close(self) -> None:
-        """Free the FMU and its temporary folder; more than one call is fine."""
-        self._is_closed = True
-        self.inside.close_pool()
-        if self.inside.renderer is not None:
-            self.inside.renderer.close()
-            self.inside.renderer = None
+        """Free the FMU and its temporary folder; more than one call is fine.
+
+        If another thread is in a method of the environment, this waits for it.
+        """
+        with self.inside.guard:
+            self._is_closed = True
+            self.inside.close_pool()
+            if self.inside.renderer is not None:
+                self.inside.renderer.close()
+                self.inside.renderer = None
         super().close()
 
     def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
+from types import FrameType
 from typing import Final, TypeVar
 
-__all__ = ["RETIRED", "without_retired"]
+__all__ = ["RETIRED", "warn_of_gone", "without_retired"]
 
 _Value = TypeVar("_Value")
 
@@ -25,6 +27,23 @@ def without_retired(given: Mapping[str, _Value]) -> dict[str, _Value]:
     """Leave out what is gone, with a ``FutureWarning`` for each that says what to do."""
     for key in given:
         if key in RETIRED:
-            text = f"{key!r} is gone and does nothing: {RETIRED[key]}"
-            warnings.warn(text, FutureWarning, stacklevel=2)
+            warn_of_gone(f"{key!r} is gone and does nothing: {RETIRED[key]}")
     return {key: value for key, value in given.items() if key not in RETIRED}
+
+
+_OURS: Final = frozenset({"fmugym", "gymnasium"})
+
+
+def warn_of_gone(text: str) -> None:
+    """Warn of something that is gone; the warning shows the user's line."""
+    frame: FrameType = sys._getframe(1)
+    while frame.f_back is not None and _package_of(frame) in _OURS:
+        frame = frame.f_back
+    place = frame.f_code.co_filename, frame.f_lineno
+    shown = frame.f_globals.setdefault("__warningregistry__", {})
+    warnings.warn_explicit(text, FutureWarning, *place, registry=shown)
+
+
+def _package_of(frame: FrameType) -> str:
+    name: str = frame.f_globals.get("__name__", "")
+    return name.partition(".")[0]

@@ -132,7 +132,7 @@ class FMUVecEnv(VecEnv):
             The observations; the infos are in ``reset_infos``.
         """
         groups = self._groups_of_options()
-        if len(groups) > 1 and not self.vector_env.inside.started:
+        if len(groups) > 1 and not self.vector_env.inside.episodes.started:
             self._outer.reset()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for mask, options in groups:

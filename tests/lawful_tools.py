@@ -46,11 +46,6 @@ class Record:
         """The first illegal call; empty if there was none."""
         return self._map[_FIRST : _FIRST + 128].split(b"\0")[0].decode()
 
-    @property
-    def living(self):
-        """How many instances and states have not been freed."""
-        return struct.unpack("ii", self._map[4:12])
-
 
 def library(version):
     """The compiled library."""

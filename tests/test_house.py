@@ -132,5 +132,5 @@ def test_nobody_else_uses_private_attributes_of_environments():
         for name, line in names_read_in(ast.parse(path.read_text(encoding="utf-8"))):
             if path not in private.get(name, {path}):
                 found.append(f"{path.relative_to(ROOT)}:{line}: {name}")
-    assert {"_step_compiled", "_open_pool", "_background"} <= private.keys()
+    assert {"_step_in_python", "_open_pool", "_background"} <= private.keys()
     assert not found, "\n".join(found)

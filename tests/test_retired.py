@@ -1,6 +1,7 @@
 """What is gone does nothing but warn, for one release, wherever a user may still give it."""
 
 import re
+from contextlib import contextmanager
 
 import pytest
 
@@ -13,8 +14,13 @@ pytestmark = pytest.mark.parametrize("key", RETIRED)
 HOUSE = fmugym.bundled_fmu("House")
 
 
+@contextmanager
 def told(key):
-    return pytest.warns(FutureWarning, match=re.escape(f"{key!r} is gone") + ".*: " + RETIRED[key])
+    """There is a warning, and it shows the line of this file."""
+    match = re.escape(f"{key!r} is gone") + ".*: " + RETIRED[key]
+    with pytest.warns(FutureWarning, match=match) as told:
+        yield
+    assert {warning.filename for warning in told} == {__file__}
 
 
 def test_in_a_config(key):

@@ -11,6 +11,7 @@ from fmugym.declared.systems import describe, fmu_of
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
+from fmugym.task.alone import alone
 
 __all__ = ["TaskEnv"]
 
@@ -98,6 +99,7 @@ class TaskEnv(FMUEnv):
             return None
         return self._observation_names
 
+    @alone
     def action_masks(self) -> Any:
         """Tell which levels of the actions take effect now, as MaskablePPO of sb3-contrib asks.
 

@@ -512,13 +512,16 @@ class NativePool(SavingPool):
                 stores; reward, terminated and truncated. The attributes that the programs were
                 made of: tuples of a name and the address of the object, or of a name alone that
                 must not be among the attributes. A function that makes the observation, and one
-                that makes the info, or None.
+                that makes the info, or None. A function that returns the result if the instance
+                has stepped, but its status or a number is not good; and one that makes the result
+                of a good step whole, or None. The guard of the environment, which is taken for each
+                step.
 
         Returns:
             A function of an action and the attributes of the environment. It returns the result of
-            the step. It returns None if nothing was done: the action is not of the type that was
-            prepared, an attribute has changed, or inputs are not finite. It returns False if the
-            instance has stepped, but its status or a number is not good.
+            the step. It returns None if nothing was done: the episode has ended, the action is not
+            of the type that was prepared, an attribute has changed, or inputs are not finite. An
+            exception ends the episode.
         """
         self._pool.prepare_one(*parts)
         return self._pool.step_one

@@ -318,7 +318,7 @@ class RecordVectorSeries(VectorWrapper):
     def _go_on(self) -> None:
         """Begin in the middle of episodes, if there was no reset."""
         envs: Any = self.env
-        if not self._recorder.has_begun and envs.inside.started:
+        if not self._recorder.has_begun and envs.inside.episodes.started:
             counts = self._envs.evaluate(lambda env: (env.step_count,), np.arange(self.num_envs))
             self._recorder.go_on(counts[0])
 

@@ -6,7 +6,7 @@ import operator
 import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from math import hypot, isfinite, isnan
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +16,6 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.signals import ordinary
 from fmugym.task.spaces import to_input_types
-
-if TYPE_CHECKING:
-    from fmugym.task.hooks import Hooks
 
 __all__ = ["blame", "elements_of", "flat_inputs", "no_action", "require_usable"]
 
@@ -56,7 +53,7 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def require_usable(env: Hooks, action: Any) -> None:
+def require_usable(env: Any, action: Any) -> None:
     """Refuse an action that is no element of a ``Discrete``, or that has a NaN.
 
     Raises:
@@ -70,7 +67,7 @@ def require_usable(env: Hooks, action: Any) -> None:
         raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
 
 
-def blame(env: Hooks, action: Any, error: BaseException) -> ConfigError | None:
+def blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
     """The error if ``_get_inputs`` failed because of an action outside of the action space."""
     if isinstance(error, FMUGymError) or not isinstance(error, Exception):
         return None

@@ -26,6 +26,7 @@ from fmugym.signals import ordinary
 from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
+from fmugym.task.alone import alone
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import Hooks, misspelt_hooks
 from fmugym.task.inputs import InputWriter
@@ -124,6 +125,7 @@ class Constructed(Pictured):
         return self.inside.pool
 
     @property
+    @alone
     def reset_method(self) -> str:
         """How episodes begin; see ``EnvConfig``."""
         return str(self._open_pool("reset_method").reset_method)

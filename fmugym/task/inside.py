@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.base import FloatArray
+from fmugym.task.alone import Guard, make_guard
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import Interface
@@ -63,6 +64,7 @@ class Inside:
     An environment in a batch has the fields of its class, and those of the batch where hooks read.
 
     Attributes:
+        guard: Lets one thread at a time call its methods.
         number: Tells which environments are newer.
         base: ``FMUEnv``, with whose methods those of an environment are compared.
         way: The way of calling hooks, see ``FMUEnv``.
@@ -103,7 +105,7 @@ class Inside:
     """
 
     __slots__ = (
-        *("action_values", "as_constructed", "base", "elements", "ended", "halt"),
+        *("action_values", "as_constructed", "base", "elements", "ended", "guard", "halt"),
         *("has_chosen", "has_info", "in_hooks", "input_row", "input_writer", "interface"),
         *("is_finite", "no_action", "no_monitors", "number", "observation_row", "observe"),
         *("opening", "output_count", "output_row", "own", "own_names", "pictured", "plan"),
@@ -117,6 +119,7 @@ class Inside:
     base: type
     elements: Any
     ended: bool
+    guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
     has_info: bool
@@ -155,6 +158,7 @@ class Inside:
     way: str
 
     def __init__(self, number: int) -> None:
+        self.guard = make_guard()
         self.number, self.own_names, self.way = number, frozenset(), "auto"
         self.pool_tells = self.has_info = self.has_chosen = False
         self.in_hooks = self.was_reset = False
@@ -187,4 +191,4 @@ class Inside:
     def keep(self) -> None:
         """Keep what hooks read in an object of its own, not in the pool, until the next step."""
         if self.player is not None:
-            self.player.keep(self)
+            self.guard.run("this", self.player.keep, self)

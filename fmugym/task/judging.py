@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import hypot, isfinite
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from fmugym.errors import SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
@@ -15,12 +16,15 @@ from fmugym.task.step import NUMBERS, conclude
 __all__ = [
     "IN_POOL",
     "Result",
+    "after_step",
     "fault_of_hooks",
     "first_observation",
     "info_of",
     "judged",
     "not_finite",
 ]
+
+R = TypeVar("R")
 
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated and info."""
@@ -77,6 +81,19 @@ def judged(
     if terminated or truncated:
         inside.ended = True
     return observation, reward, terminated, truncated, info
+
+
+def after_step(env: Constructed, function: Callable[..., R], *args: Any) -> R:
+    """Call hooks when the FMU has stepped: after an exception, the episode does not go on."""
+    env.inside.in_hooks = True
+    try:
+        return function(env, *args)
+    except BaseException:
+        env.inside.ended = True
+        env.inside.halt()
+        raise
+    finally:
+        env.inside.in_hooks = False
 
 
 def info_of(env: Constructed) -> dict[str, Any]:

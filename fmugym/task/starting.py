@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,6 @@ from fmugym.checks import check_number, integer_of, parts_of_array
 from fmugym.distributions import Choice, as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.roles import require_not_driven, require_numeric
-
-if TYPE_CHECKING:
-    from fmugym.task.hooks import Hooks
 
 __all__ = [
     "check_rest_is_known",
@@ -247,7 +244,7 @@ def _check_integer(variable: Variable, number: float) -> None:
         raise ConfigError(f"{variable.name!r}: expected one of {listing}, got {number:g}")
 
 
-def start_time_of(env: Hooks) -> Any:
+def start_time_of(env: Any) -> Any:
     """The first communication point of an environment's episode, in s; or of N as hooks read it."""
     if env.config.draws_start_time:
         return env.parameters["start_time"]

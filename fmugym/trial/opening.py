@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,6 +29,7 @@ from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.saving import SavingPool, offered_method
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, PoolSpec, ResetMethod
+from fmugym.retired import warn_of_gone
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.known import (
     known_resuming,
@@ -229,7 +229,7 @@ def _chosen(backend: str) -> str:
     if backend == "native" and not has_native_pool():
         raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
     if backend == "python":
-        warnings.warn("backend='python' means 'fmpy' now: say so", FutureWarning, stacklevel=3)
+        warn_of_gone("backend='python' means 'fmpy' now: say so")
         return "fmpy"
     if backend in ("auto", "fmu") and not has_native_pool():
         warn_of_slow_path()

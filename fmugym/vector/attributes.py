@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.signals import ordinary
 from fmugym.task.construction import plan_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
-
-if TYPE_CHECKING:
-    from fmugym.vector.inside import VectorInside
+from fmugym.vector.engines.base import Engine
+from fmugym.vector.episodes import Episodes
 
 __all__ = ["Attributes"]
 
@@ -24,12 +24,13 @@ class Attributes:
     """What ``get_attr``, ``set_attr`` and ``call`` of a vector environment read, set and call.
 
     Args:
-        inside: That of the vector environment.
+        prototype: The environment whose class and FMU all have.
+        engine: Keeps the values of each environment.
+        episodes: Tells whether there was one.
     """
 
-    def __init__(self, inside: VectorInside) -> None:
-        self._inside = inside
-        self._prototype, self._engine = inside.prototype, inside.engine
+    def __init__(self, prototype: FMUEnv, engine: Engine, episodes: Episodes) -> None:
+        self._prototype, self._engine, self._episodes = prototype, engine, episodes
 
     def read(self, name: str, indices: Sequence[int]) -> list[Any]:
         """Read an attribute, or else a parameter, of some environments.
@@ -59,7 +60,7 @@ class Attributes:
         """
         if self._prototype.render_mode is None:
             return [None for _ in indices]
-        if not self._inside.started:
+        if not self._episodes.started:
             raise SimulationError("render was called before the first reset")
         first, pictures = self._prototype.inside, []
         for index in indices:

@@ -16,10 +16,10 @@ from fmugym.checks import check_misplaced
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
+from fmugym.task.alone import alone
 from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
-from fmugym.vector.alone import Turn, alone, in_use
 from fmugym.vector.arguments import (
     autoreset_mode_of,
     checked_hooks,
@@ -86,14 +86,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012  (as in FMUEnv)
 
     _arguments: tuple[tuple[Any, ...], dict[str, Any]]
-    _turn: Turn
     inside: VectorInside
 
     def __new__(cls, *args: Any, **kwargs: Any) -> FMUVectorEnv:
         """Keep the arguments for copies."""
         env = super().__new__(cls)
         env._arguments = args, kwargs
-        env._turn = Turn()
         env.inside = VectorInside()
         return env
 
@@ -153,7 +151,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         self._background = Background()
         inside.engine = make_engine(inside.maker, env, inside.pool, hooks, max_episode_steps)
         inside.episodes = Episodes(env, inside.engine, inside.pool)
-        inside.attributes = Attributes(inside)
+        inside.attributes = Attributes(env, inside.engine, inside.episodes)
         inside.engine.starts_at_ends = self.autoreset_mode is AutoresetMode.SAME_STEP
         inside.pool.forget_health()  # that of the hook check
 
@@ -184,7 +182,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
             require_open(self, "reset")
-        if seed is None and self.inside.is_ready:
+        if seed is None and self.inside.episodes.is_ready:
             try:
                 result = self.inside.engine.reset_by(options)
             except BaseException:
@@ -193,8 +191,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             if result is not None:
                 return result
         remaining, mask = split_options(options, self.num_envs)
-        if not self.inside.is_ready and not mask.all():
-            when = "reset after an exception" if self.inside.started else "first reset"
+        if not self.inside.episodes.is_ready and not mask.all():
+            when = "reset after an exception" if self.inside.episodes.started else "first reset"
             raise ConfigError(f"the {when} must be of all environments")
         seeds = None if seed is None else checked_seeds(seed, self.num_envs)
         try:
@@ -202,7 +200,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         except BaseException:
             self._interrupt()
             raise
-        self.inside.started = self.inside.is_ready = True
+        self.inside.episodes.started = self.inside.episodes.is_ready = True
         return observations, infos
 
     def step(self, actions: Any) -> StepResult:
@@ -224,17 +222,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        turn = self._turn
-        if not turn.begin():
-            raise in_use(self, "step")
-        try:
-            if not self.inside.is_ready or self.closed or self._background.is_pending:
-                self._refuse_step("step")
-            if not self._waits:
-                return self._step(actions)
-            return self._step_until_ends(actions)
-        finally:
-            turn.end()
+        return self.inside.guard.run("step", FMUVectorEnv._step_alone, self, actions)
+
+    def _step_alone(self, actions: Any) -> StepResult:
+        if not self.inside.episodes.is_ready or self.closed or self._background.is_pending:
+            self._refuse_step("step")
+        if not self._waits:
+            return self._step(actions)
+        return self._step_until_ends(actions)
 
     def _step_until_ends(self, actions: Any) -> StepResult:
         """Step in the mode ``DISABLED``, in which ended episodes wait for a reset."""
@@ -291,7 +286,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     def _require_ready(self, method: str, *, ended: bool = False) -> None:
         """Refuse a call before the first reset and so on; ``ended`` episodes may be allowed."""
-        if not self.inside.is_ready or self.closed or self._background.is_pending:
+        if not self.inside.episodes.is_ready or self.closed or self._background.is_pending:
             self._refuse_step(method)
         engine = self.inside.engine
         if not ended and engine.any_ended and self._waits:
@@ -314,11 +309,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def _interrupt(self) -> None:
         """After an exception, end the episodes whose FMUs have stepped without a result."""
         self.inside.pool.halt()
-        self.inside.is_ready = self.inside.is_ready and not self.inside.engine.has_moved
+        if self.inside.engine.has_moved:
+            self.inside.episodes.is_ready = False
 
     def _refuse_step(self, method: str) -> None:
         require_open(self, method)
-        if self.inside.started:
+        if self.inside.episodes.started:
             raise SimulationError(
                 f"{method} was called after an exception that has ended all episodes; call reset "
                 "first"
@@ -388,14 +384,14 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         indices = chosen(where, self.num_envs)
         sources = sources_for(checked_snapshot(snapshot), indices)
         columns = self.inside.episodes.columns_of(snapshot)
-        if not self.inside.is_ready and len(indices) < self.num_envs:
+        if not self.inside.episodes.is_ready and len(indices) < self.num_envs:
             raise ConfigError("before a reset of all, a snapshot must be restored in all")
         self.inside.engine.require_fit(columns)
         require_saving(self.inside.pool)
-        self.inside.is_ready = False
+        self.inside.episodes.is_ready = False
         self.inside.episodes.restore(snapshot.bundle, sources, indices)
         self.inside.engine.place(columns, sources, indices)
-        self.inside.started = self.inside.is_ready = True
+        self.inside.episodes.started = self.inside.episodes.is_ready = True
         return self.inside.engine.observe(indices)
 
     @alone
@@ -432,9 +428,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         require_open(self, "rollout")
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
         candidates.parameters = tunable_values(self.inside.prototype, parameters, candidates.count)
-        present = self.save_state() if self.inside.is_ready else None
+        present = self.save_state() if self.inside.episodes.is_ready else None
         start = self.inside.episodes.start_of_rollout(snapshot, present, candidates.count)
-        with self.inside.returning_to(present):
+        with self.inside.episodes.returning_to(present):
             return self.inside.episodes.roll_out(start, candidates)
 
     # Single environments.
@@ -502,15 +498,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Free the pool, after waiting for a step that is under way."""
         if hasattr(self.inside, "engine"):  # otherwise the constructor has closed everything
-            self._turn.wait()
-            try:
+            with self.inside.guard:
                 self._background.stop()
                 try:
                     self.inside.engine.close()
                 finally:
                     self.inside.pool.close()
-            finally:
-                self._turn.end()
 
     # Copies.
 
@@ -520,7 +513,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
     def __deepcopy__(self, memo: dict[int, Any]) -> FMUVectorEnv:
         arguments = copy.deepcopy(self._arguments, memo)
         twin = _rebuilt(type(self), arguments, copy.deepcopy(self.spec, memo))
-        if self.inside.is_ready and not self.closed:
+        if self.inside.episodes.is_ready and not self.closed:
             twin.restore_state(self.save_state())
         return twin
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 
 import numpy as np
@@ -25,11 +27,16 @@ class Episodes:
         prototype: The environment whose task all have.
         engine: Has what hooks read.
         pool: Has the FMUs.
+
+    Attributes:
+        started: Whether there ever was one.
+        is_ready: Whether a step may follow.
     """
 
     def __init__(self, prototype: FMUEnv, engine: Engine, pool: Pool) -> None:
         self._prototype, self._engine, self._pool = prototype, engine, pool
         self._everywhere = np.arange(pool.num_instances)
+        self.started = self.is_ready = False
 
     @cached_property
     def scope(self) -> dict[str, str]:
@@ -80,6 +87,20 @@ class Episodes:
         statuses = self._pool.restore_instances(bundle, sources, indices)
         for index in indices[statuses[indices] > WARNING_CODE].tolist():
             raise SimulationError(f"environment {index}: {self._pool.failure(index)}")
+
+    @contextmanager
+    def returning_to(self, present: Snapshot | None) -> Iterator[None]:
+        """Return to the present episodes afterwards, or to none; nothing starts in between."""
+        engine = self._engine
+        starts_at_ends, engine.starts_at_ends = engine.starts_at_ends, False
+        try:
+            yield
+        finally:
+            engine.starts_at_ends = starts_at_ends
+            self.is_ready = False
+            if present is not None:
+                self.place(present, self._everywhere)
+                self.is_ready = True
 
     def start_of_rollout(
         self, snapshot: Snapshot | None, present: Snapshot | None, count: int

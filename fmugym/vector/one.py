@@ -8,6 +8,8 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
+from functools import partial
+from math import isfinite
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,7 +19,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
+from fmugym.task.judging import Result, after_step, info_of, judged
 from fmugym.task.readings import READINGS, Readings, reading
+from fmugym.task.results import as_flag, as_reward
 from fmugym.task.step import ORDER
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
@@ -86,8 +90,8 @@ class Player:
     Attributes:
         readings: What hooks read from the pool's arrays.
         left: The hooks that stay in Python, and why.
-        step: Takes an action and the attributes of the environment; see ``step_one`` of the C
-            extension.
+        step: Does a step by an action and the attributes of the environment; see ``prepare_one`` of
+            the pool.
 
     Raises:
         UntraceableError: If the hooks cannot be compiled.
@@ -97,6 +101,7 @@ class Player:
 
     def __init__(self, env: FMUEnv) -> None:
         env.inside.keep()
+        self._env, self._guard = weakref.ref(env), env.inside.guard
         self._own = env.inside.readings
         self._pool: Any = env.inside.pool
         self._numbers: dict[str, npt.NDArray[Any]] = {}
@@ -105,7 +110,7 @@ class Player:
     def _compile(self, env: FMUEnv) -> None:
         self._watched = tuple(_watched_in(env))
         task = _traced(env, self._numbers)
-        plan, ended = env.inside.plan, np.zeros(1, np.bool_)
+        plan, ended = env.inside.plan, np.ones(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
         self._starts = plan.constants[:, None].copy()
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
@@ -139,19 +144,36 @@ class Player:
     def _watch(self) -> None:
         """Let the pool compare the attributes before each step."""
         *arrays, observe, inform = self._arrays
+        complete = partial(_complete, self._env) if self.left else None
         self._may_change = [one for one in self._watched if one.copy is not None]
         addresses = tuple(one.address for one in self._watched)
-        self.step = self._pool.prepare_one(*arrays, addresses, observe, inform)
+        functions = observe, inform, partial(_judge_again, self._env), complete
+        self.step = self._pool.prepare_one(*arrays, addresses, *functions, self._guard)
+
+    def play(self, env: FMUEnv, action: Any) -> Result | None:
+        """Let the pool do the whole step.
+
+        Returns:
+            None if Python must do it.
+        """
+        result = None
+        if env.inside.readings is self.readings or self._take_over(env):
+            result = self.step(action, vars(env))
+        if result is None and self._renew(env) and self._take_over(env):
+            result = self.step(action, vars(env))
+        return result
 
     # From Python to the pool and back.
 
-    def take_over(self, env: FMUEnv) -> bool:
+    def _take_over(self, env: FMUEnv) -> bool:
         """Copy what the environment keeps to the pool's arrays, and let it read from there.
 
         Returns:
-            False if it keeps what programs cannot hold; Python must do the step.
+            False if there is no episode, or if the environment keeps what programs cannot hold.
         """
-        if any(one.has_changed() for one in self._may_change) and not self.renew(env):
+        if env.inside.ended:
+            return False
+        if any(one.has_changed() for one in self._may_change) and not self._renew(env):
             return False
         own, memory = self._own, self._memory
         none = env.inside.no_action
@@ -177,6 +199,8 @@ class Player:
         if inside.readings is not now:
             return
         inside.readings = own
+        inside.ended = inside.ended or bool(self._memory.ended[0])
+        self._memory.ended[0] = True  # the pool must not step
         if now.step_count == own.step_count:
             return  # nothing has happened
         for name in _KEPT:
@@ -187,6 +211,7 @@ class Player:
     def begin(self, inside: Inside) -> None:
         """Let the environment keep what hooks read, all of which an episode is about to set."""
         inside.readings = self._own
+        self._memory.ended[0] = True
 
     def go_back(self, inside: Inside) -> None:
         """Let the environment keep what hooks read when the FMU has stepped, but was not judged."""
@@ -194,11 +219,11 @@ class Player:
         own, memory = self._own, self._memory
         own.values = tuple(memory.kept[:, 0].tolist())
         own.state = own.previous_state
-        own.done = False
+        own.done = inside.ended = False
         for name in self._task.updated:
             own.variables[name] = _number_of(memory.before[name][..., 0])
 
-    def renew(self, env: FMUEnv) -> bool:
+    def _renew(self, env: FMUEnv) -> bool:
         """Take over attributes that were assigned or changed.
 
         Returns:
@@ -233,6 +258,53 @@ class Player:
             return False
         row[0] = value
         return True
+
+
+def _judge_again(ref: weakref.ref[FMUEnv]) -> Result:
+    """Judge a step in Python: its status or a number is not good, or a hook raises."""
+    env: Any = ref()
+    inside = env.inside
+    inside.player.go_back(inside)
+    if inside.pool_observes:
+        with np.errstate(over="ignore"):  # what is infinite then is a fault
+            inside.observation_row[:] = inside.output_row[: inside.output_count]
+    return after_step(env, judged, inside.pool.statuses.item(0))
+
+
+def _complete(ref: weakref.ref[FMUEnv], result: Result) -> Result:
+    """Call the hooks that are not compiled."""
+    env: Any = ref()
+    whole = after_step(env, _with_hooks_left, *result)
+    return _judge_again(ref) if whole is None else whole
+
+
+def _with_hooks_left(
+    env: FMUEnv,
+    observation: Any,
+    reward: Any,
+    terminated: bool,
+    truncated: bool,
+    info: dict[str, Any],
+) -> Result | None:
+    """The whole result; None if there are numbers that are not finite."""
+    left = env.inside.player.left
+    if "_is_truncated" in left:
+        truncated = as_flag("_is_truncated", env._is_truncated()) | truncated
+    if "_reward_policy" in left and "_get_observation" in left:
+        reward, observation = env._reward_and_observation()
+    elif "_reward_policy" in left:
+        reward = env._reward_policy()
+    elif "_get_observation" in left:
+        observation = env._get_observation()
+    reward = as_reward(reward)
+    if not (isfinite(reward) and env.inside.is_finite(observation)):
+        return None
+    if "_get_info" in left:
+        info = info_of(env)
+    if truncated:
+        env.inside.keep()  # the pool does not know of it
+        env.inside.ended = True
+    return observation, reward, terminated, truncated, info
 
 
 _KEPT: Final = ("values", *(name for name in READINGS if name not in {"out", "variables"}))

@@ -85,8 +85,8 @@ def differentiate_by_starts(
     Raises:
         SimulationError: See ``linearize_along``.
     """
-    present = envs.save_state() if envs.inside.is_ready else None
-    with envs.inside.returning_to(present):
+    episodes = envs.inside.episodes
+    with episodes.returning_to(envs.save_state() if episodes.is_ready else None):
         return _Perturbation(envs, states, start).differentiate(nominal, steps)
 
 

@@ -103,12 +103,18 @@ static bool add_type(PyObject *module, PyTypeObject **type, PyType_Spec *spec) {
     return *type != NULL && PyModule_AddType(module, *type) == 0;
 }
 
-static bool find_error(void) {
-    PyObject *errors = PyImport_ImportModule("fmugym.errors");
+static PyObject *find(const char *module_name, const char *name) {
+    PyObject *module = PyImport_ImportModule(module_name);
+    PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
 
-    closed_error = errors == NULL ? NULL : PyObject_GetAttrString(errors, "SimulationError");
-    Py_XDECREF(errors);
-    return closed_error != NULL;
+    Py_XDECREF(module);
+    return found;
+}
+
+static bool find_objects(void) {
+    simulation_error = find("fmugym.errors", "SimulationError");
+    sleep_function = find("time", "sleep");
+    return simulation_error != NULL && sleep_function != NULL;
 }
 
 PyMODINIT_FUNC PyInit__native(void) {
@@ -119,8 +125,9 @@ PyMODINIT_FUNC PyInit__native(void) {
         return NULL;
     }
     pool_prepare_process();
-    if (!find_error() || !add_type(module, &access_type, &access_spec) ||
+    if (!find_objects() || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
+        !add_type(module, &guard_type, &guard_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||
         !add_type(module, &snapshot_type, &snapshot_spec) ||
         PyModule_AddIntConstant(module, "MOST_REGISTERS", PROGRAM_REGISTERS) < 0) {

@@ -4,7 +4,7 @@
 
 #include "python.h"
 
-PyObject *closed_error;
+PyObject *simulation_error, *sleep_function;
 
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
     if (given != expected) {
@@ -72,7 +72,7 @@ static bool is_short(const PyPool *self, int length) {
 
 bool explain_entry(Entry entry) {
     if (entry == ENTRY_CLOSED) {
-        PyErr_SetString(closed_error, "the pool is closed");
+        PyErr_SetString(simulation_error, "the pool is closed");
     } else if (entry == ENTRY_INSIDE) {
         PyErr_SetString(PyExc_RuntimeError, "an FMU has called the pool that it is in");
     }

@@ -16,7 +16,7 @@ typedef struct {
 /* The result of prepare_one. The turn is used inside of the pool only. */
 typedef struct {
     PyObject *playing; /* the capsule that prepare_play has made */
-    PyObject *names, *observe, *inform;
+    PyObject *names, *observe, *inform, *judge, *complete, *guard;
     Watched *watched; /* their names are those of the tuple */
     size_t number_of_watched;
     double *inputs; /* memory for those of the pool */
@@ -31,6 +31,9 @@ static void one_free(One *one) {
     Py_XDECREF(one->names);
     Py_XDECREF(one->observe);
     Py_XDECREF(one->inform);
+    Py_XDECREF(one->judge);
+    Py_XDECREF(one->complete);
+    Py_XDECREF(one->guard);
     free(one->watched);
     free(one->inputs);
     free(one);
@@ -63,14 +66,19 @@ static bool fill(PyPool *self, One *one, PyObject *args) {
     Py_buffer *b = one->turn.buffers;
     PyObject *seen, *rewards, *terminated, *truncated;
 
-    if (!PyArg_ParseTuple(args, "OOOOO!OO:prepare_one", &seen, &rewards, &terminated, &truncated,
-                          &PyTuple_Type, &one->names, &one->observe, &one->inform)) {
+    if (!PyArg_ParseTuple(args, "OOOOO!OOOOO!:prepare_one", &seen, &rewards, &terminated,
+                          &truncated, &PyTuple_Type, &one->names, &one->observe, &one->inform,
+                          &one->judge, &one->complete, guard_type, &one->guard)) {
         one->names = one->observe = one->inform = NULL; /* not ours yet */
+        one->judge = one->complete = one->guard = NULL;
         return false;
     }
     Py_INCREF(one->names);
     Py_INCREF(one->observe);
     Py_INCREF(one->inform);
+    Py_INCREF(one->judge);
+    Py_INCREF(one->complete);
+    Py_INCREF(one->guard);
     if (self->pool.settings.count != 1) {
         PyErr_SetString(PyExc_ValueError, "the pool has more than one instance");
         return false;
@@ -90,10 +98,7 @@ static bool fill(PyPool *self, One *one, PyObject *args) {
     return true;
 }
 
-/* Takes the arrays of a step, whose first axis has a length of 1: what the programs see, reward,
- * terminated and truncated. Then the attributes that the programs were made of, tuples of a name and
- * the address of the value, or of a name that there must not be; what makes the observation; and what makes the info, or
- * None for an empty one. */
+/* Takes the parts that fmugym/pool/native.py describes. */
 PyObject *py_prepare_one(PyObject *object, PyObject *args) {
     PyPool *self = (PyPool *)object;
     One *one = is_prepared(self) ? calloc(1, sizeof *one) : NULL;
@@ -189,6 +194,20 @@ static PyObject *result_of(const One *one) {
     return result;
 }
 
+/* What Python has to do when the pool has done its part. */
+static PyObject *completed(const One *one, bool is_troubled) {
+    if (is_troubled) {
+        return PyObject_CallNoArgs(one->judge);
+    }
+    PyObject *result = result_of(one);
+    if (result == NULL || one->complete == Py_None) {
+        return result;
+    }
+    PyObject *whole = PyObject_CallFunctionObjArgs(one->complete, result, NULL);
+    Py_DECREF(result);
+    return whole;
+}
+
 static PyObject *step_with(PyPool *self, One *one, PyObject *action) {
     Step s = {.one = one};
     bool performed = true;
@@ -206,12 +225,26 @@ static PyObject *step_with(PyPool *self, One *one, PyObject *action) {
     if (s.is_refused) {
         Py_RETURN_NONE;
     }
-    return s.is_troubled ? PyBool_FromLong(0) : result_of(one);
+    return completed(one, s.is_troubled);
+}
+
+/* After an exception, the episode does not go on. */
+static PyObject *step_or_end(PyPool *self, One *one, PyObject *action, PyObject *attributes) {
+    uint8_t *ended = playing_of(one->playing)->play.ended;
+
+    if (*ended || !is_as_before(one, attributes)) {
+        Py_RETURN_NONE;
+    }
+    PyObject *result = step_with(self, one, action);
+    if (result == NULL) {
+        *ended = 1;
+    }
+    return result;
 }
 
 /* Takes an action, and the attributes of the environment. Returns the result of the step; None if
- * nothing was done, because the action, the inputs that it makes or an attribute are not as they
- * should be; False if the instance has stepped, but its status or a number is not good. */
+ * nothing was done, because the episode has ended, or the action, the inputs that it makes or an
+ * attribute are not as they should be. */
 PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
     PyObject *result = NULL;
@@ -225,10 +258,9 @@ PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs)
     }
     PyObject *capsule = Py_NewRef(self->one);
     One *one = PyCapsule_GetPointer(capsule, ONE);
-    if (is_as_before(one, args[1])) {
-        result = step_with(self, one, args[0]);
-    } else {
-        result = Py_NewRef(Py_None);
+    if (guard_take(one->guard, "step")) {
+        result = step_or_end(self, one, args[0], args[1]);
+        guard_give_back(one->guard);
     }
     Py_DECREF(capsule);
     return result;

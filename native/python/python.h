@@ -43,10 +43,15 @@ typedef struct {
     PyObject *one;     /* another one */
 } PyPool;
 
-extern PyTypeObject *access_type, *draws_type, *snapshot_type;
-extern PyObject *closed_error; /* raised by calls of a closed pool */
+extern PyTypeObject *access_type, *draws_type, *guard_type, *snapshot_type;
+extern PyObject *simulation_error; /* raised by calls of a closed pool, and by guards */
+extern PyObject *sleep_function;   /* that of Python, which signals interrupt */
 
-extern PyType_Spec access_spec, draws_spec, snapshot_spec, pool_spec;
+extern PyType_Spec access_spec, draws_spec, guard_spec, snapshot_spec, pool_spec;
+
+/* Takes a guard for a method. Returns false with an exception if another thread has it. */
+bool guard_take(PyObject *guard, const char *name);
+void guard_give_back(PyObject *guard);
 
 /* The table of an FMI version; NULL with an exception if there is none. */
 const Fmi *fmi_of(int version, int manner);

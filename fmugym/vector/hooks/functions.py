@@ -59,8 +59,6 @@ def _into(out: Any, result: Symbols) -> Any:
 
 def _kind_of(graph: Graph, value: Any) -> Any:
     """The type of an operand; the numbers of Python adapt to the other operands."""
-    if isinstance(value, Symbols) and value.weak is not None:
-        return value.weak
     return type(value) if type(value) in (int, float) else as_symbols(graph, value).dtype
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -51,10 +51,7 @@ class Graph:
         tables: The values to look up.
         tolerance: How far results may differ from those of hooks on arrays, relative to the largest
             one.
-        array_type: The class of symbolic arrays, if it is not ``Symbols``.
     """
-
-    array_type: Any = None
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -133,10 +130,6 @@ class Graph:
         if is_function(operation):
             self.tolerate(dtype)
         return self.compute("ufunc", ufunc, cells, dtype, ufunc)
-
-    def patched(self, own: Callable[..., Any], function: Any, args: Any, keywords: Any) -> Any:
-        """Call what stands for a function of numpy that does not ask its arguments."""
-        return own(self, function, *args, **keywords)
 
     def _number(self, node: Node) -> int:
         number = self._numbers.setdefault(node, len(self.nodes))

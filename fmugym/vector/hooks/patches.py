@@ -30,7 +30,7 @@ def _patched(function: Any, own: Callable[..., Any]) -> Callable[..., Any]:
         graph = getattr(_tracing, "graph", None)
         if graph is None:
             return function(*args, **keywords)
-        return graph.patched(own, function, args, keywords)
+        return own(graph, function, *args, **keywords)
 
     return functools.update_wrapper(call, function)
 

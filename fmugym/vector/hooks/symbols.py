@@ -21,7 +21,6 @@ from fmugym.vector.hooks.program import UntraceableError, letter_of
 __all__ = [
     "LANES",
     "Symbols",
-    "Unboxed",
     "as_symbols",
     "each",
     "graph_of",
@@ -68,18 +67,6 @@ handlers: Final[dict[str, Callable[..., Any]]] = {}
 _memory_shape: Any = vars(np.ndarray)["shape"].__get__
 
 
-class Unboxed:
-    """A number that is not known yet, and no array.
-
-    Attributes:
-        symbols: The same as an array without dimensions.
-    """
-
-    __slots__ = ()
-
-    symbols: Symbols
-
-
 class Symbols(np.ndarray[Any, Any]):
     """An array of values that are not known yet.
 
@@ -93,8 +80,6 @@ class Symbols(np.ndarray[Any, Any]):
     _cells: npt.NDArray[Any] | None
     _graph: Graph
     _writeable: bool
-    weak: type | None = None
-    """``int`` or ``float`` for a number of Python, which adapts to the types of other operands."""
 
     def __new__(
         cls, graph: Graph, cells: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
@@ -102,7 +87,7 @@ class Symbols(np.ndarray[Any, Any]):
         """Make an array whose own memory is not used."""
         if cells.size > _MOST_ELEMENTS:
             raise UntraceableError("it computes with a large array")
-        symbols: Symbols = super().__new__(graph.array_type or cls, (0, NOWHERE), dtype)
+        symbols: Symbols = super().__new__(cls, (0, NOWHERE), dtype)
         symbols._graph, symbols._cells, symbols._writeable = graph, cells, writeable
         return symbols
 
@@ -280,7 +265,7 @@ def has_symbols(value: Any) -> bool:
     """Whether a value is symbols, or a list that holds some."""
     if isinstance(value, list | tuple):
         return any(map(has_symbols, value))
-    return isinstance(value, Symbols | Unboxed)
+    return isinstance(value, Symbols)
 
 
 def graph_of(*values: Any) -> Graph:
@@ -292,8 +277,6 @@ def graph_of(*values: Any) -> Graph:
     for value in values:
         if isinstance(value, Symbols):
             return value.graph
-        if isinstance(value, Unboxed):
-            return value.symbols.graph
         if isinstance(value, list | tuple) and has_symbols(value):
             return graph_of(*value)
     raise UntraceableError("it calls a function of numpy in a way that cannot be followed")
@@ -307,8 +290,6 @@ def as_symbols(graph: Graph, value: Any) -> Symbols:
     """
     if isinstance(value, Symbols):
         return value
-    if isinstance(value, Unboxed):
-        return value.symbols.like(value.symbols.cells)
     if isinstance(value, list | tuple) and has_symbols(value):
         parts = [as_symbols(graph, part) for part in value]
         if len({part.shape for part in parts}) > 1:

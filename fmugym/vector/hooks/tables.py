@@ -15,7 +15,6 @@ from fmugym.vector.hooks.graph import Cell, Graph
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import (
     Symbols,
-    Unboxed,
     as_symbols,
     each,
     graph_of,
@@ -48,14 +47,11 @@ class Table(np.ndarray[Any, Any]):
 
     def __getitem__(self, key: Any) -> Any:
         if has_symbols(key):
-            return graph_of(key).patched(self._look_up, look_up, (key,), {})
+            return look_up(lift(graph_of(key), self.view(np.ndarray)), key)
         return super().__getitem__(key)
 
-    def _look_up(self, graph: Graph, function: Any, key: Any) -> Any:
-        return function(lift(graph, self.view(np.ndarray)), key)
-
     def __array_function__(self, function: Any, types: Any, args: Any, keywords: Any) -> Any:
-        if any(issubclass(one, Symbols | Unboxed) for one in types):
+        if any(issubclass(one, Symbols) for one in types):
             return NotImplemented
         return super().__array_function__(function, types, args, keywords)
 
