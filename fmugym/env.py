@@ -70,6 +70,9 @@ class FMUEnv(Constructed):
     A hook that returns something unusable raises ``ConfigError`` with the hook's name. A reward or
     an observation that is not finite is a fault of the episode, like a failure of the FMU.
 
+    One thread at a time may use an environment. A method that another thread calls meanwhile raises
+    a ``SimulationError``; only ``close`` waits.
+
     An exception that a hook raises reaches the caller of ``step`` unchanged. If the FMU has stepped
     already, the episode is over, and ``reset`` must follow. An exception of ``_get_inputs`` leaves
     the episode as it was; it becomes a ``ConfigError`` if it comes from an action that is not in

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from itertools import repeat
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,8 @@ except ImportError as error:
     raise ImportError(lacking("fmugym.sb3", "Stable-Baselines3", "sb3"), name=error.name) from error
 
 __all__ = ["FMUVecEnv", "ScaledActions", "make_sb3_env"]
+
+R = TypeVar("R")
 
 Indices = int | Iterable[int] | None
 StepReturn = tuple[Any, npt.NDArray[np.float32], MaskArray, list[dict[str, Any]]]
@@ -205,8 +207,8 @@ class FMUVecEnv(VecEnv):
         Raises:
             ConfigError: If there is none of this name (it is an ``AttributeError``, too).
         """
-        require_open(self.vector_env, "get_attr")
-        return self.vector_env.inside.attributes.read(attr_name, self._numbers(indices))
+        read = self.vector_env.inside.attributes.read
+        return self._alone("get_attr", read, attr_name, self._numbers(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
         """Set an attribute, or a parameter of the FMU from the next episode on.
@@ -220,14 +222,13 @@ class FMUVecEnv(VecEnv):
             ConfigError: If there is nothing of this name, or it is a parameter that the other
                 environments draw in each episode.
         """
-        env, attributes = self.vector_env, self.vector_env.inside.attributes
-        require_open(env, "set_attr")
+        attributes = self.vector_env.inside.attributes
         given = dict.fromkeys(self._numbers(indices), value)
         if not attributes.is_parameter(attr_name):
-            attributes.set_attribute(attr_name, given)
+            self._alone("set_attr", attributes.set_attribute, attr_name, given)
             return
         complete = self._all_values(attr_name, given)
-        env.set_attr(attr_name, complete)
+        self.vector_env.set_attr(attr_name, complete)
         self._set_parameters[attr_name] = complete
 
     def _all_values(self, name: str, given: Mapping[int, Any]) -> list[Any]:
@@ -257,9 +258,13 @@ class FMUVecEnv(VecEnv):
                 they cannot have each for itself.
         """
         numbers = self._numbers(indices)
-        require_open(self.vector_env, "call")
-        attributes = self.vector_env.inside.attributes
-        return attributes.call(method_name, numbers, method_args, method_kwargs)
+        call = self.vector_env.inside.attributes.call
+        return self._alone("env_method", call, method_name, numbers, method_args, method_kwargs)
+
+    def _alone(self, name: str, function: Callable[..., R], *args: Any) -> R:
+        """Call a function of the vector environment, which other threads may not use meanwhile."""
+        require_open(self.vector_env, name)
+        return self.vector_env.inside.guard.run(name, function, *args)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Indices = None) -> list[bool]:
         """Return False for each: single environments have no wrappers."""

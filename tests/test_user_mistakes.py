@@ -32,6 +32,7 @@ from fmugym import (
 )
 from fmugym.baselines import PID
 from fmugym.errors import ArgumentError
+from fmugym.task.readings import READINGS
 
 
 @pytest.mark.parametrize("group", mistakes.GROUPS)
@@ -609,6 +610,16 @@ class TestHooks:
             env.step(0.0)
         with pytest.raises(ConfigError, match="unknown output 'summ'; did you mean 'sum'"):
             env.out["summ"]
+
+    @pytest.mark.parametrize("name", READINGS)
+    def test_attributes_in_the_place_of_what_they_read(self, make_env, name):
+        def early(self, *args, **keywords):
+            setattr(self, name, 1.0)
+            PlainEnv.__init__(self, *args, **keywords)
+
+        for contents in ({name: 1.0}, {"__init__": early}):
+            with pytest.raises(ConfigError, match=f"'{name}' .*hooks read.* another name"):
+                make_env(cls=type("Own", (PlainEnv,), contents))
 
     def test_a_goal_reward_that_is_not_there(self, make_env):
         with pytest.raises(AttributeError, match="PlainEnv is no goal task"):

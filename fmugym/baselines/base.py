@@ -224,5 +224,6 @@ def require_physical(env: Any) -> None:
 
 def attribute_of(env: Any, name: str) -> Any:
     """An attribute of an environment, or of the first of many."""
-    base = env.unwrapped
-    return getattr(base.inside.prototype if isinstance(base, VectorEnv) else base, name)
+    base: Any = env.unwrapped
+    is_vector = isinstance(base, VectorEnv)
+    return getattr(base.inside.prototype if is_vector else base, name)

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from fmugym.baselines.base import Controller, FloatArray
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import ordinary
 
 __all__ = ["Constant", "Random", "Schedule"]
 
@@ -32,7 +33,7 @@ class Constant(Controller):
         try:
             taken = self._as_actions(self._decide(np.empty((1, 0))))[0]
             is_element = np.allclose(taken, self.action)  # but for its rounding to float32
-        except (TypeError, ValueError):  # of another shape, or no numbers
+        except ordinary(TypeError, ValueError):  # of another shape, or no numbers
             is_element = False
         if not is_element:
             raise ConfigError(f"the action {shown(self.action)} is not in {shown(self.space)}")

@@ -252,7 +252,7 @@ def _read_parquet(path: Path, changed: int, size: int) -> Mapping[str, Table]:
     pyarrow, parquet = imported("pyarrow", "parquet"), imported("pyarrow.parquet", "parquet")
     try:
         table = parquet.ParquetFile(path).read()
-    except (pyarrow.ArrowException, ValueError) as error:
+    except ordinary(pyarrow.ArrowException, ValueError) as error:
         raise ConfigError(f"{path.name} is no Parquet file: {reason(error)}") from None
     if not table.num_rows:
         raise ConfigError(f"{path.name} has no rows")

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.errors import ConfigError, reason, shown
+from fmugym.signals import ordinary
 
 __all__ = ["Cells", "FloatArray", "Table", "read_modelica", "read_weather"]
 
@@ -119,7 +120,7 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
         times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(rows)]
         cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
         dates, fields = np.split(np.array(cells, np.float64), [len(_DATES)], axis=1)
-    except ValueError as error:
+    except ordinary(ValueError) as error:
         raise ConfigError(f"{name} is no weather of EnergyPlus: {reason(error)}") from None
     return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields, _CODES)
 
@@ -200,7 +201,7 @@ def _modelica_table(
 ) -> Table:
     try:
         numbers = np.array(cells, np.float64).reshape(shape)
-    except ValueError as error:
+    except ordinary(ValueError) as error:
         raise ConfigError(f"{what} is damaged: {reason(error)}") from None
     if not numbers.size:
         raise ConfigError(f"{what} has no rows")

@@ -8,6 +8,7 @@ from collections.abc import Mapping, MutableMapping
 from typing import Any, Final
 
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import ordinary
 
 __all__ = ["as_toml", "revised"]
 
@@ -62,7 +63,7 @@ def revised(text: str, document: Mapping[str, Any]) -> str | None:
         _revise(written, document, ())
         changed = tomlkit.dumps(written)
         return changed if _same(tomllib.loads(changed), document) else None
-    except (TOMLKitError, tomllib.TOMLDecodeError, KeyError, ValueError):
+    except ordinary(TOMLKitError, KeyError, ValueError):
         return None
 
 

@@ -17,6 +17,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool import Paced
 from fmugym.pool.backend.clock import RealClock
+from fmugym.signals import ordinary
 
 __all__ = ["Cell", "Lease", "paced_cells"]
 
@@ -175,7 +176,7 @@ class Cell:
         try:
             outputs = self._read(token)
             self._client.set_torque(inputs["tau"], token)
-        except RuntimeError as error:
+        except ordinary(RuntimeError) as error:
             if _LEAVING.search(str(error)) is None:
                 raise
             return self._outputs, Status.TERMINATED
@@ -205,12 +206,12 @@ class Cell:
         (token, is_leased), self._session = self._session, None
         try:
             self._client.set_torque(0.0, token)
-        except RuntimeError as error:  # the lab has ended the session
+        except ordinary(RuntimeError) as error:  # the lab has ended the session
             logger.debug("the torque was not taken away: %s", error)
         stop = self._client.stop_episode if is_leased else self._client.stop_experiment
         try:
             stop(token)
-        except RuntimeError as error:
+        except ordinary(RuntimeError) as error:
             logger.debug("the session was not stopped: %s", error)
 
 

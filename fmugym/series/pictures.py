@@ -19,6 +19,7 @@ from fmugym.checks import check_path
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.series.timeseries import TimeSeries
+from fmugym.signals import ordinary
 from fmugym.task.quantity import Quantity
 
 __all__ = ["COLOURS", "as_svg", "drawing_style", "plot", "svg_of"]
@@ -118,7 +119,7 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
         file = check_path("the path of a picture", path)
         try:
             figure.savefig(file, dpi=150)
-        except ValueError as error:  # of Matplotlib, for a format that it does not know
+        except ordinary(ValueError) as error:  # of Matplotlib, for a format that it does not know
             raise ConfigError(f"no picture can be written: {error}") from None
     return figure
 

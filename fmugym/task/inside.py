@@ -16,7 +16,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import Interface
 from fmugym.task.opening import PoolOpening
-from fmugym.task.readings import Readings
+from fmugym.task.readings import NoReadings, Readings
 from fmugym.task.warm_up import WarmUps
 
 if TYPE_CHECKING:
@@ -165,6 +165,7 @@ class Inside:
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
         self.pictured = None, 0.0
+        self.readings = NoReadings()  # type: ignore[assignment]  # until there are any
 
     @property
     def is_open(self) -> bool:

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
+from fmugym.errors import ConfigError
 from fmugym.task.values import EpisodeVariables, NamedValues
 
-__all__ = ["READINGS", "Readings", "read_by", "reading"]
+__all__ = ["READINGS", "NoReadings", "Readings", "read_by", "reading"]
 
 
 @dataclass(slots=True)
@@ -55,6 +56,19 @@ class Readings:
             before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
         """
         self.action, self.previous_action, self.previous_state, self.inputs = before
+
+
+class NoReadings:
+    """Stands for what hooks read as long as the constructor of ``FMUEnv`` has not made it."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise ConfigError(
+            f"{name!r} is what hooks read, which there is after super().__init__(...) only; give "
+            "an attribute of your own another name"
+        )
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        self.__getattr__(name)
 
 
 READINGS: Final = tuple(field.name for field in fields(Readings) if field.name != "values")

@@ -257,7 +257,7 @@ def _new_model(plan: Plan, venv: Any) -> Any:
     try:
         algorithm = algorithm_of(plan.algorithm)
         return algorithm(policy, venv, **{"seed": plan.seed, "device": "cpu", **own})
-    except (TypeError, ValueError, AssertionError) as error:
+    except ordinary(TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{plan.algorithm} cannot be made: {reason(error)}") from error
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
+from fmugym.signals import ordinary
 from fmugym.task.readings import READINGS, Readings
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.contents import Contents
@@ -60,7 +61,7 @@ def attribute(env: FMUEnv, name: Any) -> Any:
         return env.parameters[name]
     try:
         return getattr(env, name)
-    except AttributeError as error:
+    except ordinary(AttributeError) as error:
         raise UnknownAttributeError(str(error)) from None
 
 
