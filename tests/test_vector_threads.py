@@ -7,8 +7,9 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from test_threads import MANY, run_together
 
-from fmugym import SimulationError
+from fmugym import SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
 from fmugym.vector import FMUVectorEnv
 
@@ -40,6 +41,7 @@ def methods(envs, snapshot):
         "call": lambda: envs.call("linger"),
         "health": lambda: envs.health,
         "np_random_seed": lambda: envs.np_random_seed,
+        "linearize_along": lambda: linearize_along(envs, snapshot[0], []),
     }
 
 
@@ -76,7 +78,7 @@ def test_threads_at_once_leave_it_whole(hooks):
     envs.reset(seed=0)
     snapshot, stop, wrong = envs.save_state(), time.monotonic() + 0.5, []
     calls = methods(envs, snapshot)
-    del calls["step_async"]
+    del calls["step_async"], calls["linearize_along"]
     calls["call"] = lambda: envs.call("state")
 
     def play(seed):
@@ -90,17 +92,16 @@ def test_threads_at_once_leave_it_whole(hooks):
                 wrong.append(error)
                 return
 
-    threads = [threading.Thread(target=play, args=(seed,)) for seed in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    run_together([lambda seed=seed: play(seed) for seed in range(3)])
     assert wrong == []
     require_whole(envs)
 
 
 def require_whole(envs):
-    envs.set_attr("force_mag", 10.0)
+    """It plays as a new one does, also in another thread."""
+    played = []
+    run_together([lambda: played.append(envs.set_attr("force_mag", 10.0))])
+    assert played == [None]
     with closing(FMUVectorEnv(CartPoleEnv, 3)) as other:
         for one in (envs, other):
             one.reset(seed=3)
@@ -131,7 +132,7 @@ def test_interrupts_leave_it_whole(hooks):
         for number in range(300):
             try:
                 signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-6, 4e-4)))
-                while True:
+                for _ in range(MANY):
                     calls[number % len(calls)]()
             except KeyboardInterrupt:
                 interrupted += 1
