@@ -58,6 +58,7 @@ def _is_own(env: Any, base: type[Any], name: str) -> bool:
     return getattr(found, "__func__", found) is not getattr(base, name)
 
 
+@dataclass(init=False, repr=False, eq=False, slots=True)
 class Inside:
     """What the other rooms of the package need of an environment: its attribute ``inside``.
 
@@ -103,16 +104,6 @@ class Inside:
         renderer: Draws the pictures, once there are any.
         pictured: The reward and the return that a picture shows.
     """
-
-    __slots__ = (
-        *("action_values", "as_constructed", "base", "elements", "ended", "guard", "halt"),
-        *("has_chosen", "has_info", "in_hooks", "input_row", "input_writer", "interface"),
-        *("is_finite", "no_action", "no_monitors", "number", "observation_row", "observe"),
-        *("opening", "output_count", "output_row", "own", "own_names", "pictured", "plan"),
-        *("player", "pool", "pool_observes", "pool_tells", "quantities", "readings"),
-        *("renderer", "scope", "spec", "start_inputs", "step_limit", "step_pool"),
-        *("warm_up_steps", "warm_ups", "was_reset", "way"),
-    )
 
     action_values: Sequence[int] | None
     as_constructed: dict[str, Any]

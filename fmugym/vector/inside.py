@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from fmugym.env import FMUEnv
@@ -16,6 +17,7 @@ from fmugym.vector.making import EnvMaker
 __all__ = ["VectorInside"]
 
 
+@dataclass(init=False, repr=False, eq=False, slots=True)
 class VectorInside:
     """What other modules need of a vector environment: its attribute ``inside``.
 
@@ -29,11 +31,6 @@ class VectorInside:
         attributes: Reads, sets and calls what single environments have.
         at_ends: What is called of the actions where episodes have ended; see ``look_at_ends``.
     """
-
-    __slots__ = (
-        *("at_ends", "attributes", "engine", "episodes", "guard", "maker", "pool"),
-        "prototype",
-    )
 
     at_ends: list[Callable[[Any], None]]
     attributes: Attributes
