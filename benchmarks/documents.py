@@ -27,7 +27,7 @@ TASKS = {
     "`CartPole-v0`": "CartPole-v0",
     "`Pendulum-v0`": "Pendulum-v0",
     "`CloudPendulum-v0`": "CloudPendulum-v0",
-    "a [tracking task](task.md#remember-something-during-an-episode)": "tracking",
+    "a [tracking task](hooks.md#remember-something-during-an-episode)": "tracking",
 }
 WAYS = ("auto", "array")
 SIZES = (1, 8, 64, 1024)
@@ -76,7 +76,7 @@ def _fastest(samples: list[Sample]) -> float:
 
 
 def _hooks(effort: Effort) -> list[Table]:
-    """The tables of docs/hooks.md, and what hooks cost that are called one by one."""
+    """A table of docs/vector.md, and what hooks cost that are called one by one."""
     table = Table(
         "Processor time of a step of gymnasium.make in us, resets included",
         ["", "compiled", "in Python", "Gymnasium's own"],
@@ -120,7 +120,7 @@ def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callab
 
 
 def _training(effort: Effort) -> list[Table]:
-    """The table of docs/which-algorithm.md, which tells in its text who reached what is wanted."""
+    """The table of docs/training.md, which tells in its text who reached what is wanted."""
     (table,) = training.tables(effort)
     place = table.header.index("reached by")
     table.header, *table.rows = (

@@ -74,7 +74,7 @@ def _private(root: Path, names: tuple[str, ...]) -> Path:
 
 @functools.cache
 def _warn(text: str) -> None:
-    """Once is enough."""
+    """Warn, but once for each text."""
     logger.warning(text)
 
 

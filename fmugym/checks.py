@@ -229,7 +229,7 @@ def check_flag(what: str, value: Any) -> bool:
 
 
 def has_method(value: object, name: str) -> bool:
-    """Whether a value has a method of this name; one that answers no question has none."""
+    """Whether a value has a method of this name; no, if asking it raises an error."""
     try:
         return callable(getattr(value, name, None))
     except ordinary(Exception):  # the object's own method fails

@@ -94,8 +94,8 @@ class EnvConfig:
         fault_retries: How often a step that the FMU discards is repeated, as 2, 4, 8 ... smaller
             ones, before ``on_fault`` applies.
         fault_reward: Reward of a step that failed.
-        leak_limit: Bytes of memory that resets may take for good, and that a worker process may
-            grow by. Beyond it, the worker is replaced; in this process, the log says so once. None
+        leak_limit: Bytes of memory that resets may leak, and by which a worker process may
+            grow. Beyond it, the worker is replaced; in this process, the log says so once. None
             for no limit.
         reset_method: How episodes begin: ``"restore"``, ``"reset"``, ``"instance"``, ``"library"``
             or ``"process"``; by default the fastest one that a trial has found to be right.

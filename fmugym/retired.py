@@ -1,4 +1,4 @@
-"""What earlier versions took: it warns for one release, and then nobody knows it any more."""
+"""What earlier versions took: it warns for one release, and is unknown after that."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """FMU tasks for RLlib on Ray: each env runner steps one ``FMUVectorEnv``.
 
-Needs the extra ``rllib``. See ``docs/train-rllib.md``.
+Needs the extra ``rllib``. See ``docs/rllib.md``.
 """
 
 from __future__ import annotations

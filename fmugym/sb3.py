@@ -1,6 +1,6 @@
 """FMU environments for Stable-Baselines3: a ``VecEnv`` over ``FMUVectorEnv``.
 
-Needs the extra ``sb3``. See ``docs/stable-baselines3.md``.
+Needs the extra ``sb3``. See ``docs/libraries.md``.
 """
 
 from __future__ import annotations

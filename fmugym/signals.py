@@ -1,4 +1,4 @@
-"""Exceptions of signal handlers, which nobody may take for those of a user's objects."""
+"""Exceptions of signal handlers, told apart from those of a user's objects."""
 
 from __future__ import annotations
 

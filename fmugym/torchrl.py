@@ -1,6 +1,6 @@
 """FMU environments for TorchRL: an ``EnvBase`` over ``FMUVectorEnv``.
 
-Needs the extra ``torchrl``. See ``docs/train-torchrl.md``.
+Needs the extra ``torchrl``. See ``docs/libraries.md``.
 """
 
 from __future__ import annotations

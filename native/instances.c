@@ -48,7 +48,7 @@ static Status choose_messages(const Pool *pool, Instance *me, size_t count) {
     return instance_judge(me, status);
 }
 
-/* Asks the FMU to say why calls fail. If it cannot bear the question, it is made anew. */
+/* Asks the FMU to log why calls fail. If that call fails itself, a new instance takes its place. */
 static bool ask_for_errors(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
 

@@ -1,6 +1,6 @@
 """Useful FMUs that break one promise each, and what fmugym does about it.
 
-The tests expect it, and docs/reliability.md tells it: ``python quirk_table.py`` prints its table.
+The tests expect it, and tests/zoo/README.md tells it: ``python quirk_table.py`` prints its table.
 The FMUs are those of ``zoo/quirks.c``.
 """
 

@@ -156,8 +156,8 @@ def test_a_task_by_hand_is_the_same_task(tasks, index):
 DOCUMENTS = {
     "readme": "docs/speed.md",
     "vector": "docs/vector.md",
-    "hooks": "docs/hooks.md",
-    "training": "docs/which-algorithm.md",
+    "hooks": "docs/vector.md",
+    "training": "docs/training.md",
 }
 
 

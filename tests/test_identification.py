@@ -401,7 +401,7 @@ def test_scipy_is_named_with_its_extra(monkeypatch):
 
 @measured
 class TestMeasured:
-    """On real swings; where they come from is told in docs/plant.md."""
+    """On real swings; where they come from is told in docs/lab.md."""
 
     def test_single_pendulum(self):
         name = "dfki_simple_pendulum_damped_swing_segment.csv"

@@ -1,7 +1,7 @@
 """FMUs that are useful but break a promise: every episode equals that of a fresh instance.
 
 The reference is FMPy, making the same calls on a new instance of a new copy of the library. The
-table is in quirk_table.py and in docs/reliability.md.
+table is in quirk_table.py and in tests/zoo/README.md.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ from fmugym.trial.verdict import Grade, Neighbours, Verdict
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "reliability.md"
+DOCUMENT = Path(__file__).parent / "zoo" / "README.md"
 STEP = 0.05
 LENGTHS = (3, 12, 12, 5)
 NUM_ENVS = 3
@@ -286,7 +286,7 @@ def test_the_document_has_this_table():
 
 
 def test_inputs_stay_within_their_limits(make_fmu):
-    """An FMU may not bear others, and what follows is no sign of shared globals."""
+    """An FMU may fail beyond them, and such a failure is no sign of shared globals."""
     fmu = fmugym.FMU(make_fmu("well behaved"))
     spec = PoolSpec((fmu.variable("u"),), (), STEP, input_limits=((-0.5, 0.25),))
     rows = [start_inputs(spec), neighbour_inputs(spec), *moving_inputs(spec, 50, 1.0)]

@@ -1,4 +1,4 @@
-"""A short form of ``python tests/soak.py``; the full one is in docs/reliability.md."""
+"""A short form of ``python tests/soak.py``; the full one is in tests/README.md."""
 
 import os
 import subprocess

@@ -19,7 +19,7 @@ from fmugym.tools import compilers, stand_in
 from fmugym.tools.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")
-DOCUMENT = HERE.parent / "docs" / "archives.md"
+DOCUMENT = HERE.parent / "docs" / "foreign-fmus.md"
 ZIG = [sys.executable, "-m", "ziglang", "cc", "-shared", "-fPIC", "-O1", "-g0", "-w"]
 SYMBOLS = sorted(set(re.findall(r"_gfortran_\w+", (HERE / "old_fortran.c").read_text())))
 OLD = {"_gfortran_pow_i4_i4": "GFORTRAN_1.4"}

@@ -1,6 +1,6 @@
 """The fault zoo: what FMUs do wrong, and what a user sees of it in each setting.
 
-The table is in zoo_table.py and in docs/reliability.md. Each cell of it is visited in a process of
+The table is in zoo_table.py and in tests/zoo/README.md. Each cell of it is visited in a process of
 its own, or, with isolation, all in one process, to which nothing may happen.
 """
 
@@ -20,7 +20,7 @@ from fmugym.errors import ContractError
 from fmugym.testing import check_fmu_env
 
 HERE = Path(__file__).parent
-DOCUMENT = HERE.parent / "docs" / "reliability.md"
+DOCUMENT = HERE / "zoo" / "README.md"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its faults are those of Linux")
 

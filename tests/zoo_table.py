@@ -1,4 +1,4 @@
-"""The faults of the zoo with their outcomes: what the tests expect and docs/reliability.md tells.
+"""The faults of the zoo with their outcomes: what the tests expect and tests/zoo/README.md tells.
 
 ``python zoo_table.py`` prints the table of the document.
 """

@@ -1,4 +1,4 @@
-"""The pictures of the tutorial "From FMU to agent": what its commands print, and what they draw.
+"""The pictures of the tutorial: what its commands print, and what they draw.
 
     python docs/_site/tutorial.py FOLDER
 

@@ -126,7 +126,7 @@ def _count(source: Any, attribute: str) -> int:
 
 
 def _needs_completed_step(source: Any, root: Any) -> bool:
-    """In FMI 3.0 an FMU must ask for it; in the older versions it may do without at most."""
+    """In FMI 3.0 an FMU says that it needs the call; in older ones, that it can do without."""
     element = root.find("ModelExchange")
     if source.fmiVersion.startswith("3"):
         return element.get("needsCompletedIntegratorStep") in {"true", "1"}

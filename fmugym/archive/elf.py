@@ -126,7 +126,7 @@ class ElfLibrary:
         return next(iter(self._texts(_SONAME)), None)
 
     def search_path(self, folder: Path) -> list[Path]:
-        """The folders in which it wants its libraries to be looked for; it lies in ``folder``."""
+        """The folders in which the loader is to look for its libraries; ``folder`` is its own."""
         origin = str(folder)
         entries = [f for text in self._texts(_RPATH, _RUNPATH) for f in text.split(":") if f]
         expanded = [f.replace("$ORIGIN", origin).replace("${ORIGIN}", origin) for f in entries]

@@ -87,7 +87,7 @@ def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
 
 
 class AttendedPool(CountedPool):
-    """A pool whose resets somebody may go with."""
+    """A pool whose resets may have an attendant."""
 
     _attendant: Attendant | None = None
 
@@ -107,7 +107,7 @@ class AttendedPool(CountedPool):
             self._release()
 
     def attend(self, attendant: Attendant | None) -> None:
-        """Let somebody go with all calls of ``reset`` from now on."""
+        """Give all calls of ``reset`` an attendant from now on."""
         self._attendant = attendant
 
     def reset(

@@ -22,8 +22,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 HOW_TO_BUILD = (
-    "the C extension of fmugym was not built, for want of Python's headers. Install them (on "
-    "Debian: apt install python3-dev), and fmugym again"
+    "the C extension of fmugym was not built, because Python's headers were missing. Install them "
+    "(on Debian: apt install python3-dev), and fmugym again"
 )
 
 

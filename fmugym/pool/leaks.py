@@ -1,4 +1,4 @@
-"""The leak watch: it tells once that resets of an FMU take memory for good.
+"""The leak watch: it tells once that resets of an FMU do not give memory back.
 
 The watch looks at the memory of the process, at some of the calls that reset instances. It cannot
 know who has taken memory, the FMU or the caller. So once the process has grown by the limit, it
@@ -53,7 +53,7 @@ class _Total:
 
 
 class LeakWatch:
-    """Finds out whether resets of an FMU take memory for good, and says so once.
+    """Finds out whether resets of an FMU leak memory, and says so once.
 
     Args:
         limit: Bytes that they may take.

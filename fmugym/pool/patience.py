@@ -1,4 +1,4 @@
-"""What to do when an FMU gets no licence: wait for one, or give up with its words."""
+"""What to do when an FMU gets no licence: wait for one, or raise an error that quotes the FMU."""
 
 from __future__ import annotations
 

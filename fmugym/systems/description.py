@@ -19,7 +19,7 @@ __all__ = ["PartVariable", "SystemDescription", "describe_system"]
 
 
 _NO_PLAN: Final = SystemPlan("", ())
-"""Dataclasses want a default here, for there are others before."""
+"""A dataclass needs a default here, because fields before this one have some."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,7 +68,7 @@ class Diary:
             raise ConfigError(f"the facts of the recording are damaged: {error}") from None
 
     def facts(self) -> dict[str, Any]:
-        """What ``of`` needs."""
+        """The facts from which ``of`` makes the same object again."""
         return asdict(self)
 
     def of_training(self, folder: Path, begin: int) -> Callable[[FMUVectorEnv], Any]:

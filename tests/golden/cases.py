@@ -283,7 +283,7 @@ def tasks():
     found = {name: partial(made, name) for name in ids}
     names = ("SwingUp", "Tracking", "Uncompiled", "Goal", "Building")
     found |= {name: partial(of_user, name) for name in names}
-    pages = ("systems.md [system]", "task-file.md fmu =", "from-fmu-to-agent.md fmu =")
+    pages = ("systems.md [system]", "task-file.md fmu =", "tutorial.md fmu =")
     files = ("examples cart_pole.toml", "examples pendulum.toml")
     return found | {name: partial(of_docs, name) for name in (*pages, *files)}
 

@@ -1,4 +1,4 @@
-"""Hooks that may do more than compute: they must not be called once more than Python would."""
+"""Hooks that may do more than compute: an additional call of one would change something."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tutorial "From FMU to agent": its commands run in their order, as written."""
+"""The tutorial: its commands run in their order, as written."""
 
 import importlib
 import re
@@ -15,7 +15,7 @@ import fmugym
 from fmugym.envs.house import HOUSE_TASK
 from fmugym.tools.cli import main
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "from-fmu-to-agent.md"
+DOCUMENT = Path(__file__).parent.parent / "docs" / "tutorial.md"
 TEXT = DOCUMENT.read_text(encoding="utf-8")
 TASK = re.search(r"^```toml\n(.*?)^```", TEXT, re.M | re.S)[1]
 
