@@ -299,6 +299,7 @@ class TestGuard:
         assert order == ["first", "second"]
         assert self.refused(guard) is None
 
+    @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="needs signals of Unix")
     def test_waiting_can_be_interrupted(self, guard):
         may_go, entered = threading.Event(), threading.Event()
 
@@ -310,7 +311,8 @@ class TestGuard:
         thread.start()
         assert entered.wait(20)
         before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        timer = threading.Timer(0.05, signal.raise_signal, [signal.SIGINT])
+        arguments = threading.get_ident(), signal.SIGINT
+        timer = threading.Timer(0.05, signal.pthread_kill, arguments)
         timer.start()
         try:
             with pytest.raises(KeyboardInterrupt), guard:

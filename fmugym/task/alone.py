@@ -43,7 +43,7 @@ class Guard(Protocol):
 
 
 class _PythonGuard:
-    """A ``Guard`` where there is no C extension."""
+    """A ``Guard`` where there is no C extension; an interrupt while it is taken may keep it."""
 
     def __init__(self) -> None:
         self._lock = RLock()
