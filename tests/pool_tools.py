@@ -16,7 +16,7 @@ KINDS = {
 """The arguments by which ``make_pool`` makes each kind."""
 
 
-def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, **spec):
+def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, private=False, **spec):
     """Open a pool, in this process or with options of ``make_pool``.
 
     Args:
@@ -25,12 +25,13 @@ def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, **sp
         time_step: In s.
         n: How many instances.
         options: Of ``make_pool``; None for a pool in this process.
+        private: Whether each instance of a pool in this process has a library of its own.
         spec: Others of a ``PoolSpec``.
     """
     given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
     spec = PoolSpec(given, read, time_step, **spec)
     if options is None:
-        pool = local_pool(fmu, spec, n, LOG)
+        pool = local_pool(fmu, spec, n, LOG, private_libraries=private)
     else:
         pool = opening.make_pool(fmu, spec, n, LOG, **options)
     pool.variable = fmu.variable
