@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import wine_tools
 from pool_tools import KINDS, open_pool, reset, start, step
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMU, ConfigError
@@ -250,22 +251,7 @@ class TestEnvironments:
     @pytest.mark.parametrize("isolation", ["none", "process"])
     def test_single_and_vector_environments_agree(self, fmu_path, isolation):
         path = fmu_path()
-        single = Env(path, self.CONFIG, isolation=isolation)
-        vector = fmugym.FMUVectorEnv(
-            lambda: Env(path, self.CONFIG, isolation=isolation), num_envs=3
-        )
-        try:
-            single.reset(seed=1)
-            vector.reset(seed=1)
-            vector.action_space.seed(1)
-            for _ in range(15):
-                actions = vector.action_space.sample()
-                rows = vector.step(actions)[0]
-                row = single.step(actions[0])[0]
-                np.testing.assert_array_equal(rows[0], row)
-        finally:
-            single.close()
-            vector.close()
+        require_same_alone(lambda: Env(path, self.CONFIG, isolation=isolation), 15)
 
     def test_snapshots_go_on_alike(self, fmu_path):
         env = Env(fmu_path(), self.CONFIG)

@@ -11,6 +11,7 @@ import pytest
 import wine_tools
 from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
@@ -215,28 +216,7 @@ def test_a_single_environment(sun, interface):
 @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 @all_ways
 def test_many_environments_equal_single_ones(sun, way, interface):
-    make = partial(Sun, sun(interface))
-    envs = vector(make, **way)
-    found = [[(row.tolist(),)] for row in envs.reset(seed=7)[0]]
-    resets = np.zeros(3, np.bool_)
-    for _ in range(14):
-        result = envs.step(np.zeros((3, 1), np.float32))
-        for index in range(3):
-            if resets[index]:
-                found[index].append((result.observations[index].tolist(),))
-                assert result.infos["_drawn"][index]
-                start = result.infos["drawn"]["start_time"][index]
-                assert start == result.observations[index][3]
-            else:
-                values = (result.observations, result.rewards, *result[2:4])
-                found[index].append(tuple(value[index].tolist() for value in values))
-        resets = result.terminated | result.truncated
-    for index, rows in enumerate(found):
-        env = make()
-        expected = play(env, 7 + index, 14)[: len(rows)]
-        assert rows == [row[:1] if len(row) == 2 else row for row in expected]
-        env.close()
-    envs.close()
+    assert require_same_alone(partial(Sun, sun(interface)), 14, **way)
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
@@ -488,24 +468,7 @@ def test_recorded_times_are_those_of_the_fmu(task, tmp_path):
 def test_vectors_of_tasks_equal_single_ones(task, hooks, warm_up):
     task = task | {"start_time": {"from": "10-01", "to": "10-03", "step": "6h"}}
     task |= {"warm_up": warm_up} if warm_up else {}
-    envs = FMUVectorEnv(partial(fmugym.load, task), 3, hooks=hooks)
-    singles = [fmugym.load(task) for _ in range(3)]
-    observations = envs.reset(seed=3)[0]
-    for i, env in enumerate(singles):
-        assert observations[i].tolist() == env.reset(seed=3 + i)[0].tolist()
-        require_day(observations[i], env.time / DAY)
-    for count in range(1, 26):
-        result = envs.step(np.full((3, 1), 0.25, np.float32))
-        for i, env in enumerate(singles):
-            if count % 9 == 0:
-                assert result.observations[i].tolist() == env.reset()[0].tolist()
-            else:
-                observation, reward, *_ = env.step(np.array([0.25], np.float32))
-                assert result.observations[i].tolist() == observation.tolist()
-                assert result.rewards[i] == reward
-                require_day(observation, env.time / DAY)
-    for env in (envs, *singles):
-        env.close()
+    assert require_same_alone(partial(fmugym.load, task), 25, hooks=hooks)
 
 
 def test_a_task_file_keeps_it(task, tmp_path):
