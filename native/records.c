@@ -164,10 +164,6 @@ void records_add(Pool *pool, size_t begin, size_t count, Mask mask, const double
     }
 }
 
-void record_add(Pool *pool, size_t index, const double *inputs) {
-    records_add(pool, index, 1, (Mask){NULL, 0}, inputs);
-}
-
 void record_drop(Pool *pool, size_t index) {
     if (pool->records != NULL) {
         pool->records->rows[index] = NOT_WHOLE;

@@ -10,10 +10,9 @@
 bool records_open(Pool *pool);
 void records_close(Pool *pool);
 
-/* The following four do nothing in a pool that keeps no records. A record that cannot be
+/* The following three do nothing in a pool that keeps no records. A record that cannot be
  * continued, because memory runs out or the instance has left the episode, is dropped. */
 void record_begin(Pool *pool, size_t index, const Access *start, const double *starts);
-void record_add(Pool *pool, size_t index, const double *inputs);
 void record_drop(Pool *pool, size_t index);
 /* Adds the inputs of a run of instances, those of each after each other, but for those in the mask. */
 void records_add(Pool *pool, size_t begin, size_t count, Mask mask, const double *inputs);

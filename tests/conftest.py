@@ -1,6 +1,7 @@
 """Fixtures for the tests of several modules."""
 
 import collections
+import contextlib
 import functools
 import gc
 import os
@@ -79,18 +80,21 @@ def wine():
 
 
 @pytest.fixture
-def make_env(probe):
+def opened():
+    """Have things closed after the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda thing: stack.enter_context(contextlib.closing(thing))
+
+
+@pytest.fixture
+def make_env(probe, opened):
     """Make environments over the probe that are closed after the test."""
-    envs = []
 
     def make(version=2, *, cls=fmu_tools.PlainEnv, path=None, render_mode=None, **config):
-        env = cls(path or probe(version), fmu_tools.probe_config(**config), render_mode=render_mode)
-        envs.append(env)
-        return env
+        config = fmu_tools.probe_config(**config)
+        return opened(cls(path or probe(version), config, render_mode=render_mode))
 
-    yield make
-    for env in envs:
-        env.close()
+    return make
 
 
 @pytest.fixture

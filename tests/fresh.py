@@ -1,11 +1,13 @@
 """Episodes as FMPy plays them: each on a fresh instance of a fresh copy of the library."""
 
 import logging
+from dataclasses import replace
 
 from fmugym import FMU
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.backend.by_fmpy import FMPyInstance
+from fmugym.pool.backend.rig import FaultError
 
 LOG = logging.getLogger("fmugym.test.fresh")
 
@@ -22,14 +24,26 @@ def play(path, outputs, rows, step_size, start_values=None, **times):
         times: Others of a ``PoolSpec``, such as the start time and the tolerance.
 
     Returns:
-        The outputs of the start and of each step; fewer if the FMU asked to stop.
+        The outputs of the start and of each step; fewer if the FMU asked to stop. If the FMU cannot
+        be read before its first step, the outputs of the start are those of the model description.
     """
     fmu = FMU(path)
     inputs = tuple(map(fmu.variable, rows[0]))
     spec = PoolSpec(inputs, tuple(map(fmu.variable, outputs)), step_size, **times)
-    instance = FMPyInstance(fmu, spec, LOG)
     try:
-        results = [as_floats(instance.reset(start_values or {}))]
+        return played(fmu, spec, rows, start_values or {})
+    except FaultError as failure:
+        if "reading the outputs" not in str(failure):
+            raise
+        return played(fmu, replace(spec, blind_start=True), rows, start_values or {})
+    finally:
+        fmu.close()
+
+
+def played(fmu, spec, rows, start_values):
+    instance = FMPyInstance(fmu, spec, LOG, fmu.prepare_library())
+    try:
+        results = [as_floats(instance.reset(start_values))]
         for row in rows:
             values, status = instance.step(row)
             results.append(as_floats(values))
@@ -38,7 +52,6 @@ def play(path, outputs, rows, step_size, start_values=None, **times):
         return results
     finally:
         instance.stop()
-        fmu.close()
 
 
 def as_floats(values):

@@ -17,37 +17,34 @@ def sources(version):
     return found | {"sources/headers/stubs.h": stubs.encode()}
 
 
-def build_description(version, **changes):
-    names = [f"code/{name}" for name in (*FILES, f"fmi{version}.c")]
-    attributes = {"modelIdentifier": "Model", "language": "C99"} | changes
+def build_description():
+    names = [f"code/{name}" for name in (*FILES, "fmi3.c")]
     return f"""<fmiBuildDescription fmiVersion="3.0">
       <BuildConfiguration modelIdentifier="Other"/>
-      <BuildConfiguration modelIdentifier="{attributes["modelIdentifier"]}">
-        <SourceFileSet language="{attributes["language"]}">
+      <BuildConfiguration modelIdentifier="Model">
+        <SourceFileSet language="C99">
           {"".join(f'<SourceFile name="{name}"/>' for name in names)}
           <PreprocessorDefinition name="STUBS" value="&quot;stubs.h&quot;"/>
-          <PreprocessorDefinition name="FMI_VERSION" value="{version}"/>
+          <PreprocessorDefinition name="FMI_VERSION" value="3"/>
           <PreprocessorDefinition name="BROKEN" optional="true" value="x"/>
           <IncludeDirectory name="headers"/>
         </SourceFileSet>
-        <Library name="m"/>
       </BuildConfiguration>
     </fmiBuildDescription>"""
 
 
-def write_source_fmu(path, version=3, add=None, described=True):
+def write_source_fmu(path, version=3, add=None):
     """Write an FMU without a library.
 
     Args:
         path: The new file.
-        version: Of FMI.
+        version: Of FMI: the model description of 2 lists the sources, a build description of 3.
         add: More files, by their places.
-        described: Whether a build description lists the sources; otherwise the model description.
     """
     files = sources(version)
     xml = exchange_tools.describe("dahlquist", version, BOTH)
-    if described:
-        files["sources/buildDescription.xml"] = build_description(version).encode()
+    if version == 3:
+        files["sources/buildDescription.xml"] = build_description().encode()
     else:
         names = (*(f"code/{name}" for name in FILES), "code/shim.c")
         text = '#define FMI_VERSION 2\n#define STUBS "../headers/stubs.h"\n#include "fmi2.c"\n'

@@ -1,21 +1,18 @@
 """Systems of FMUs with linear equations (``zoo/linear.c``), their exact solutions, and pools."""
 
-import logging
 from pathlib import Path
 
 import model_tools
 import numpy as np
 import pytest
+from pool_tools import open_pool, start, step
 from scipy.linalg import expm
 
 from fmugym import bundled_fmu
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 from fmugym.systems import FMUSystem
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
-LOG = logging.getLogger("fmugym.test")
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 
 STATES = {
@@ -36,39 +33,21 @@ VARIABLES = (
 
 
 @pytest.fixture(name="make")
-def closing_pools():
+def closing_pools(opened):
     """Make pools of plans that are closed after the test."""
-    made = []
 
     def make(plan, inputs=(), outputs=(), count=1, time_step=0.1, **options):
         fmu = plan.as_fmu() if isinstance(plan, FMUSystem) else SystemFMU(plan)
-        spec = PoolSpec(
-            tuple(map(fmu.variable, inputs)),
-            tuple(map(fmu.variable, outputs)),
-            time_step,
-            **options,
-        )
-        pool = local_pool(fmu, spec, count, LOG)
-        pool.variable = fmu.variable
-        made.append(pool)
-        return pool
+        return opened(open_pool(fmu, inputs, outputs, time_step, count, **options))
 
-    yield make
-    for pool in made:
-        pool.close()
+    return make
 
 
 def play(pool, steps, inputs=None):
     """Reset and step; the outputs, shape (steps + 1, k)."""
-    names, values = (), np.zeros((0, pool.num_instances))
-    outputs, statuses = pool.reset(names, values)
-    assert not statuses.any(), pool.failure(0)
-    rows = [outputs[:, 0].copy()]
-    for i in range(steps):
-        outputs, statuses = pool.step(None if inputs is None else inputs[i])
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs[:, 0].copy())
-    return np.array(rows)
+    rows = [start(pool).outputs[:, 0].copy()]
+    given = [()] * steps if inputs is None else inputs
+    return np.array(rows + [step(pool, *given[i])[:, 0] for i in range(steps)])
 
 
 def linear_fmu(path, version=2):

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from source_tools import BOTH, build_description, write_source_fmu
 
-from fmugym import FMU, ConfigError, FMULoadError
+from fmugym import FMU, FMULoadError
 from fmugym.pool import PoolSpec
-from fmugym.tools import compilers
 from fmugym.tools.cli import main
 from fmugym.tools.compiling import compile_fmu
 from fmugym.trial import opening
@@ -46,18 +45,6 @@ class TestCompile:
         )
         assert fmu_tools.read_fmu(made).keys() > fmu_tools.read_fmu(source_fmu(version)).keys()
 
-    def test_a_list_in_the_model_description(self, tmp_path, source_fmu):
-        made = compile_fmu(source_fmu(2, described=False), tmp_path / "made.fmu")
-        built = exchange_tools.exchange_fmu(tmp_path / "b.fmu", "dahlquist", 2, BOTH)
-        found, expected = simulated(made, "co_simulation"), simulated(built, "co_simulation")
-        np.testing.assert_allclose(found, expected, rtol=1e-15)
-
-    def test_ziglang_where_the_system_has_no_compiler(self, tmp_path, source_fmu, monkeypatch):
-        pytest.importorskip("ziglang", reason="needs ziglang: the extra windows")
-        monkeypatch.setattr(compilers.shutil, "which", lambda name: None)
-        made = compile_fmu(source_fmu(3))
-        assert np.isfinite(simulated(made, "co_simulation")).all()
-
     def test_the_command(self, source_fmu, capsys):
         path = source_fmu(3)
         assert main(["compile", str(path), "--json"]) == 0
@@ -79,13 +66,14 @@ class TestRefusals:
             compile_fmu(path)
 
     def test_source_code_without_a_list(self, tmp_path, source_fmu):
-        path = source_fmu(3, {"sources/buildDescription.xml": b"<fmiBuildDescription/>"})
+        empty = b'<fmiBuildDescription fmiVersion="3.0"/>'
+        path = source_fmu(3, {"sources/buildDescription.xml": empty})
         with pytest.raises(FMULoadError, match="no list"):
             compile_fmu(path)
 
     @pytest.mark.parametrize("name", ["../other.c", "/etc/passwd", "code/missing.c", ""])
     def test_files_elsewhere(self, source_fmu, name):
-        text = build_description(3).replace("code/usual.c", name)
+        text = build_description().replace("code/usual.c", name)
         path = source_fmu(3, {"sources/buildDescription.xml": text.encode()})
         with pytest.raises(FMULoadError, match="source"):
             compile_fmu(path)
@@ -97,10 +85,14 @@ class TestRefusals:
         assert not list(tmp_path.glob("*_*.fmu"))
 
     def test_no_compiler(self, source_fmu, monkeypatch):
-        monkeypatch.setattr(compilers.shutil, "which", lambda name: None)
-        monkeypatch.setattr(compilers.importlib.util, "find_spec", lambda name: None)
-        with pytest.raises(ConfigError, match="ziglang"):
+        monkeypatch.setenv("CC", "no-such-compiler")
+        with pytest.raises(FMULoadError, match=r"CMake Error .*no-such-compiler"):
             compile_fmu(source_fmu(3))
+
+    def test_several_sets_of_files(self, source_fmu):
+        text = build_description().replace("</SourceFileSet>", "</SourceFileSet><SourceFileSet/>")
+        with pytest.raises(FMULoadError, match="2 sets of source files"):
+            compile_fmu(source_fmu(3, {"sources/buildDescription.xml": text.encode()}))
 
     def test_not_xml(self, source_fmu):
         path = source_fmu(3, {"sources/buildDescription.xml": b"<a><b></a>"})

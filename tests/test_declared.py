@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import zoo_tools
 from gymnasium.envs.registration import EnvSpec
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
@@ -166,33 +167,7 @@ def test_units_reach_observations_actions_and_rewards():
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
-    envs = FMUVectorEnv(partial(fmugym.load, TANK), 3, hooks=hooks, autoreset_mode="same_step")
-    singles = [fmugym.load(TANK) for _ in range(3)]
-    observations, infos = envs.reset(seed=5)
-    for i, env in enumerate(singles):
-        same(env.reset(seed=5 + i)[0], observations[i])
-    envs.action_space.seed(3)
-    for _ in range(60):
-        actions = envs.action_space.sample()
-        observations, rewards, terminated, truncated, infos = envs.step(actions)
-        for i, env in enumerate(singles):
-            seen, reward, end, cut, info = env.step(actions[i])
-            assert (reward, end, cut) == (rewards[i], terminated[i], truncated[i])
-            if end or cut:
-                same(seen, infos["final_obs"][i])
-                seen, _ = env.reset()
-            else:
-                assert info["cost"] == infos["cost"][i]
-                assert info["reward_terms"]["calm"] == infos["reward_terms"]["calm"][i]
-            same(seen, observations[i])
-    for env in (envs, *singles):
-        env.close()
-
-
-def test_all_hooks_of_a_task_with_memory_and_costs_are_compiled():
-    envs = FMUVectorEnv(partial(fmugym.load, TANK), 2, hooks="compiled")
-    assert envs.inside.engine._task.left == {}
-    envs.close()
+    assert require_same_alone(partial(fmugym.load, TANK), 60, "same_step", hooks=hooks)
 
 
 def test_samples_over_the_substeps_of_a_step():

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMUVectorEnv
@@ -105,25 +106,8 @@ def test_a_continuous_action_may_change_while_it_is_on():
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_many_environments_equal_single_ones_to_the_last_bit(kind, hooks):
     make = partial(fmugym.load, task(kind, history={"of": "u", "length": "0.2s"}))
-    envs, singles = FMUVectorEnv(make, 3, hooks=hooks), [make() for _ in range(3)]
-    if hooks == "compiled":
-        assert envs.inside.engine._task.left == {}
-    observations, _ = envs.reset(seed=2)
-    for i, env in enumerate(singles):
-        np.testing.assert_array_equal(env.reset(seed=2 + i)[0], observations[i])
-    envs.action_space.seed(1)
-    for _ in range(25):
-        actions = envs.action_space.sample()
-        observations, rewards, *_ = envs.step(actions)
-        for i, env in enumerate(singles):
-            seen, reward, *_ = env.step(actions[i])
-            np.testing.assert_array_equal(seen, observations[i])
-            assert reward == rewards[i]
-        if "levels" in KINDS[kind]:
-            masks = [env.action_masks() for env in singles]
-            np.testing.assert_array_equal(envs.call("action_masks"), masks)
-    for env in (envs, *singles):
-        env.close()
+    method = "action_masks" if "levels" in KINDS[kind] else None
+    require_same_alone(make, 25, method=method, hooks=hooks)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMUVectorEnv
@@ -156,33 +157,7 @@ def last(values, first):
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_many_environments_equal_single_ones_to_the_last_bit(hooks):
-    envs = FMUVectorEnv(partial(fmugym.load, EVERYTHING), 3, hooks=hooks)
-    singles = [fmugym.load(EVERYTHING) for _ in range(3)]
-    observations, _ = envs.reset(seed=5)
-    expected = [env.reset(seed=5 + i)[0] for i, env in enumerate(singles)]
-    np.testing.assert_array_equal(observations, expected)
-    envs.action_space.seed(3)
-    for step in range(30):
-        actions = envs.action_space.sample()
-        observations, rewards, _, truncated, infos = envs.step(actions)
-        if step % 13 == 12:  # the step that follows the end of an episode
-            expected = [env.reset()[0] for env in singles]
-            np.testing.assert_array_equal(observations, expected)
-            continue
-        for i, env in enumerate(singles):
-            seen, reward, _, cut, info = env.step(actions[i])
-            assert (reward, cut) == (rewards[i], truncated[i])
-            np.testing.assert_array_equal(seen, observations[i])
-            for name, value in info["reward_terms"].items():
-                assert value == infos["reward_terms"][name][i]
-    for env in (envs, *singles):
-        env.close()
-
-
-def test_all_hooks_are_compiled():
-    envs = FMUVectorEnv(partial(fmugym.load, EVERYTHING), 2, hooks="compiled")
-    assert envs.inside.engine._task.left == {}
-    envs.close()
+    assert require_same_alone(partial(fmugym.load, EVERYTHING), 30, hooks=hooks)
 
 
 CSV = "time;T_C;note\n0;10;a\n3600;20;b\n7200;15;c\n"

@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMUVectorEnv
@@ -291,33 +292,7 @@ def test_many_environments_equal_single_ones(parameters, sensors, actuators, hoo
     history = {"of": ["angle", "tau"], "length": "0.1s"}
     declared = task(parameters, history, **SENSORS[sensors])
     declared["variables"]["tau"] = {"min": -0.01, "max": 0.01} | ACTUATORS[actuators]
-    make = partial(fmugym.load, declared)
-    envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
-    if hooks == "compiled":
-        assert envs.inside.engine._task.left == {}
-    observations, infos = envs.reset(seed=2)
-    for i in range(3):
-        singles.append(make())
-        seen, info = singles[i].reset(seed=2 + i)
-        np.testing.assert_array_equal(seen, observations[i])
-        assert info["drawn"]["noise key"] == infos["drawn"]["noise key"][i]
-    assert len(set(infos["drawn"]["noise key"])) == 3
-    envs.action_space.seed(1)
-    ended = False
-    for _ in range(50):
-        actions = envs.action_space.sample()
-        observations, *_ = envs.step(actions)
-        results = []
-        for i, env in enumerate(singles):
-            if ended and mode == "next_step":
-                results.append((env.reset()[0], False))
-                continue
-            seen, _, _, cut, _ = env.step(actions[i])
-            results.append((env.reset()[0] if cut and mode == "same_step" else seen, cut))
-        np.testing.assert_array_equal(observations, [seen for seen, _ in results])
-        ended = results[0][1]
-    for env in (envs, *singles):
-        env.close()
+    assert require_same_alone(partial(fmugym.load, declared), 50, mode, hooks=hooks)
 
 
 @pytest.mark.parametrize(

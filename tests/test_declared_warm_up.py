@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMUVectorEnv
@@ -147,32 +148,7 @@ def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
     if caches:
         task["warm_up"] = task["warm_up"] | {"cache": True}
         task["parameters"] = {"T_m_0": 291.0}
-    make = partial(fmugym.load, task)
-    envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
-    if hooks == "compiled":
-        assert envs.inside.engine._task.left == {}
-    observations, _ = envs.reset(seed=2)
-    for i in range(3):
-        singles.append(make())
-        np.testing.assert_array_equal(singles[i].reset(seed=2 + i)[0], observations[i])
-    envs.action_space.seed(1)
-    ended = False
-    for _ in range(16):
-        actions = envs.action_space.sample()
-        observations, rewards, *_ = envs.step(actions)
-        results = []
-        for i, env in enumerate(singles):
-            if ended and mode == "next_step":
-                results.append((env.reset()[0], 0.0, False))
-                continue
-            seen, reward, _, cut, _ = env.step(actions[i])
-            seen = env.reset()[0] if cut and mode == "same_step" else seen
-            results.append((seen, reward, cut))
-        np.testing.assert_array_equal(observations, [seen for seen, *_ in results])
-        np.testing.assert_array_equal(rewards, [reward for _, reward, _ in results])
-        ended = results[0][2]
-    for env in (envs, *singles):
-        env.close()
+    assert require_same_alone(partial(fmugym.load, task), 16, mode, hooks=hooks)
 
 
 @pytest.mark.parametrize("controller", [PID, THERMOSTAT, "schedule 05:00=0.7 21:00=0.3", 0.5])

@@ -1,8 +1,6 @@
 """Event mode in co-simulation, clocks, early return: FMI 3.0."""
 
 import contextlib
-import logging
-from contextlib import closing
 
 import clocks_tools
 import exchange_tools
@@ -10,19 +8,17 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
-from pool_kinds import POOLS
+from pool_tools import KINDS, open_pool, reset, start, step
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMU, ConfigError
-from fmugym.pool import PoolSpec
 from fmugym.tools.skeleton import Skeleton
-from fmugym.trial import opening
 
-LOG = logging.getLogger("fmugym.test")
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
-all_kinds = pytest.mark.parametrize("kind", [*POOLS, "wine"])
+all_kinds = pytest.mark.parametrize("kind", [*KINDS, "wine"])
 both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
@@ -44,9 +40,7 @@ def fmu_path(tmp_path_factory):
 
 
 @pytest.fixture
-def make_pool(request, fmu_path):
-    made = []
-
+def make_pool(request, fmu_path, opened):
     def make(kind, interface="CoSimulation", n=1, inputs=(), outputs=COUNTS, step=0.1, **spec):
         arrays = any(name.endswith("]") for name in inputs)
         building = contextlib.nullcontext
@@ -54,36 +48,9 @@ def make_pool(request, fmu_path):
             request.getfixturevalue("wine")
             building = wine_tools.building_for_windows
         fmu = FMU(fmu_path(interface, building=building, arrays=arrays), probe_timeout=None)
-        spec = PoolSpec(
-            inputs=tuple(map(fmu.variable, inputs)),
-            outputs=tuple(map(fmu.variable, outputs)),
-            time_step=step,
-            **spec,
-        )
-        pool = opening.make_pool(fmu, spec, n, LOG, **POOLS.get(kind, {}))
-        pool.variable = fmu.variable
-        made.append(pool)
-        return pool
+        return opened(open_pool(fmu, inputs, outputs, step, n, KINDS.get(kind, {}), **spec))
 
-    yield make
-    for pool in made:
-        pool.close()
-
-
-def start(pool, **values):
-    """Reset a pool with start values, numbers or one for each instance."""
-    variables = tuple(map(pool.variable, values))
-    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
-    pool.reset(variables, np.array(rows, float).reshape(len(rows), pool.num_instances))
-    assert not pool.statuses.any(), pool.failure(0)
-    return pool
-
-
-def step(pool, *inputs):
-    rows = np.array([np.broadcast_to(v, pool.num_instances) for v in inputs], float)
-    outputs, statuses = pool.step(rows.reshape(len(inputs), pool.num_instances))
-    assert not statuses.any(), pool.failure(0)
-    return outputs.copy()
+    return make
 
 
 def ticks_of(period=0.2, pace=0.5, until=10.0):
@@ -126,7 +93,7 @@ class TestTimedClocks:
     @both_interfaces
     def test_each_instance_has_its_own_clocks(self, make_pool, kind, interface):
         periods, paces = np.array([0.2, 0.3, 0.7]), np.array([0.5, 0.11, 1.3])
-        pool = start(make_pool(kind, interface, n=3), period=periods, pace=paces)
+        pool = start(make_pool(kind, interface, n=3), {"period": periods, "pace": paces})
         for _ in range(23):
             found = step(pool)
         for i in range(3):
@@ -145,7 +112,7 @@ class TestTimedClocks:
 
     @all_kinds
     def test_early_returns_leave_the_time_of_the_step(self, make_pool, kind):
-        pool = start(make_pool(kind, outputs=("x", *COUNTS), step=0.5), eager=0.013)
+        pool = start(make_pool(kind, outputs=("x", *COUNTS), step=0.5), {"eager": 0.013})
         for index in range(6):
             found = step(pool)[:, 0]
             assert found[0] == pytest.approx(0.5 * (index + 1), abs=1e-12)
@@ -159,31 +126,28 @@ class TestEarlyReturn:
     @all_kinds
     @pytest.mark.parametrize("version", [2, 3])
     @pytest.mark.parametrize("size", [0.1, 0.37])
-    def test_the_rest_of_the_step_follows(self, tmp_path, kind, version, size):
+    def test_the_rest_of_the_step_follows(self, tmp_path, opened, kind, version, size):
         ends = {}
         for options in ((), ("-DEARLY=0.03",)):
             path = exchange_tools.exchange_fmu(
                 tmp_path / "model.fmu", "dahlquist", version, ("CoSimulation",), "", options
             )
             fmu = FMU(path, probe_timeout=None)
-            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("x"),), time_step=size)
-            with closing(opening.make_pool(fmu, spec, 2, LOG, **POOLS.get(kind, {}))) as pool:
-                pool.variable = fmu.variable
-                start(pool)
-                ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
+            pool = opened(open_pool(fmu, ["u"], ["x"], size, 2, KINDS.get(kind, {})))
+            start(pool)
+            ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
         plain, early = ends.values()
         np.testing.assert_allclose(early, plain, rtol=2e-3)  # its Euler steps end elsewhere
 
     @all_kinds
     @pytest.mark.parametrize("name", ["constant", "fixed"])
-    def test_a_clock_without_interval_is_named(self, fmu_path, tmp_path, kind, name):
+    def test_a_clock_without_interval_is_named(self, fmu_path, tmp_path, opened, kind, name):
         given = {"constant": ' intervalDecimal="0.1"', "fixed": ' intervalCounter="1"'}[name]
         fmu = FMU(fmu_tools.edited_fmu(fmu_path(), tmp_path, {given: ""}), probe_timeout=None)
-        spec = PoolSpec((), (fmu.variable("x"),), time_step=0.1)
-        with closing(opening.make_pool(fmu, spec, 1, LOG, **POOLS.get(kind, {}))) as pool:
-            pool.reset((), np.zeros((0, 1)))
-            reference = list(clocks_tools.CLOCKS).index(name)
-            assert f"value reference {reference} has an interval of nan" in pool.failure(0)
+        pool = opened(open_pool(fmu, (), ["x"], options=KINDS.get(kind, {})))
+        reset(pool)
+        reference = list(clocks_tools.CLOCKS).index(name)
+        assert f"value reference {reference} has an interval of nan" in pool.failure(0)
 
 
 class TestTriggeredClocks:
@@ -246,7 +210,7 @@ class TestStates:
     def test_a_restored_state_goes_on_with_the_same_ticks(self, make_pool, kind, interface):
         inputs = ("strike", "command")
         pool = make_pool(kind, interface, 2, inputs, COUNTS + LASTS + ("sample", "bell"))
-        start(pool, pace=[0.5, 0.15])
+        start(pool, {"pace": [0.5, 0.15]})
         actions = np.random.default_rng(1).integers(0, 2, (40, 2))
         for action in actions[:13]:
             step(pool, *action)
@@ -259,7 +223,7 @@ class TestStates:
     @both_interfaces
     def test_all_pools_give_the_same_numbers(self, make_pool, interface):
         rows = {}
-        for kind in POOLS:
+        for kind in KINDS:
             inputs = ("strike", "command", "pace")
             pool = start(make_pool(kind, interface, 2, inputs, COUNTS + LASTS, 0.17))
             random = np.random.default_rng(2)
@@ -287,22 +251,7 @@ class TestEnvironments:
     @pytest.mark.parametrize("isolation", ["none", "process"])
     def test_single_and_vector_environments_agree(self, fmu_path, isolation):
         path = fmu_path()
-        single = Env(path, self.CONFIG, isolation=isolation)
-        vector = fmugym.FMUVectorEnv(
-            lambda: Env(path, self.CONFIG, isolation=isolation), num_envs=3
-        )
-        try:
-            single.reset(seed=1)
-            vector.reset(seed=1)
-            vector.action_space.seed(1)
-            for _ in range(15):
-                actions = vector.action_space.sample()
-                rows = vector.step(actions)[0]
-                row = single.step(actions[0])[0]
-                np.testing.assert_array_equal(rows[0], row)
-        finally:
-            single.close()
-            vector.close()
+        require_same_alone(lambda: Env(path, self.CONFIG, isolation=isolation), 15)
 
     def test_snapshots_go_on_alike(self, fmu_path):
         env = Env(fmu_path(), self.CONFIG)

@@ -1,47 +1,33 @@
 """What pools ask of FMUs of each FMI version: calls, statuses, values, loading."""
 
-import logging
 import os
 import threading
 
 import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_library
+from pool_tools import open_pool, start, step
 
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 
-LOG = logging.getLogger("fmugym.test")
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
 
 
-@pytest.fixture(name="make")
-def closing_pools():
+@pytest.fixture
+def make(opened):
     """Make pools that are closed after the test."""
-    made = []
 
     def make(path, inputs=(), outputs=(), count=1, time_step=0.5, **spec):
-        fmu = FMU(path)
-        names = (tuple(map(fmu.variable, some)) for some in (inputs, outputs))
-        made.append(local_pool(fmu, PoolSpec(*names, time_step, **spec), count, LOG))
-        made[-1].variable = fmu.variable
-        return made[-1]
+        return opened(open_pool(FMU(path), inputs, outputs, time_step, count, **spec))
 
-    yield make
-    for pool in made:
-        pool.close()
+    return make
 
 
 def reset(pool, **values):
     """Reset all instances with the same start values; the outputs of the first."""
-    rows = np.array([[value] * pool.num_instances for value in values.values()], float)
-    starts = tuple(map(pool.variable, values))
-    outputs, statuses = pool.reset(starts, rows.reshape(len(values), pool.num_instances))
-    assert not statuses.any(), pool.failure(0)
-    return outputs[:, 0].tolist()
+    return start(pool, values).outputs[:, 0].tolist()
 
 
 class TestCallOrder:
@@ -70,8 +56,7 @@ class TestValues:
         names = ["n_out", "mix", "on_out", "mode_out"]
         pool = make(probe(version), ["mode", "c", "on", "n", "a"], names)
         reset(pool)
-        outputs, _ = pool.step(np.array([[turbo], [0.25], [1], [-4], [0.5]]))
-        assert outputs[:, 0].tolist() == [-4, 25.5, 1, turbo]
+        assert step(pool, turbo, 0.25, 1, -4, 0.5)[:, 0].tolist() == [-4, 25.5, 1, turbo]
 
     def test_a_wrong_type_is_refused_by_the_fmu(self, make, probe):
         """The probe knows the type of every reference: nothing is read as what it is not."""
@@ -148,13 +133,9 @@ class TestManyInstances:
 
         def live():
             try:
-                fmu = FMU(probe(version))
-                spec = PoolSpec((fmu.variable("a"),), (fmu.variable("sum"),), 1.0)
-                pool = local_pool(fmu, spec, 1, LOG)
-                pool.reset((), np.zeros((0, 1)))
+                pool = start(open_pool(FMU(probe(version)), ["a"], ["sum"], 1.0))
                 for _ in range(200):
-                    outputs, statuses = pool.step(np.ones((1, 1)))
-                    assert not statuses.any()
+                    outputs = step(pool, 1.0)
                 assert outputs.tolist() == [[200.0]]
                 pool.close()
             except BaseException as error:

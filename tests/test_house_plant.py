@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy.integrate import solve_ivp
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym.baselines import PID, Hysteresis
@@ -274,16 +275,7 @@ class TestEnvironment:
         assert len(days) > 25
 
     def test_many_houses_are_compiled_and_equal_single_ones(self):
-        envs = fmugym.FMUVectorEnv(HouseEnv, 3, hooks="compiled")
-        rng = np.random.default_rng(0)
-        actions = rng.random((40, 3, 1)).astype(np.float32)
-        together = [envs.reset(seed=5)[0], *(envs.step(row)[0] for row in actions)]
-        envs.close()
-        for index in range(3):
-            with HouseEnv() as env:
-                alone = [env.reset(seed=5 + index)[0]]
-                alone += [env.step(row[index])[0] for row in actions]
-            assert np.array_equal(np.array(together)[:, index], np.array(alone))
+        require_same_alone(HouseEnv, 40, hooks="compiled")
 
     def test_a_better_controller_costs_less(self):
         """On weeks that training leaves out: no heating, a thermostat, a PI controller."""

@@ -1,6 +1,5 @@
 """Linear models: against closed forms, central differences, and what FMUs do in a step."""
 
-import logging
 from contextlib import closing
 
 import exchange_tools
@@ -8,13 +7,12 @@ import foreign_tank
 import numpy as np
 import pytest
 from fmu_tools import CLAIMING_DERIVATIVES, edited_fmu, probe_fmu
+from pool_tools import open_pool, start, step
 from pythonfmu.builder import FmuBuilder
 from scipy.linalg import expm
 
 import fmugym
 from fmugym.archive.bundled import BUNDLED
-from fmugym.pool import PoolSpec
-from fmugym.trial.opening import make_pool
 
 M, L, B, G, V_C = 0.06, 0.1, 4e-4, 9.81, 0.05  # of the bundled pendulum
 with_derivatives = pytest.mark.parametrize(
@@ -85,24 +83,22 @@ def test_against_central_differences_of_the_fmu(model, version):
 def derivatives(model, version, names, columns, linear):
     """The FMU's own derivatives of the states, for columns of start values and inputs."""
     fmu = fmugym.FMU(fmugym.bundled_fmu(model, version))
-    pool = make_pool(fmu, PoolSpec((), (), 0.01), columns.shape[1], logging.getLogger("test"))
-    pool.reset(tuple(map(fmu.variable, names)), columns)
-    values = pool.read(tuple(map(fmu.variable, linear.derivatives)))
-    pool.close()
-    return values
+    with closing(open_pool(fmu, n=columns.shape[1])) as pool:
+        start(pool, dict(zip(names, columns, strict=True)))
+        return pool.read(tuple(map(fmu.variable, linear.derivatives)))
 
 
 @each_version
 def test_each_instance_is_differentiated_at_its_own_point(version):
     fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum", version))
     torque, theta, speed = map(fmu.variable, ["tau", "theta", "theta_dot"])
-    angles = np.array([[0.0, 1.0, -2.5]])
-    with closing(make_pool(fmu, PoolSpec((torque,), (), 0.02), 3, logging.getLogger())) as pool:
+    angles = np.array([0.0, 1.0, -2.5])
+    with closing(open_pool(fmu, ["tau"], n=3)) as pool:
         with pytest.raises(fmugym.SimulationError, match="needs a reset"):
             pool.differentiate((theta,), (theta,))
-        pool.reset((fmu.variable("theta_0"),), angles)
+        start(pool, {"theta_0": angles})
         found = pool.differentiate((speed, fmu.variable("theta_ddot")), (theta, torque))
-    by_angle, by_torque = G / L * np.cos(angles[0]), np.full(3, 1 / (M * L**2))
+    by_angle, by_torque = G / L * np.cos(angles), np.full(3, 1 / (M * L**2))
     expected = np.array([np.zeros((2, 3)), [by_angle, by_torque]])
     assert found == pytest.approx(expected, rel=1e-12)
 
@@ -114,13 +110,11 @@ def test_a_step_from_near_upright_is_that_of_the_linear_model(version):
     system[:2] = np.hstack([linear.A, linear.B])
     fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum", version))
     assert linear.states == ("theta", "theta_dot")
-    spec = PoolSpec((fmu.variable("tau"),), tuple(map(fmu.variable, linear.states)), 0.02)
-    pool = make_pool(fmu, spec, 3, logging.getLogger("test"))
     deviations = np.diag([1e-4, 1e-3, 1e-5])
-    pool.reset(tuple(map(fmu.variable, ["theta_0", "theta_dot_0"])), deviations[:2])
-    stepped, _ = pool.step(deviations[2:])
+    with closing(open_pool(fmu, ["tau"], linear.states, 0.02, 3)) as pool:
+        start(pool, {"theta_0": deviations[0], "theta_dot_0": deviations[1]})
+        stepped = step(pool, deviations[2])
     assert stepped == pytest.approx((expm(0.02 * system) @ deviations)[:2], rel=1e-5)
-    pool.close()
 
 
 @each_version

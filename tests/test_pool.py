@@ -1,6 +1,5 @@
 """The contract of ``fmugym.pool.base``, for every implementation of it."""
 
-import logging
 import pickle
 
 import fmpy
@@ -9,6 +8,7 @@ import pytest
 import zoo_tools
 from fmu_tools import MAJOR_VERSIONS, edited_fmu
 from plants import PLANTS
+from pool_tools import LOG, open_pool, reset
 from wine_tools import for_windows
 
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
@@ -19,8 +19,6 @@ from fmugym.pool import PoolSpec
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import Component, Group, SystemPlan
 from fmugym.trial import opening
-
-LOG = logging.getLogger("fmugym.test")
 
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])
@@ -43,34 +41,25 @@ engine_only = pytest.mark.parametrize(
 
 
 @pytest.fixture(params=OPTIONS)
-def make_pool(request, tmp_path):
+def make_pool(request, tmp_path, opened):
     """Make pools of one implementation that are closed after the test."""
     in_wine = request.param == "wine"
     if in_wine:
         request.getfixturevalue("wine")
         monkeypatch = request.getfixturevalue("monkeypatch")
         monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
-    made = []
 
     def make(path, inputs, outputs, num_instances=1, time_step=0.1, reset_method=None, **spec):
         fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
         if "system" in request.param:
             fmu = system_of(path)
-        spec = PoolSpec(
-            inputs=tuple(map(fmu.variable, inputs)),
-            outputs=tuple(map(fmu.variable, outputs)),
-            time_step=time_step,
-            **spec,
-        )
         options = OPTIONS[request.param] | {"reset_method": reset_method}
-        pool = opening.make_pool(fmu, spec, num_instances, LOG, private_libraries=False, **options)
-        pool.variable, pool.is_system = fmu.variable, "system" in request.param
-        made.append(pool)
-        return pool
+        options["private_libraries"] = False
+        pool = open_pool(fmu, inputs, outputs, time_step, num_instances, options, **spec)
+        pool.is_system = "system" in request.param
+        return opened(pool)
 
-    yield make
-    for pool in made:
-        pool.close()
+    return make
 
 
 def system_of(path):
@@ -126,9 +115,7 @@ class Plant:
 
 def set_up(pool, mask=None, **values):
     """Reset with start values, numbers or one for each instance."""
-    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
-    array = np.array(rows, float).reshape(len(rows), pool.num_instances)
-    return pool.reset(tuple(map(pool.variable, values)), array, mask)
+    return reset(pool, values, mask)
 
 
 def step(pool, value=0.0, **options):

@@ -1,49 +1,29 @@
 """What a step gives of the values after each of its substeps, in every pool."""
 
-import logging
-
 import numpy as np
 import pytest
+from pool_tools import KINDS, open_pool, start, step
 
 import fmugym
 from fmugym import FMU, ConfigError, FMUVectorEnv, bundled_fmu
-from fmugym.pool import PoolSpec
 from fmugym.pool.spec import SAMPLINGS
-from fmugym.trial.opening import make_pool
 
 SUBSTEPS, STEP = 5, 0.1
 OUTPUTS = ("x", "x_dot", "theta", "theta_dot", "f")
-POOLS = {
-    "native": {"backend": "native"},
-    "process": {"isolation": "process", "workers": 1},
-}
 
 
-@pytest.fixture(params=POOLS)
-def make(request):
-    made = []
-
+@pytest.fixture(params=KINDS)
+def make(request, opened):
     def make(**spec):
         fmu = FMU(bundled_fmu("CartPole"))
-        outputs = tuple(map(fmu.variable, OUTPUTS))
-        spec = PoolSpec((fmu.variable("f"),), outputs, **spec)
-        made.append(make_pool(fmu, spec, 3, logging.getLogger("test"), **POOLS[request.param]))
-        return made[-1]
+        return opened(open_pool(fmu, ["f"], OUTPUTS, n=3, options=KINDS[request.param], **spec))
 
-    yield make
-    for pool in made:
-        pool.close()
+    return make
 
 
 def rollout(pool, inputs):
-    start = FMU(bundled_fmu("CartPole")).variable("phi_0")
-    first = pool.reset((start,), np.array([[0.1, -0.2, 0.3]]))[0].copy()
-    results = []
-    for row in inputs:
-        outputs, statuses = pool.step(row)
-        assert not statuses.any()
-        results.append(outputs.copy())
-    return first, np.array(results)
+    first = start(pool, {"phi_0": [0.1, -0.2, 0.3]}).outputs.copy()
+    return first, np.array([step(pool, *row) for row in inputs])
 
 
 def expected(fine):

@@ -1,16 +1,14 @@
 """The methods of integration by themselves: their orders, and how many steps they do."""
 
-import logging
 import math
 from contextlib import closing
 
 import exchange_tools
 import numpy as np
 import pytest
+from pool_tools import open_pool, start, step
 
 from fmugym import FMU
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 
 ORDERS = {"euler": 1, "rk4": 4, "dormand_prince": 5, "rosenbrock": 5}
 ANY = 0.9
@@ -26,15 +24,10 @@ def compiled(tmp_path_factory):
 
 def ends(path, output, time_step, count=1, starts=None, **spec):
     """The value of an output after each step."""
-    starts = starts or {}
     fmu = FMU(path, probe_timeout=None)
-    spec = PoolSpec((), (fmu.variable(output),), time_step, **spec)
-    with closing(local_pool(fmu, spec, 1, logging.getLogger("fmugym.test"))) as pool:
-        values = np.array([*starts.values()]).reshape(-1, 1)
-        pool.reset(tuple(map(fmu.variable, starts)), values)
-        found = [pool.step()[0][0, 0] for _ in range(count)]
-        assert not pool.statuses.any(), pool.failure(0)
-    return found
+    with closing(open_pool(fmu, (), [output], time_step, **spec)) as pool:
+        start(pool, starts)
+        return [step(pool)[0, 0] for _ in range(count)]
 
 
 def require_order(order, errors, lengths):

@@ -1,7 +1,6 @@
 """Start times that differ from episode to episode: pools, environments and declared tasks."""
 
 import csv
-import logging
 import pickle
 from functools import partial
 
@@ -10,28 +9,23 @@ import gymnasium
 import numpy as np
 import pytest
 import wine_tools
+from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import FMU, Choice, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, Uniform
 from fmugym.errors import TaskError
-from fmugym.pool import PoolSpec
 from fmugym.pool.spec import START_TIME
 from fmugym.series import RecordSeries
-from fmugym.trial import opening
 
-LOG = logging.getLogger("fmugym.test")
-KINDS = {
-    "native": {"backend": "native"},
-    "process": {"backend": "auto", "isolation": "process", "workers": 2},
-    "wine": {},
-}
 STEP = 0.25
 STARTS = np.array([0.0, 1.5, 86400.25])
 OUTPUTS = ("x", "now", "sine", "seconds")
 SUNS = [("ModelExchange", 1), ("ModelExchange", 2), ("ModelExchange", 3)]
 SUNS += [("CoSimulation", 2), ("CoSimulation", 3)]
-CASES = [(kind, *sun) for kind in KINDS for sun in SUNS if (kind, sun[0]) != ("wine", SUNS[-1][0])]
+CASES = [(kind, *sun) for kind in KINDS for sun in SUNS]
+CASES += [("wine", *sun) for sun in SUNS if sun[0] == "ModelExchange"]
 all_cases = pytest.mark.parametrize(("kind", "interface", "version"), CASES)
 with_states = pytest.mark.parametrize(
     ("kind", "interface", "version"), [case for case in CASES if case[2] > 1]
@@ -54,9 +48,8 @@ def sun(tmp_path_factory):
 
 
 @pytest.fixture
-def make_pool(request, sun):
+def make_pool(request, sun, opened):
     """Make pools that are closed after the test."""
-    made = []
 
     def make(kind, interface="CoSimulation", version=2, n=3, **spec):
         path = sun(interface, version)
@@ -64,32 +57,23 @@ def make_pool(request, sun):
             request.getfixturevalue("wine")
             path = wine_tools.exchange_fmu(path.with_suffix(".win.fmu"), "sun", version)
         fmu = FMU(path, probe_timeout=None)
-        spec = PoolSpec(
-            inputs=(), outputs=tuple(map(fmu.variable, OUTPUTS)), time_step=STEP, **spec
-        )
-        pool = opening.make_pool(fmu, spec, n, LOG, **KINDS[kind])
-        pool.x = fmu.variable("x")
-        made.append(pool)
-        return pool
+        return opened(open_pool(fmu, (), OUTPUTS, STEP, n, KINDS.get(kind, {}), **spec))
 
-    yield make
-    for pool in made:
-        pool.close()
+    return make
 
 
 def start(pool, times, x=None):
     """Reset a pool with the start time of each instance, and the state if it is given."""
     variables, rows = (START_TIME,), [times]
     if x is not None:
-        variables, rows = (pool.x, START_TIME), [x, times]
+        variables, rows = (pool.variable("x"), START_TIME), [x, times]
     pool.reset(variables, np.array(rows, np.float64))
     assert not pool.statuses.any(), pool.failure(0)
 
 
 def steps(pool, count):
     for _ in range(count):
-        pool.step()
-        assert not pool.statuses.any(), pool.failure(0)
+        step(pool)
 
 
 def require(pool, starts, count, x=0.0):
@@ -219,9 +203,9 @@ def test_a_single_environment(sun, interface):
         drawn.append(info["drawn"]["start_time"])
         assert list(info["drawn"]) == ["x", "start_time", "target"]
         assert env.time == env.parameters["start_time"] == drawn[-1]
-        for step in range(1, 4):
+        for count in range(1, 4):
             observation = env.step(ACTION)[0]
-            assert env.time == drawn[-1] + step * STEP
+            assert env.time == drawn[-1] + count * STEP
             assert observation[1] == pytest.approx(env.time, abs=1e-9)
     generator = np.random.default_rng(4)
     assert drawn[-1] == [generator.uniform(*limits) for limits in ((-1, 1), (0, 100))][1]
@@ -232,28 +216,7 @@ def test_a_single_environment(sun, interface):
 @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 @all_ways
 def test_many_environments_equal_single_ones(sun, way, interface):
-    make = partial(Sun, sun(interface))
-    envs = vector(make, **way)
-    found = [[(row.tolist(),)] for row in envs.reset(seed=7)[0]]
-    resets = np.zeros(3, np.bool_)
-    for _ in range(14):
-        result = envs.step(np.zeros((3, 1), np.float32))
-        for index in range(3):
-            if resets[index]:
-                found[index].append((result.observations[index].tolist(),))
-                assert result.infos["_drawn"][index]
-                start = result.infos["drawn"]["start_time"][index]
-                assert start == result.observations[index][3]
-            else:
-                values = (result.observations, result.rewards, *result[2:4])
-                found[index].append(tuple(value[index].tolist() for value in values))
-        resets = result.terminated | result.truncated
-    for index, rows in enumerate(found):
-        env = make()
-        expected = play(env, 7 + index, 14)[: len(rows)]
-        assert rows == [row[:1] if len(row) == 2 else row for row in expected]
-        env.close()
-    envs.close()
+    assert require_same_alone(partial(Sun, sun(interface)), 14, **way)
 
 
 @pytest.mark.parametrize("mode", ["SameStep", "Disabled"])
@@ -505,24 +468,7 @@ def test_recorded_times_are_those_of_the_fmu(task, tmp_path):
 def test_vectors_of_tasks_equal_single_ones(task, hooks, warm_up):
     task = task | {"start_time": {"from": "10-01", "to": "10-03", "step": "6h"}}
     task |= {"warm_up": warm_up} if warm_up else {}
-    envs = FMUVectorEnv(partial(fmugym.load, task), 3, hooks=hooks)
-    singles = [fmugym.load(task) for _ in range(3)]
-    observations = envs.reset(seed=3)[0]
-    for i, env in enumerate(singles):
-        assert observations[i].tolist() == env.reset(seed=3 + i)[0].tolist()
-        require_day(observations[i], env.time / DAY)
-    for step in range(1, 26):
-        result = envs.step(np.full((3, 1), 0.25, np.float32))
-        for i, env in enumerate(singles):
-            if step % 9 == 0:
-                assert result.observations[i].tolist() == env.reset()[0].tolist()
-            else:
-                observation, reward, *_ = env.step(np.array([0.25], np.float32))
-                assert result.observations[i].tolist() == observation.tolist()
-                assert result.rewards[i] == reward
-                require_day(observation, env.time / DAY)
-    for env in (envs, *singles):
-        env.close()
+    assert require_same_alone(partial(fmugym.load, task), 25, hooks=hooks)
 
 
 def test_a_task_file_keeps_it(task, tmp_path):

@@ -8,6 +8,7 @@ import values_tools
 from gymnasium import spaces
 from process_tools import run_python
 from values_tools import VERSIONS, pools, versions
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
@@ -81,35 +82,11 @@ def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
 @pools
 @pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
 def test_vector_environments_draw_what_single_ones_do(feedthrough, options, hooks):
-    def make():
-        parameters = {"String_parameter": CHOICE, "Float64_parameter": Uniform(0, 1)}
-        outputs = ["length", "Float64_told"]
-        path = feedthrough[3]
-        return Telling(path, model_parameters=parameters, model_output_names=outputs, **options)
-
-    env = make()
-    expected = []
-    for index in range(3):
-        runs = []
-        for episode in range(3):
-            start = env.reset(seed=None if episode else 11 + index)
-            runs.append((start[0].tolist(), start[1]["drawn"], env.step(0)[1]))
-        expected.append(runs)
-    env.close()
-    envs = FMUVectorEnv(make, 3, hooks=hooks)
-    for episode in range(3):
-        observations, infos = envs.reset(seed=None if episode else 11)
-        rewards = envs.step(np.zeros(3, np.int64))[1]
-        for index in range(3):
-            first, drawn, reward = expected[index][episode]
-            assert observations[index].tolist() == first
-            assert {name: infos["drawn"][name][index] for name in drawn} == drawn
-            assert rewards[index] == reward
-            assert (
-                envs.get_attr("parameters")[index]["String_parameter"]
-                == (drawn["String_parameter"])
-            )
-    envs.close()
+    drawn = {"String_parameter": CHOICE, "Float64_parameter": Uniform(0, 1)}
+    config = {"model_parameters": drawn, "model_output_names": ["length", "Float64_told"]}
+    assert require_same_alone(
+        lambda: Telling(feedthrough[3], max_episode_steps=2, **config, **options), 9, hooks=hooks
+    )
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])

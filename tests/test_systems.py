@@ -11,8 +11,8 @@ import fmu_tools
 import numpy as np
 import pytest
 import system_tools
+from pool_tools import open_pool, start, step
 from system_tools import (
-    LOG,
     by_each_master,
     closing_pools,  # noqa: F401  # the fixture "make"
     linear,
@@ -30,7 +30,6 @@ from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
-from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import (
@@ -44,7 +43,6 @@ from fmugym.systems.plan import (
     Loop,
     SystemPlan,
 )
-from fmugym.trial import opening
 
 NO_START = ((), np.zeros((0, 1)))
 
@@ -490,35 +488,23 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("method", list(ResetMethod)[:4])
-def test_episodes_begin_anew_by_each_method(make, method):
+def test_episodes_begin_anew_by_each_method(make, opened, method):
     """Each instance has private copies of all libraries, which are also loaded anew."""
-    fmu = SystemFMU(pendulums())
-    outputs = tuple(map(fmu.variable, PENDULUM_OUTPUTS))
-    spec = PoolSpec((), outputs, 0.02, reset_method=method)
-    pool = local_pool(fmu, spec, 2, LOG, private_libraries=True)
-    try:
-        episodes = [play(pool, 10) for _ in range(4)]
-        assert all(rows.tobytes() == episodes[0].tobytes() for rows in episodes)
-    finally:
-        pool.close()
-    assert play(make(pendulums(), (), PENDULUM_OUTPUTS, time_step=0.02), 10).tobytes() == (
-        episodes[0].tobytes()
-    )
+    options = {"private_libraries": True, "reset_method": method}
+    pool = opened(open_pool(SystemFMU(pendulums()), (), PENDULUM_OUTPUTS, 0.02, 2, options))
+    expected = play(make(pendulums(), (), PENDULUM_OUTPUTS, time_step=0.02), 10).tobytes()
+    assert [play(pool, 10).tobytes() for _ in range(4)] == [expected] * 4
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_system_runs_in_worker_processes(make, workers):
-    fmu = SystemFMU(pendulums())
-    spec = PoolSpec((), tuple(map(fmu.variable, PENDULUM_OUTPUTS)), 0.02)
-    pool = opening.make_pool(fmu, spec, 3, LOG, isolation="process", workers=workers)
+def test_a_system_runs_in_worker_processes(make, opened, workers):
+    options = {"isolation": "process", "workers": workers}
+    pool = opened(open_pool(SystemFMU(pendulums()), (), PENDULUM_OUTPUTS, 0.02, 3, options))
     here = make(pendulums(), (), PENDULUM_OUTPUTS, 3, 0.02)
-    try:
-        for one in (pool, here):
-            one.reset((), np.zeros((0, 3)))
-        for _ in range(10):
-            assert pool.step()[0].tobytes() == here.step()[0].tobytes()
-    finally:
-        pool.close()
+    for one in (pool, here):
+        start(one)
+    for _ in range(10):
+        assert step(pool).tobytes() == step(here).tobytes()
 
 
 def test_a_closed_system_says_so(make):

@@ -13,6 +13,7 @@ from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
     play,
 )
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import (
@@ -269,17 +270,7 @@ class TestOwnArrays:
 
     def test_vector_environments_do_as_single_ones(self, path):
         system = own_arrays(path)
-        envs = FMUVectorEnv(lambda: Plant(system), 3)
-        singles = [Plant(system) for _ in range(3)]
-        found = [envs.reset(seed=[4, 5, 6])[0]]
-        expected = [[env.reset(seed=4 + i)[0] for i, env in enumerate(singles)]]
-        for actions in np.random.default_rng(0).uniform(-1, 1, (4, 3, 2)).astype(np.float32):
-            found.append(envs.step(actions)[0])
-            expected.append([e.step(a)[0] for e, a in zip(singles, actions, strict=True)])
-        assert np.array_equal(found, expected)
-        envs.close()
-        for env in singles:
-            env.close()
+        require_same_alone(lambda: Plant(system), 4)
 
     def test_snapshots_and_rollouts(self, path):
         envs = FMUVectorEnv(lambda: Plant(own_arrays(path)), 2)

@@ -4,16 +4,14 @@ import clocks_tools
 import numpy as np
 import pytest
 import ssp_tools
+from pool_tools import open_pool, start, step
 from system_tools import (
-    LOG,
     closing_pools,  # noqa: F401  # the fixture "make"
     linear,
     linear_fmu,
 )
 
 from fmugym import FMU, Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 from fmugym.tools import cli
 
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
@@ -38,14 +36,8 @@ def named(names):
 
 
 def run(pool, commands):
-    pool.reset((), np.zeros((0, pool.num_instances)))
-    assert not pool.statuses.any(), pool.failure(0)
-    rows = []
-    for inputs in commands:
-        outputs, statuses = pool.step(np.tile(inputs[:, None], pool.num_instances))
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs.copy())
-    return np.array(rows)
+    start(pool)
+    return np.array([step(pool, *inputs) for inputs in commands])
 
 
 def commands(count=30, seed=0):
@@ -57,21 +49,15 @@ def commands(count=30, seed=0):
 
 @both_interfaces
 @pytest.mark.parametrize("substeps", [1, 3])
-def test_a_component_does_what_the_fmu_does_alone(make, fmus, interface, substeps):
+def test_a_component_does_what_the_fmu_does_alone(make, opened, fmus, interface, substeps):
     """Also with substeps: a clock that is set ticks once in a step of the environment."""
     fmu = FMU(fmus[interface], probe_timeout=None)
-    variables = [tuple(map(fmu.variable, names)) for names in (INPUTS, OUTPUTS)]
-    alone = local_pool(fmu, PoolSpec(*variables, 0.17, substeps=substeps), 2, LOG)
+    alone = opened(open_pool(fmu, INPUTS, OUTPUTS, 0.17, 2, substeps=substeps))
     system = FMUSystem({"c": fmus[interface]})
-    lists = named(INPUTS), named(OUTPUTS)
-    pool = make(system, *lists, 2, 0.17, substeps=substeps)
-    try:
-        expected = run(alone, commands())
-        found = run(pool, commands())
-    finally:
-        alone.close()
+    pool = make(system, named(INPUTS), named(OUTPUTS), 2, 0.17, substeps=substeps)
+    expected = run(alone, commands())
     assert expected[-1, 6, 0] > 5, "the clock that is set"
-    assert found.tobytes() == expected.tobytes()
+    assert run(pool, commands()).tobytes() == expected.tobytes()
 
 
 def with_follower(fmus, **options):
@@ -100,14 +86,12 @@ def test_a_follower_adds_up_what_clocks_do(make, fmus, master):
 
 def test_a_restored_state_goes_on_with_the_same_ticks(make, fmus):
     pool = make(with_follower(fmus), ["c.strike"], [*named(OUTPUTS), "f.y2"], 2)
-    pool.reset((), np.zeros((0, 2)))
-    actions = commands()[:, :1, None].repeat(2, 2)
-    for action in actions[:13]:
-        pool.step(action)
+    actions = commands()[:, :1]
+    run(pool, actions[:13])
     snapshot = pool.save()
-    first = [pool.step(action)[0].copy() for action in actions[13:]]
+    first = [step(pool, *action) for action in actions[13:]]
     pool.restore(snapshot)
-    assert np.array_equal(first, [pool.step(action)[0].copy() for action in actions[13:]])
+    assert np.array_equal(first, [step(pool, *action) for action in actions[13:]])
 
 
 class Env(FMUEnv):

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import ssp_tools
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
@@ -160,16 +161,7 @@ class TestEnvironments:
         assert env.reset(seed=0, options=options)[0][1] > first[1] + 2
 
     def test_a_vector_environment_gives_what_single_ones_give(self, archive):
-        envs = FMUVectorEnv(lambda: TwoHouses(archive), 3)
-        single = [TwoHouses(archive) for _ in range(3)]
-        seen = envs.reset(seed=5)[0]
-        assert np.array_equal(seen, [env.reset(seed=5 + i)[0] for i, env in enumerate(single)])
-        for _ in range(5):
-            actions = np.stack([env.action_space.sample() for env in single])
-            seen = envs.step(actions)[0]
-            alone = [env.step(a)[0] for env, a in zip(single, actions, strict=True)]
-            assert np.array_equal(seen, alone)
-        envs.close()
+        require_same_alone(lambda: TwoHouses(archive), 5)
 
     def test_a_copy_of_an_environment_has_the_same_system(self):
         import pickle

@@ -1,15 +1,13 @@
 """Linear models of systems: the derivatives of components, joined by the chain rule."""
 
-import logging
 from contextlib import closing
 
 import numpy as np
 import pytest
+from pool_tools import open_pool, start
 from system_tools import linear_fmu
 
 from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 from fmugym.trial import pools
 
 MASS, LENGTH, GRAVITY, FRICTION = 0.5, 0.4, 9.81, 0.03
@@ -66,13 +64,8 @@ def houses():
 
 def rates(system, names, values):
     """What the derivatives are after an initialization with these start values."""
-    fmu = system.as_fmu()
-    spec = PoolSpec((), tuple(map(fmu.variable, names)), 1.0)
-    with closing(local_pool(fmu, spec, 1, logging.getLogger("fmugym.test"))) as pool:
-        starts = np.array([[value] for value in values.values()])
-        outputs, statuses = pool.reset(tuple(map(fmu.variable, values)), starts)
-        assert not statuses.any()
-        return outputs[:, 0].copy()
+    with closing(open_pool(system.as_fmu(), (), names)) as pool:
+        return start(pool, values).outputs[:, 0].copy()
 
 
 def test_it_is_the_difference_quotient_of_houses_in_a_loop():

@@ -1,6 +1,5 @@
 """Systems against one model of the same equations, and against FMPy's container."""
 
-import logging
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -11,12 +10,9 @@ import pytest
 import system_tools
 from fmpy.container_fmu import config
 from fmpy.container_fmu.cli import create_container_fmu
+from pool_tools import open_pool, start, step
 
 from fmugym import FMU, Component, Connection, FMUSystem, bundled_fmu
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
-
-LOG = logging.getLogger("fmugym.test")
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum")
 FRICTION = 4e-4  # N m s / rad, the default of the bundled pendulum
@@ -31,16 +27,9 @@ def fixture_linear(tmp_path_factory):
 
 def played(fmu, outputs, end, count, substeps=1, **parameters):
     """The outputs after 0, 1 ... count steps, shape (count + 1, k)."""
-    fmu = FMU.of(fmu)
-    spec = PoolSpec((), tuple(map(fmu.variable, outputs)), end / count, substeps=substeps)
-    with closing(local_pool(fmu, spec, 1, LOG)) as pool:
-        starts = np.array([list(parameters.values())], float).T
-        rows = [pool.reset(tuple(map(fmu.variable, parameters)), starts)[0][:, 0].copy()]
-        for _ in range(count):
-            outputs, statuses = pool.step(None)
-            assert not statuses.any(), pool.failure(0)
-            rows.append(outputs[:, 0].copy())
-    return np.array(rows)
+    with closing(open_pool(FMU.of(fmu), (), outputs, end / count, substeps=substeps)) as pool:
+        rows = [start(pool, parameters).outputs[:, 0].copy()]
+        return np.array(rows + [step(pool)[:, 0] for _ in range(count)])
 
 
 def matrices(**given):

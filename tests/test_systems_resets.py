@@ -6,26 +6,25 @@ The FMUs are those of ``zoo/quirks.c``; what is right is an episode of a fresh s
 import itertools
 import logging
 import os
+from contextlib import closing
 
 import numpy as np
 import pytest
 import quirk_table
 import ssp_tools
 from exchange_tools import exchange_fmu
+from pool_tools import open_pool, start, step
 
 from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.tools import cli
-from fmugym.trial import opening
 from fmugym.trial.candidate import Candidate
 from fmugym.trial.rungs import find_rungs
 from fmugym.trial.trial import examine
 from fmugym.trial.verdict import Grade
 
-LOG = logging.getLogger("fmugym.test")
 RESTORE, RESET, INSTANCE, LIBRARY, PROCESS = ResetMethod
 MIXES = list(itertools.product((RESTORE, RESET, INSTANCE), repeat=3))
 NAMES = ("a", "b", "c")
@@ -58,48 +57,31 @@ def chain(fmu_of, *tokens, version=2):
     )
 
 
-def spec_of(fmu, **options):
-    names = [name for name in fmu.description.variables if name.endswith((".y", ".clock"))]
-    outputs = tuple(map(fmu.variable, names))
-    return PoolSpec((fmu.variable("a.u"),), outputs, 0.1, **options)
+def outputs_of(fmu):
+    return [name for name in fmu.description.variables if name.endswith((".y", ".clock"))]
 
 
-def play(pool, fmu, gain, length):
-    """The outputs of all instances, shape (steps + 1, outputs, instances)."""
-    start = (fmu.variable("b.gain"),)
-    outputs, statuses = pool.reset(start, np.full((1, pool.num_instances), gain))
-    rows = [outputs.copy()]
-    assert not statuses.any(), pool.failure(0)
-    for step in range(length):
-        inputs = np.sin(0.9 * step + np.arange(pool.num_instances))[None]
-        outputs, statuses = pool.step(inputs)
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs.copy())
-    return np.array(rows)
-
-
-def open_pool(system, count, methods=(), **options):
+def open_chain(system, count, *options, **spec):
     fmu = system.as_fmu()
-    spec = spec_of(fmu, component_resets=tuple(methods))
-    if spec.reloads:
-        options["private_libraries"] = True
-    return fmu, local_pool(fmu, spec, count, LOG, **options)
+    return open_pool(fmu, ["a.u"], outputs_of(fmu), 0.1, count, *options, **spec)
+
+
+def play(pool, gain, length):
+    """The outputs of all instances, shape (steps + 1, outputs, instances)."""
+    instances = np.arange(pool.num_instances)
+    first = start(pool, {"b.gain": gain}).outputs.copy()
+    return np.array([first, *(step(pool, np.sin(0.9 * i + instances)) for i in range(length))])
 
 
 def fresh_episode(system, gain, length, count=2):
-    fmu, pool = open_pool(system, count, private_libraries=True)
-    try:
-        return play(pool, fmu, gain, length)
-    finally:
-        pool.close()
+    with closing(open_chain(system, count, private=True)) as pool:
+        return play(pool, gain, length)
 
 
 def episodes(system, methods, count=2, lengths=LENGTHS):
-    fmu, pool = open_pool(system, count, methods)
-    try:
-        return [play(pool, fmu, *one) for one in zip(GAINS, lengths, strict=False)]
-    finally:
-        pool.close()
+    options = {"component_resets": tuple(methods), "private": LIBRARY in methods}
+    with closing(open_chain(system, count, **options)) as pool:
+        return [play(pool, *one) for one in zip(GAINS, lengths, strict=False)]
 
 
 def is_right(system, methods):
@@ -169,33 +151,26 @@ class TestMethods:
         assert fitted.component_resets == (RESET, INSTANCE)
         assert fitted.reset_method is INSTANCE
         assert fitted.whole_reset_method is RESET
-        spec = PoolSpec((fmu.variable("a.u"),), (fmu.variable("b.h"),), 0.1)
-        pool = local_pool(fmu, spec, 2, LOG)
-        try:
-            rows = []
+        rows = []
+        with closing(open_pool(fmu, ["a.u"], ["b.h"], 0.1, 2)) as pool:
             for _ in range(3):
-                first = pool.reset((), np.zeros((0, 2)))[0].copy()
-                rows.append([first, *(pool.step(np.ones((1, 2)))[0].copy() for _ in range(9))])
-        finally:
-            pool.close()
+                first = start(pool).outputs.copy()
+                rows.append([first, *(step(pool, 1.0) for _ in range(9))])
         assert np.array_equal(rows[0], rows[1])
         assert np.array_equal(rows[0], rows[2])
 
     def test_snapshots_end_with_the_instance(self, fmu_of):
         """A state of a component that was made anew belongs to nobody."""
         system = chain(fmu_of, "well behaved", "well behaved")
-        fmu, pool = open_pool(system, 2, (RESTORE, INSTANCE))
-        try:
-            play(pool, fmu, 1.5, 5)
+        with closing(open_chain(system, 2, component_resets=(RESTORE, INSTANCE))) as pool:
+            play(pool, 1.5, 5)
             snapshot = pool.save()
-            before = pool.step(np.zeros((1, 2)))[0].copy()
+            before = step(pool, 0.0)
             pool.restore(snapshot)
-            assert pool.step(np.zeros((1, 2)))[0].tobytes() == before.tobytes()
-            play(pool, fmu, 1.5, 5)
+            assert step(pool, 0.0).tobytes() == before.tobytes()
+            play(pool, 1.5, 5)
             with pytest.raises(Exception, match="another instance"):
                 pool.restore(snapshot)
-        finally:
-            pool.close()
 
 
 class TestChoice:
@@ -245,7 +220,8 @@ class TestChoice:
 
 def verdict_of(system):
     fmu = system.as_fmu()
-    return examine(Candidate.of(fmu), spec_of(fmu), several=False)
+    spec = PoolSpec((fmu.variable("a.u"),), tuple(map(fmu.variable, outputs_of(fmu))), 0.1)
+    return examine(Candidate.of(fmu), spec, several=False)
 
 
 class TestTrial:
@@ -286,12 +262,8 @@ class TestTrial:
     def test_pools_do_what_it_says(self, fmu_of, token, options, caplog):
         caplog.set_level(logging.INFO)
         system = chain(fmu_of, "well behaved", token)
-        fmu = system.as_fmu()
-        pool = opening.make_pool(fmu, spec_of(fmu), 3, LOG, **options)
-        try:
-            found = [play(pool, fmu, *one) for one in zip(GAINS, LENGTHS, strict=True)]
-        finally:
-            pool.close()
+        with closing(open_chain(system, 3, options)) as pool:
+            found = [play(pool, *one) for one in zip(GAINS, LENGTHS, strict=True)]
         for rows, gain, length in zip(found, GAINS, LENGTHS, strict=True):
             right = fresh_episode(system, gain, length, 3)
             assert rows.tobytes() == right.tobytes()

@@ -17,6 +17,7 @@ from values_tools import (
     versions,
     ways,
 )
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
@@ -160,23 +161,8 @@ def test_bounds_and_samplings_of_arrays(feedthrough):
 
 @pools
 def test_vector_environments_do_as_single_ones(state_space, options):
-    def make():
-        return state_space_env(
-            state_space, model_parameters={"A": [[Uniform(-2, -1), 0.5], [0, -2]]}, **options
-        )
-
-    envs, env = FMUVectorEnv(make, 3), make()
-    seen = envs.reset(seed=5)[0]
-    for index in range(3):
-        assert seen[index].tolist() == env.reset(seed=5 + index)[0].tolist()
-        for _ in range(3):
-            env.step(np.array([0.25], np.float32))
-        envs.reset(seed=5)
-        for _ in range(3):
-            rows = envs.step(np.full((3, 1), 0.25, np.float32))[0]
-        assert rows[index].tolist() == np.float32(env.state).tolist()
-    env.close()
-    envs.close()
+    drawn = {"A": [[Uniform(-2, -1), 0.5], [0, -2]]}
+    require_same_alone(lambda: state_space_env(state_space, model_parameters=drawn, **options), 3)
 
 
 def test_each_environment_has_its_own_array(state_space):

@@ -22,6 +22,7 @@ SLOW_MODULES = {
     "test_examples_half_batches",
     "test_examples_house",
     "test_examples_planners",
+    "test_examples_references",
     "test_examples_system",
     "test_export",
     "test_export_fmu",
@@ -239,7 +240,6 @@ EXHAUSTIVE_TESTS = (
     "test_examples_system.py",
     "test_systems_faces.py::TestCommandLine::test_validation",
     "test_systems_ssp.py::TestDamaged",
-    "test_compile.py::TestCompile::test_ziglang",
     "test_benchmarks.py::test_tables_of_the_documentation_have_the_rows_that_stand_there[readme]",
     "test_model_exchange.py::TestEvents::test_time_does_not",
 )

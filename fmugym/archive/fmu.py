@@ -1,7 +1,7 @@
 """An FMU file: it is opened once, checked, extracted to its own folder and cleaned up.
 
-Reading the description never executes the FMU. Loading it (``fmugym.fmi``, ``fmugym.pool``) does:
-an FMU is native code that runs with all the rights of the process.
+Reading the description never executes the FMU. Loading it (``fmugym.pool``) does: an FMU is native
+code that runs with all the rights of the process.
 """
 
 from __future__ import annotations

@@ -11,26 +11,24 @@ from fmugym.errors import ConfigError
 
 __all__ = ["find_compiler"]
 
-_PROGRAMS: Final = {"C": ("cc", "gcc", "clang"), "C++": ("c++", "g++", "clang++")}
-_ZIG: Final = {"C": "cc", "C++": "c++"}
+_PROGRAMS: Final = ("cc", "gcc", "clang")
 
 
-def find_compiler(what: str, language: str = "C") -> list[str]:
-    """The command of a compiler.
+def find_compiler(what: str) -> list[str]:
+    """The command of a compiler for C.
 
     Args:
         what: What is to be built, for the error.
-        language: C or C++.
 
     Raises:
         ConfigError: If there is none; the text says how to get one.
     """
-    found = next(filter(None, map(shutil.which, _PROGRAMS[language])), None)
+    found = next(filter(None, map(shutil.which, _PROGRAMS)), None)
     if found is not None:
         return [found]
     if importlib.util.find_spec("ziglang") is None:
         raise ConfigError(
-            f"{what} needs a {language} compiler: install gcc (Debian: apt install gcc g++), or "
-            "ziglang (pip install ziglang)"
+            f"{what} needs a C compiler: install gcc (Debian: apt install gcc), or ziglang "
+            "(pip install ziglang)"
         )
-    return [sys.executable, "-m", "ziglang", _ZIG[language]]
+    return [sys.executable, "-m", "ziglang", "cc"]

@@ -69,8 +69,9 @@ static void refuse_shape(const char *name, const Py_buffer *buffer, int dimensio
     PyErr_Format(PyExc_ValueError, "%s must have the shape %s, not %s", name, expected, actual);
 }
 
-bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
-                 int dimensions, const Py_ssize_t *shape) {
+/* The shape holds as many lengths as dimensions says. */
+static bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
+                        int dimensions, const Py_ssize_t *shape) {
     static const int flags[] = {[COPIED] = PyBUF_STRIDES,
                                 [IN_PLACE] = PyBUF_C_CONTIGUOUS,
                                 [WRITTEN] = PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE};

@@ -25,11 +25,8 @@ typedef enum {
 
 enum { ANY_LENGTH = -1 }; /* stands for any length */
 
-/* Takes an array. The shape holds as many lengths as dimensions says. If the array does not fit,
- * returns false with an exception whose text begins with the name. */
-bool take_buffer(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
-                 int dimensions, const Py_ssize_t *shape);
-
+/* Take an array of one or two dimensions. If it does not fit, they return false with an exception
+ * whose text begins with the name. */
 bool take_vector(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,
                  Py_ssize_t length);
 bool take_matrix(PyObject *object, Py_buffer *buffer, Use use, const char *name, Item item,

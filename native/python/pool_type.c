@@ -25,7 +25,7 @@ static bool close_pool(PyPool *self) {
     return reported;
 }
 
-PyObject *py_close(PyObject *object, PyObject *unused) {
+static PyObject *py_close(PyObject *object, PyObject *unused) {
     (void)unused;
     if (!close_pool((PyPool *)object)) {
         return NULL;

@@ -93,8 +93,6 @@ bool report_messages(PyPool *self);
 
 /* The methods of a pool */
 
-PyObject *py_close(PyObject *object, PyObject *unused);
-
 PyObject *py_step_own(PyObject *object, PyObject *unused);
 PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);

@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import logging
-import math
-import os
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, Final, ParamSpec, TypeVar
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
 
 from fmpy.fmi1 import FMICallException, FMU1Slave
 from fmpy.fmi2 import FMU2Slave, fmi2Terminated
@@ -24,13 +22,11 @@ from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callback
 from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.backend.rig import FaultError
 from fmugym.pool.patience import licence_errors
-from fmugym.pool.spec import START_TIME, PoolSpec, ResetMethod
+from fmugym.pool.private_libraries import copy_libraries
+from fmugym.pool.spec import START_TIME, PoolSpec
 from fmugym.signals import ordinary
 
 __all__ = ["FMPyInstance", "fmpy_pool"]
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 _SLAVES: Final = {1: FMU1Slave, 2: FMU2Slave, 3: FMU3Slave}
 _MISDECLARED: Final = ("fmi1InitializeSlave", "fmi1DoStep")
@@ -50,27 +46,23 @@ class FMPyInstance:
     Each episode has a new instance, for which the library is loaded anew.
 
     Args:
-        fmu: The FMU. No other instance should use its folder, as both would share one library.
+        fmu: The FMU.
         spec: What to do at each reset and step.
         log: Gets the FMU's messages.
+        library: The FMU's library, or a copy of it. No other instance should load the same file.
+
+    Raises:
+        FMULoadError: If the FMU cannot be loaded or instantiated.
     """
 
-    def __init__(self, fmu: FMU, spec: PoolSpec, log: logging.Logger) -> None:
-        self._fmu, self._spec, self._log = fmu, spec, log
+    def __init__(self, fmu: FMU, spec: PoolSpec, log: logging.Logger, library: Path) -> None:
+        self._fmu, self._spec, self._library = fmu, spec, library
         self._version = fmu.description.fmi_major_version
-        self._inputs = {variable.name: variable for variable in spec.inputs}
         self._messages = Messages(fmu.description.model_identifier, log)
         self._slave: Any = None
         self._status: int = Status.OK
-        self._is_initialized = self._is_blind = False
+        self._is_initialized = False
         self._start_time, self._count = spec.start_time, 0
-
-    def check(self) -> None:
-        """Make an instance and free it.
-
-        Raises:
-            FMULoadError: If the FMU cannot be loaded or instantiated.
-        """
         self._instantiate()
         self.stop()
 
@@ -81,19 +73,15 @@ class FMPyInstance:
         starts = dict(start_values)
         self._start_time, self._count = starts.pop(START_TIME.name, self._spec.start_time), 0
         self._instantiate()
-        variables = {name: self._fmu.variable(name) for name in starts}
-        self._initialize(variables, starts)
+        self._initialize(starts)
         self._is_initialized = True
-        return self._outputs_at_start()
+        return list(self._spec.start_outputs) if self._spec.blind_start else self._outputs()
 
     def step(self, inputs: Mapping[str, float]) -> tuple[list[Any], int]:
         """See ``Backend.step``."""
         if self._slave is None:
             raise SimulationError("the instance needs a reset before it can be stepped")
-        bad = [f"{name} = {value}" for name, value in inputs.items() if not math.isfinite(value)]
-        if bad:
-            raise FaultError(f"the inputs are not finite: {', '.join(bad)}", Status.NOT_FINITE)
-        self._set("setting the inputs", self._inputs, inputs)
+        self._set("setting the inputs", inputs)
         for _ in range(self._spec.substeps):
             if self._advance():
                 outputs = self._outputs()
@@ -115,9 +103,7 @@ class FMPyInstance:
             slave.freeInstance()  # and its library
         self._messages.pass_on()
 
-    def _call(
-        self, doing: str, function: Callable[P, R], *arguments: P.args, **named: P.kwargs
-    ) -> R:
+    def _call(self, doing: str, function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
         """Call FMPy; a bad status becomes a failure with the reason."""
         try:
             return function(*arguments, **named)
@@ -140,11 +126,7 @@ class FMPyInstance:
             elif self._version == 2:
                 slave.instantiate(callbacks=fmi2_callbacks, loggingOn=wants_all)
             else:
-                slave.instantiate(
-                    loggingOn=wants_all,
-                    logMessage=self._messages.note,
-                    intermediateUpdate=_decline_early_return,
-                )
+                slave.instantiate(loggingOn=wants_all, logMessage=self._messages.note)
         except ordinary(Exception):
             slave.component = None
         if not slave.component:
@@ -155,51 +137,34 @@ class FMPyInstance:
 
     def _load(self) -> Any:
         fmu, description = self._fmu, self._fmu.description
-        fmu.prepare_library()
-        with _loading:
-            working_directory = os.getcwd()
-            try:
+        try:
+            with _loading, contextlib.chdir("."):  # FMPy goes elsewhere meanwhile
                 slave = _SLAVES[self._version](
                     guid=description.instantiation_token,
                     modelIdentifier=description.model_identifier,
                     unzipDirectory=str(fmu.extract()),
                     instanceName=self._messages.name,
+                    libraryPath=str(self._library),
                 )
-            except ordinary(Exception) as error:
-                raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
-            finally:
-                os.chdir(working_directory)  # FMPy leaves it changed after a failed load
+        except ordinary(Exception) as error:
+            raise FMULoadError(f"{fmu.path.name} cannot be loaded: {error}") from None
         if self._version == 1:
             for name in _MISDECLARED:
                 slave._functions[name].restype = ctypes.c_int
         return slave
 
-    def _initialize(self, variables: Mapping[str, Variable], values: Mapping[str, Any]) -> None:
+    def _initialize(self, values: Mapping[str, Any]) -> None:
         slave, start_time, stop_time = self._slave, self._start_time, self._spec.stop_time
         times = {"startTime": start_time, "stopTime": stop_time, "tolerance": self._spec.tolerance}
         if self._version == 2:
             self._call("setting up the experiment", slave.setupExperiment, **times)
             times = {}
-        self._set("setting the start values", variables, values)
+        self._set("setting the start values", values)
         if self._version == 1:
             self._call("initialization", slave.initialize, start_time, stop_time)
             return
         self._call("entering initialization", slave.enterInitializationMode, **times)
         self._call("initialization", slave.exitInitializationMode)
-
-    def _outputs_at_start(self) -> list[Any]:
-        """The outputs; start values if the FMU cannot be read before its first step."""
-        try:
-            return self._outputs()
-        except FaultError as failure:
-            if failure.status != Status.ERROR:
-                raise
-            if not self._is_blind:
-                self._log.warning("%s; until the first step it has start values", failure)
-            self._is_blind, self._status = True, Status.OK
-            return [
-                v.start or "" if v.kind == "string" else v.start_number for v in self._spec.outputs
-            ]
 
     # A step.
 
@@ -213,8 +178,10 @@ class FMPyInstance:
         try:
             result = self._call(doing, self._slave.doStep, time, step_size)
         except FaultError as failure:
-            if self._version == 2 and failure.status == Status.DISCARD and self._asks_to_stop():
-                return True
+            if self._version == 2 and failure.status == Status.DISCARD:
+                why, ask = "asking why the step was discarded", self._slave.getBooleanStatus
+                if self._call(why, ask, fmi2Terminated):
+                    return True
             raise
         if self._version < 3:
             return False
@@ -223,40 +190,26 @@ class FMPyInstance:
             raise FaultError(f"{doing} ended early, at t = {reached:g} s", Status.DISCARD)
         return bool(asks_to_stop)
 
-    def _asks_to_stop(self) -> bool:
-        asking = self._slave.getBooleanStatus
-        return bool(self._call("asking why the step was discarded", asking, fmi2Terminated))
-
     # Values.
 
     def _outputs(self) -> list[Any]:
-        return [self._get(variable) for variable in self._spec.outputs]
+        return [
+            self._call("reading the outputs", self._method("get", v), [v.value_reference])[0]
+            for v in self._spec.outputs
+        ]
 
-    def _get(self, variable: Variable) -> Any:
-        getter = getattr(self._slave, f"get{self._type(variable)}")
-        value = self._call("reading the outputs", getter, [variable.value_reference])[0]
-        return value.decode(errors="replace") if isinstance(value, bytes) else value
-
-    def _set(
-        self, doing: str, variables: Mapping[str, Variable], values: Mapping[str, Any]
-    ) -> None:
+    def _set(self, doing: str, values: Mapping[str, Any]) -> None:
         for name, value in values.items():
-            variable = variables[name]
+            variable = self._fmu.variable(name)
             own = _CONVERSIONS.get(variable.kind, round)(value)
-            setter = getattr(self._slave, f"set{self._type(variable)}")
-            self._call(doing, setter, [variable.value_reference], [own])
+            self._call(doing, self._method("set", variable), [variable.value_reference], [own])
 
-    def _type(self, variable: Variable) -> str:
-        """The type in the names of FMPy's methods."""
-        if variable.kind != "enumeration":
-            return variable.type
-        return "Int64" if self._version == 3 else "Integer"
-
-
-def _decline_early_return(*arguments: Any) -> None:
-    """Ask for no early return in an intermediate update, which the FMU may allow unasked."""
-    if arguments[6]:
-        arguments[6][0] = False
+    def _method(self, verb: str, variable: Variable) -> Callable[..., Any]:
+        """FMPy's method that gets or sets variables of a type."""
+        of_enumerations = "Int64" if self._version == 3 else "Integer"
+        kind = of_enumerations if variable.kind == "enumeration" else variable.type
+        method: Callable[..., Any] = getattr(self._slave, f"{verb}{kind}")
+        return method
 
 
 @licence_errors()
@@ -271,7 +224,7 @@ def fmpy_pool(
 ) -> BackendPool:
     """Make a pool of instances that FMPy steps, one after another, in this process.
 
-    Several instances have a copy of the FMU's files each, and so share no library.
+    Each of them has a copy of the FMU's library.
 
     Args:
         fmu: The FMU; closed with the pool.
@@ -285,19 +238,22 @@ def fmpy_pool(
         ConfigError: If the FMU or the user needs what FMPy's classes are not used for here.
         FMULoadError: If the FMU cannot be loaded or instantiated.
     """
-    asked_for = {
-        "reset_method": reset_method is not None,
-        "isolation='process'": isolation == "process",
-    }
-    refused = [name for name, wish in (_needs(fmu, spec) | asked_for).items() if wish]
+    needs = _needs(fmu, spec) | {"reset_method": reset_method is not None}
+    needs |= {"isolation='process'": isolation == "process"}
+    refused = [name for name, is_needed in needs.items() if is_needed]
     if refused:
         fmu.close()
         raise ConfigError(
             "FMPy steps FMUs for co-simulation with scalar variables here. "
             f"{fmu.path.name} needs the C extension (backend='native') for: {', '.join(refused)}"
         )
-    instances = _Instances(fmu, replace(spec, reset_method=ResetMethod.INSTANCE), log)
-    return BackendPool(fmu, instances.spec, num_instances, instances, is_real=False)
+
+    def instances(count: int) -> list[FMPyInstance]:
+        fmu.prepare_library()
+        libraries = copy_libraries(fmu, fmu.extract(), count)
+        return [FMPyInstance(fmu, spec, log, library) for library in libraries]
+
+    return BackendPool(fmu, spec, num_instances, instances, is_real=False)
 
 
 def _needs(fmu: FMU, spec: PoolSpec) -> dict[str, bool]:
@@ -308,25 +264,8 @@ def _needs(fmu: FMU, spec: PoolSpec) -> dict[str, bool]:
         "model exchange": about.interface != "co_simulation",
         "clocks and event mode": about.uses_event_mode,
         "libraries for Windows": fmu.in_wine,
+        "Strings": any(variable.kind == "string" for variable in variables),
         "arrays": bool(about.structure) or any(not v.is_scalar for v in variables),
         "samplings": bool(spec.samplings),
         "fault_retries": bool(spec.fault_retries),
     }
-
-
-class _Instances:
-    """Makes the instances of a pool, and removes what they share at its end."""
-
-    def __init__(self, fmu: FMU, spec: PoolSpec, log: logging.Logger) -> None:
-        self.spec, self._log = spec, log
-        self._fmus = [fmu]
-
-    def __call__(self, count: int) -> Sequence[FMPyInstance]:
-        FMPyInstance(self._fmus[0], self.spec, self._log).check()
-        self._fmus += [self._fmus[0].again() for _ in range(1, count)]
-        return [FMPyInstance(fmu, self.spec, self._log) for fmu in self._fmus]
-
-    def close(self) -> None:
-        """Remove the copies of the FMU's files."""
-        for fmu in self._fmus:
-            fmu.close()

@@ -1,0 +1,65 @@
+"""Pools: opened by the names of variables, reset with values by name, and stepped."""
+
+import logging
+
+import numpy as np
+
+from fmugym.pool import PoolSpec
+from fmugym.pool.local import local_pool
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+KINDS = {
+    "native": {"backend": "native"},
+    "process": {"isolation": "process", "workers": 1},
+}
+"""The arguments by which ``make_pool`` makes each kind."""
+
+
+def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, private=False, **spec):
+    """Open a pool, in this process or with options of ``make_pool``.
+
+    Args:
+        fmu: The FMU; ``pool.variable`` looks up its variables.
+        inputs, outputs: Names.
+        time_step: In s.
+        n: How many instances.
+        options: Of ``make_pool``; None for a pool in this process.
+        private: Whether each instance of a pool in this process has a library of its own.
+        spec: Others of a ``PoolSpec``.
+    """
+    given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
+    spec = PoolSpec(given, read, time_step, **spec)
+    if options is None:
+        pool = local_pool(fmu, spec, n, LOG, private_libraries=private)
+    else:
+        pool = opening.make_pool(fmu, spec, n, LOG, **options)
+    pool.variable = fmu.variable
+    return pool
+
+
+def reset(pool, values=None, mask=None):
+    """Reset with start values by name, a number for all instances or one for each."""
+    values = values or {}
+    rows = [np.broadcast_to(value, pool.num_instances) for value in values.values()]
+    array = np.array(rows, float).reshape(len(rows), pool.num_instances)
+    return pool.reset(tuple(map(pool.variable, values)), array, mask)
+
+
+def start(pool, values=None):
+    """Reset all instances, of which none may fail; returns the pool."""
+    reset(pool, values)
+    assert not pool.statuses.any(), pool.failure(int(pool.statuses.argmax()))
+    return pool
+
+
+def step(pool, *inputs):
+    """Step all instances, of which none may fail, with a number or a row of each input.
+
+    Returns:
+        A copy of the outputs, shape (k, N).
+    """
+    rows = [np.broadcast_to(value, pool.num_instances) for value in inputs]
+    outputs, statuses = pool.step(np.array(rows, float) if rows else None)
+    assert not statuses.any(), pool.failure(int(statuses.argmax()))
+    return outputs.copy()
