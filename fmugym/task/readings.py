@@ -62,13 +62,14 @@ class NoReadings:
     """Stands for what hooks read as long as the constructor of ``FMUEnv`` has not made it."""
 
     def __getattr__(self, name: str) -> Any:
-        raise ConfigError(
-            f"{name!r} is what hooks read, which there is after super().__init__(...) only; give "
-            "an attribute of your own another name"
-        )
+        raise AttributeError(_too_early(name), name=name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        self.__getattr__(name)
+        raise ConfigError(f"{_too_early(name)}; give an attribute of your own another name")
+
+
+def _too_early(name: str) -> str:
+    return f"{name!r} is what hooks read, which there is after super().__init__(...) only"
 
 
 READINGS: Final = tuple(field.name for field in fields(Readings) if field.name != "values")
