@@ -150,8 +150,8 @@ static bool provide_last(Results *r, ResultArrays *a) {
     return true;
 }
 
-bool results_provide_starts(Results *r, ResultArrays *a) {
-    return provide_last(r, a) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
+bool results_provide_starts(Results *r, bool at_ends, ResultArrays *a) {
+    return (!at_ends || provide_last(r, a)) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
 }
 
 bool results_provide_reset(Results *r, ResultArrays *a) {
@@ -225,20 +225,22 @@ static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
            set_named(infos, "_final_info", infos_mask(&origin));
 }
 
-static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {
+static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started,
+                               bool at_ends) {
     const Origin origin = origin_of(r, a);
     PyObject *infos = infos_within(&origin, &r->infos);
 
-    if (infos != NULL && any_started && (!add_starts(r, infos, a) || !add_ends(r, infos, a))) {
+    if (infos != NULL && any_started &&
+        (!add_starts(r, infos, a) || (at_ends && !add_ends(r, infos, a)))) {
         Py_CLEAR(infos);
     }
     return infos;
 }
 
 /* Makes the tuple without the constructor of its class, which takes several times as long. */
-PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
+PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started, bool at_ends) {
     PyObject *observations = form_of(&r->observations, a->arrays);
-    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started);
+    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started, at_ends);
     PyObject *result = infos == NULL ? NULL : r->allocate(r->class, 5);
 
     if (result == NULL) {

@@ -59,6 +59,8 @@ class PerEnvEngine(Engine):
         action_space: The space of the actions of all environments.
     """
 
+    way = "per_env"
+
     def __init__(
         self,
         envs: Sequence[FMUEnv],
