@@ -109,16 +109,19 @@ class Contents:
         kept = self._kept[: self._first_outside]
         return {one.attribute for one in kept if _has_changed(one)}
 
-    def changed_outside(self) -> str | None:
+    def changed_outside(self, *, by_adding: bool = False) -> str | None:
         """The name of a global variable that was set, or whose value has changed in place.
 
-        What was only added to a list or a dict does not count: it may be a record or a cache.
+        Args:
+            by_adding: Whether it counts, too, if something was only added to a list or a dict. That
+                may be a record or a cache.
         """
         for place, name, value in self._outside:
             if differs(value, place[name]):
                 return name or type(value).__name__
         kept = self._kept[self._first_outside :]
-        return next((k.attribute for k in kept if _has_changed(k) and not _was_added_to(k)), None)
+        changed = filter(_has_changed, kept)
+        return next((k.attribute for k in changed if by_adding or not _was_added_to(k)), None)
 
     def restore(self) -> None:
         """Undo all changes."""
@@ -194,7 +197,8 @@ def _has_changed(kept: _Kept) -> bool:
 
 
 def _restore_dict(target: dict[str, Any], contents: Mapping[str, Any]) -> None:
-    dict.clear(target)
+    if list(target) != list(contents):  # an interrupt must not find the attributes gone
+        dict.clear(target)
     dict.update(target, contents)
 
 

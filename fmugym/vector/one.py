@@ -24,11 +24,11 @@ from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import NUMBERS, ORDER, conclude_left
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.memory import Memory
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
+from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.purity import names_in_hooks, unchanged_globals
+from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.streams import no_draws
 from fmugym.vector.views import batched, column
@@ -378,17 +378,20 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     """Compile the hooks, and compare the programs with them on states around the present one."""
     if _is_debugged():
         raise UntraceableError("a debugger is attached")
+    require_pure(env)
     near, far = (sample_states(env, (1.0,), states_around(env, r)) for r in _REACHES)
-    with unchanged_globals(env), borrowed(env):
+    with borrowed(env, outside=True) as contents:
         _call_hooks(env, column(near, 0))
-    with unchanged_globals(env):
-        with _repeated(env, numbers, len(near.step_count)):
-            task = compile_hooks(env, [near, far], numbers)
-        if "_get_inputs" in task.left:  # it would have to read before the FMU steps
-            raise UntraceableError("; ".join(task.left.values()))
-        difference = find_difference(env, near, task.left)
-        if difference is not None:
-            raise UntraceableError(difference)
+        changed = contents.changed_outside(by_adding=True)
+    if changed is not None:
+        raise UntraceableError(f"it changes {changed} outside of self")
+    with _repeated(env, numbers, len(near.step_count)):
+        task = compile_hooks(env, [near, far], numbers)
+    if "_get_inputs" in task.left:  # it would have to read before the FMU steps
+        raise UntraceableError("; ".join(task.left.values()))
+    difference = find_difference(env, near, task.left)
+    if difference is not None:
+        raise UntraceableError(difference)
     return task
 
 
