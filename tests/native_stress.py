@@ -32,7 +32,7 @@ from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
-from fmugym.task.values import LateDict
+from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
 THREADS = 6
@@ -102,7 +102,7 @@ DRAWS = draws(0)
 
 def tell(drawn, mask):
     """What a reset tells of the episodes that it starts."""
-    return {"drawn": LateDict.of(lambda: {"drawn": drawn * mask}), "_drawn": mask}
+    return {"drawn": drawn * mask}
 
 
 class ReceiverError(Exception):
@@ -193,7 +193,7 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (tuple, 0, (), self.results(), tell),
+                "results": (tuple, 0, (), self.results(), (LateDict, UNFILLED, tell)),
             },
         )
 

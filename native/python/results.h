@@ -26,8 +26,9 @@ typedef struct {
 
 /* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
  * the shape and type of each array: those of observations and infos, then rewards, terminated,
- * truncated, mask and drawn values; and a function of drawn values and a mask that returns what infos
- * tell of the episodes that start. Returns NULL with an exception if it does not fit. */
+ * truncated, mask and drawn values; and, for what infos tell of the episodes that start, the class
+ * LateDict, the key of what fills it, and a function of drawn values and a mask that does so. Returns
+ * NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 

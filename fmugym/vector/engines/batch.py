@@ -39,14 +39,14 @@ from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.memory import Memory
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import results
+from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
+from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams, no_draws
-from fmugym.vector.views import batched, column, parts, some, take
+from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
 
@@ -121,7 +121,7 @@ class BatchEngine(Engine):
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         drawn_array = (len(drawn), self._n), real
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
-        tell = partial(drawn_info, plan)
+        tell = late_info(plan)
         self._play = self._pool.prepare_play(
             plan.model_variables,
             memory.programs(task),
@@ -399,7 +399,7 @@ class BatchEngine(Engine):
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
         self._reset_pool(mask, indices, plan, values)
-        written = warm_ups.run(self._pool, parts(Readings.of(self.env), indices), indices)
+        written = warm_ups.run(self._pool, some(Readings.of(self.env), indices), indices)
         self._place(written, written.values(), indices)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
@@ -531,15 +531,19 @@ class BatchEngine(Engine):
         """See ``Engine.step``."""
         if self._left or (resetting is not None and not self._pool_starts):
             actions = self._checked_before(actions, resetting)
+        at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
+        step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
         self.has_moved = True  # unless the call refuses its arguments
+        played: Played
         try:
-            if resetting is None:
-                result, troubled, self.any_ended, started = self._advance(actions)
+            if step is None or (resetting is not None and not self._pool_starts):
+                played = self._step_pool(actions, resetting)
             else:
-                played = self._start_and_advance(actions, resetting)
-                result, troubled, self.any_ended, started = played
+                played = step(actions, at_ends)
         except _REFUSALS as error:
             return self.step(self._converted(actions, error), resetting)
+        result: StepResult
+        result, troubled, self.any_ended, started = played
         if troubled or self._left_after:
             return self._completed(result, troubled, started)
         return result
@@ -553,22 +557,13 @@ class BatchEngine(Engine):
         return checked
 
     @passes_refusals
-    def _advance(self, actions: Any) -> Played:
-        """Let the pool do its part of a step."""
-        play = self._play
-        at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
-        if play.step is not None and play.start_and_step is not None:
-            return play.start_and_step(actions, True) if at_ends else play.step(actions, False)
-        play.before(actions)
-        self._pool.step()
-        return play.after(actions)
-
-    @passes_refusals
-    def _start_and_advance(self, actions: Any, starting: MaskArray) -> Played:
-        """Start the episodes in the mask, and step the other environments."""
+    def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
+        """Start the episodes in the mask, and let the FMUs of the other environments step."""
         play, plan = self._play, self.env.inside.plan
-        if self._pool_starts and play.start_and_step is not None:
-            return play.start_and_step(actions, False)
+        if starting is None:
+            play.before(actions)
+            self._pool.step()
+            return play.after(actions)
         indices = starting.nonzero()[0]
         drawn = self._streams.draw(plan, indices)
         play.before(actions)

@@ -52,8 +52,7 @@ class Memory:
         self._n = len(ended)
         self.ended, self.parameters = ended, readings.parameters
         self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
-        shape, dtype = (self._n, *(env.action_space.shape or ())), env.action_space.dtype
-        self.actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
+        self.actions = _copied(readings.action), _copied(readings.previous_action)
         self.variables: dict[str, npt.NDArray[Any]] = {}
         self.before: dict[str, npt.NDArray[Any]] = {}
 
@@ -83,9 +82,9 @@ class Memory:
 
     def programs(self, task: TracedTask) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The programs, with the arrays that they load and store."""
-        return task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)
+        return task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)
 
-    def _find(self, row: Row) -> Any:
+    def find(self, row: Row) -> Any:
         """The array of a row that a program loads or stores."""
         kind, *rest = row
         index: Any = rest[-1]
@@ -163,3 +162,8 @@ class Memory:
             ),
             "results": results,
         }
+
+
+def _copied(actions: Any) -> npt.NDArray[Any]:
+    """A copy of actions with environments first, in the order of memory."""
+    return np.array(np.moveaxis(actions, -1, 0), order="C")
