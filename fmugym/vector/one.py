@@ -382,7 +382,8 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     near, far = (sample_states(env, (1.0,), states_around(env, r)) for r in _REACHES)
     with borrowed(env, outside=True) as contents:
         _call_hooks(env, column(near, 0))
-        changed = contents.changed_outside(by_adding=True)
+        changes = contents.changes()
+    changed = changes.outside or changes.added
     if changed is not None:
         raise UntraceableError(f"it changes {changed} outside of self")
     with _repeated(env, numbers, len(near.step_count)):

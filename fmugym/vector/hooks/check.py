@@ -274,10 +274,12 @@ class _Comparison(NamedTuple):
             result = _result_of(self.env, self.name)
             after = _read_only(Readings.of(self.env), self.name)
         changed = [name for name, row in before.items() if differs(row, after[name])]
-        attribute, outside = self.contents.changed(), self.contents.changed_outside()
-        self.contents.restore()
-        if outside is not None:
-            attribute = f"{_OUTSIDE}{outside}"
+        changes = self.contents.changes()
+        if any(changes):
+            self.contents.restore()
+        attribute = changes.inside
+        if changes.outside is not None:
+            attribute = f"{_OUTSIDE}{changes.outside}"
         return result, changed[0] if changed else attribute
 
 

@@ -459,11 +459,11 @@ def in_hook(env: FMUEnv, name: str) -> Iterator[None]:
 
 def require_unchanged(contents: Contents) -> None:
     """Raise an ``UntraceableError`` if a hook has changed an attribute in place."""
-    changed, outside = contents.changed(), contents.changed_outside()
-    if changed is not None:
-        raise UntraceableError(f"it changes self.{changed}")
-    if outside is not None:
-        raise UntraceableError(f"it changes {outside}, which all environments share")
+    changes = contents.changes()
+    if changes.inside is not None:
+        raise UntraceableError(f"it changes self.{changes.inside}")
+    if changes.outside is not None:
+        raise UntraceableError(f"it changes {changes.outside}, which all environments share")
 
 
 def _placed(env: FMUEnv, name: str, error: Exception) -> str:
