@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     )
     from fmugym.fmi.status import Status
     from fmugym.linearization import LinearModel, linearize
+    from fmugym.linearization.sensitivities import derivatives
+    from fmugym.linearization.trajectories import linearize_along
     from fmugym.pool import Backend, Paced
     from fmugym.recording import Recorder, Recording, replay
     from fmugym.systems import Component, Connection, FMUSystem
     from fmugym.task.snapshot import Snapshot
     from fmugym.tools.agents import load_agent
     from fmugym.vector import FMUVectorEnv
-    from fmugym.vector.sensitivities import derivatives
-    from fmugym.vector.trajectories import linearize_along
 
 __all__ = [
     "FMU",
@@ -106,9 +106,9 @@ _MODULES = {
     "task.snapshot": ["Snapshot"],
     "tools.agents": ["load_agent"],
     "linearization": ["LinearModel", "linearize"],
+    "linearization.sensitivities": ["derivatives"],
+    "linearization.trajectories": ["linearize_along"],
     "vector": ["FMUVectorEnv"],
-    "vector.sensitivities": ["derivatives"],
-    "vector.trajectories": ["linearize_along"],
 }
 _ROOMS = [
     *("archive", "baselines", "checks", "config", "declared", "distributions", "env", "envs"),

@@ -278,8 +278,8 @@ class Pool:
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
 
-    def play(self, actions: Array, drawn: Array | None, /) -> tuple[Any, int, bool, Array | None]:
-        """Do a step, with all that was taken over; see ``NativePool.prepare_play``.
+    def play(self, actions: Array, at_ends: bool, /) -> tuple[Any, int, bool, Array | None]:
+        """Do a step, with all that was taken over; see ``Play.step`` of ``fmugym.pool.base``.
 
         Raises:
             TypeError: If the actions have another type or shape than was prepared.
@@ -287,18 +287,18 @@ class Pool:
             IndexError: If a hook looks up an index outside of its table; the FMUs have stepped.
         """
 
-    def play_before(self, actions: Array, drawn: Array, /) -> None:
-        """Do what comes before the FMUs' part of ``play``, where they run in other processes.
+    def play_before(self, actions: Array, /) -> None:
+        """Do what comes before the FMUs' part of ``play``, where the caller steps them.
 
-        Such a pool was made without paths of libraries. It draws the start values of the instances
-        to be reset. The arguments and errors are those of ``play``.
+        The errors are those of ``play``. Where they run in other processes, the pool was made
+        without paths of libraries.
         """
 
-    def play_after(self, actions: Array, drawn: Array, /) -> tuple[Any, int, bool, None]:
+    def play_after(self, actions: Array, /) -> tuple[Any, int, bool, None]:
         """Do what comes after the FMUs' part of ``play``.
 
-        The outputs and statuses are those that the pool's arrays have. The arguments, results and
-        errors are those of ``play``.
+        The outputs and statuses are those that the pool's arrays have. The results and errors are
+        those of ``play``.
         """
 
     def prepare_one(self, *parts: Any) -> None:
@@ -307,11 +307,8 @@ class Pool:
     def step_one(self, action: Any, attributes: dict[str, Any], /) -> Any:
         """Do a step of a single environment; see ``NativePool.prepare_one``."""
 
-    def start(self, mask: Array, observations: Array, drawn: Array, /) -> tuple[int, bool]:
-        """Start the episodes in the mask; see ``NativePool.start_of_play``."""
-
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
-        """Do a whole reset with a mask; see ``NativePool.reset_of_play``."""
+        """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""
 
     def save(self) -> Snapshot | int:
         """Save the states of all; or tell which instance refuses."""
@@ -364,7 +361,6 @@ class Pool:
         rewards: Array,
         terminated: Array,
         truncated: Array,
-        drawn: Array,
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""

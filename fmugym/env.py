@@ -25,7 +25,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.patience import failed_reset
 from fmugym.systems import FMUSystem
-from fmugym.task.actions import blame, require_usable
+from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
 from fmugym.task.construction import Constructed, plan_of_reset, prepare_hooks
 from fmugym.task.episode import Episode, EpisodePlan
@@ -47,7 +47,6 @@ __all__ = [
     "FMUEnv",
 ]
 
-_INTEGERS: Final = frozenset({int, np.int64})
 _ARGUMENTS: Final = (
     *("fmu_path", "config", "log_level", "render_mode", "backend", "isolation", "hooks"),
 )
@@ -324,7 +323,7 @@ class FMUEnv(Constructed):
             self._check_before_step()
         self.inside.in_hooks = True
         try:
-            self._take_action(action)
+            take_action(self, action)
             try:
                 troubled = self.inside.step_pool()
                 self.inside.readings.step_count += 1
@@ -347,27 +346,6 @@ class FMUEnv(Constructed):
         if not self.after_end:
             gymnasium_logger.warn("step was called after the end of the episode; call reset first")
         self.after_end = True
-
-    def _take_action(self, action: Any) -> None:
-        elements = self.inside.elements
-        if elements is None or type(action) not in _INTEGERS or action not in elements:
-            require_usable(self, action)
-        self._take_usable(action)
-        self.inside.input_writer.write(self.inside.readings.inputs, self.inside.input_row)
-
-    def _take_usable(self, action: Any) -> None:
-        """Make the inputs for an action that was checked already."""
-        read = self.inside.readings
-        before = read.action, read.previous_action, read.previous_state, read.inputs
-        read.previous_action, read.previous_state, read.action = read.action, read.state, action
-        try:
-            read.inputs = self.inside.input_writer.checked(self._get_inputs(), action)
-        except BaseException as error:  # the FMU was not touched: a better action may follow
-            read.take_back(before)
-            blaming = blame(self, action, error)
-            if blaming is not None:
-                raise blaming from error
-            raise
 
     @property
     def time(self) -> float:

@@ -135,8 +135,6 @@ static double take(const Draws *draws, const Draw *draw, Stream *stream) {
 
 void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride) {
     for (size_t i = 0; i < draws->count; i++) {
-        if (draws->draws[i].kind != KIND_GIVEN) {
-            values[i * stride] = take(draws, &draws->draws[i], stream);
-        }
+        values[i * stride] = take(draws, &draws->draws[i], stream);
     }
 }

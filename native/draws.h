@@ -10,7 +10,6 @@
 
 /* Each kind is named with its numbers. */
 #define DISTRIBUTIONS(X)                                                                           \
-    X(GIVEN, "given", 0)             /* drawn by the caller before */                              \
     X(UNIFORM, "uniform", 2)         /* lower end, width */                                        \
     X(LOG_UNIFORM, "log_uniform", 2) /* the same of the logarithm */                               \
     X(NORMAL, "normal", 4)           /* mean, standard deviation, limits */                        \
@@ -58,7 +57,7 @@ bool draws_are_sound(const Draws *draws, size_t number_of_numbers);
 /* Whether all rows are below this number. */
 bool draws_fit(const Draws *draws, size_t rows);
 
-/* Draws the values of an episode, which lie stride values apart. Those that were given stay. */
+/* Draws the values of an episode, which lie stride values apart. */
 void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride);
 
 #endif

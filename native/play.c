@@ -222,7 +222,7 @@ WIDE static bool is_any(const uint8_t *flags, size_t count) {
     return any != 0;
 }
 
-static void start_episodes(const Turn *turn, size_t begin, size_t count) {
+void play_start_episodes(const Turn *turn, size_t begin, size_t count) {
     uint32_t starting[PROGRAM_WIDTH];
     size_t number = 0;
 
@@ -298,7 +298,6 @@ void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh
     Notes notes = {.outside = false};
 
     source.fresh = fresh;
-    start_episodes(turn, begin, count);
     copy_rows(play, begin, count);
     program_run(&play->judgement, &source, begin, count, &scratch->judgement, &notes);
     memcpy(verdict->not_finite, notes.not_finite, sizeof notes.not_finite);

@@ -92,8 +92,7 @@ typedef struct {
     char *const *last_seen;   /* the same for the arrays that the judgement stores */
     const size_t *seen_sizes; /* bytes of one environment in each of these arrays */
     uint8_t *started;         /* where they have started; NULL if they start in the next step */
-    double *drawn; /* a row for each draw; only the values drawn in this step are written. Values
-                    * that were given are read from it */
+    double *drawn; /* a row for each draw; only the values drawn in this step are written */
 } Turn;
 
 /* Whether an action is out of range or NaN. */
@@ -119,9 +118,10 @@ typedef struct {
 
 void play_open(const Turn *turn, PlayScratch *scratch);
 
-/* Both handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
- * are reset or stepped, the second afterwards. */
+/* All three handle a run of at most PROGRAM_WIDTH environments. The first runs before their instances
+ * are reset or stepped, the second afterwards where they were reset, the third at last. */
 void play_prepare(const Turn *turn, size_t begin, size_t count, PlayScratch *scratch);
+void play_start_episodes(const Turn *turn, size_t begin, size_t count);
 void play_judge(const Turn *turn, size_t begin, size_t count, const Fresh *fresh,
                 PlayScratch *scratch, Verdict *verdict);
 

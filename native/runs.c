@@ -467,6 +467,9 @@ size_t run_turn(Task *task, PlayedRun run, Scratch scratch) {
         play_prepare(turn, run.begin, run.count, run.registers);
         troubled = advance(task, run.begin, run.count, scratch, &fresh.fits_floats);
         replace_outputs(task, run.begin, run.count, scratch.outputs);
+        if (task->operation == PLAY) {
+            play_start_episodes(turn, run.begin, run.count);
+        }
     }
     play_judge(turn, run.begin, run.count, &fresh, run.registers, run.verdict);
     return troubled;
@@ -504,15 +507,14 @@ size_t run_play(Task *task, size_t begin, size_t end, Scratch scratch) {
 
 size_t run_before(Task *task, size_t begin, size_t end) {
     const Turn *turn = task->call->turn;
+    const Play *play = turn->play;
     PlayScratch registers;
 
     play_open(turn, &registers);
     for (size_t first = begin; first < end; first += RUN) {
         play_prepare(turn, first, length_of_run(first, end), &registers);
-    }
-    for (size_t index = begin; index < end; index++) {
-        if (is_in(task->call->mask, index)) {
-            play_draw(turn, index);
+        if (!play->reads_kept) {
+            play_keep_outputs(play, 0, play->number_of_outputs, first, length_of_run(first, end));
         }
     }
     return 0;

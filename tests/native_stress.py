@@ -32,7 +32,7 @@ from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
-from fmugym.task.values import LateDict
+from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
 
 THREADS = 6
@@ -102,7 +102,7 @@ DRAWS = draws(0)
 
 def tell(drawn, mask):
     """What a reset tells of the episodes that it starts."""
-    return {"drawn": LateDict.of(lambda: {"drawn": drawn * mask}), "_drawn": mask}
+    return {"drawn": drawn * mask}
 
 
 class ReceiverError(Exception):
@@ -193,7 +193,7 @@ class Subject:
                 "drawn_variables": ((variables[0], 0),),
                 "variable_starts": ((variables[0], np.float64(1.0).tobytes()),),
                 "input_starts": ((-1, 0.0),) * len(self.pool.inputs),
-                "results": (tuple, 0, (), self.results(), tell),
+                "results": (tuple, 0, (), self.results(), (LateDict, UNFILLED, tell)),
             },
         )
 
@@ -211,24 +211,17 @@ class Subject:
 
     def play(self):
         actions = self.rng.integers(0, 2, self.n)
-        drawn = np.empty((1, self.n))
-        if self.rng.random() < 0.5:  # episodes start in the step that ends others
-            drawn = None
+        at_ends = bool(self.rng.random() < 0.5)  # episodes start in the step that ends others
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            result = self.pool._pool.play(actions, drawn)[0]
+            result = self.pool._pool.play(actions, at_ends)[0]
             counts["played"] += 1
             if self.rng.random() < 0.5:
                 self.ends = result[4].get("final_obs")
 
-    def start_episodes(self):
-        observations = np.empty((self.n, len(self.outputs)), np.float32)
-        with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool._pool.start(self.mask(), observations, np.empty((1, self.n)))
-
     def reset_by(self):
         """Hold what some resets return, and read it later."""
         with contextlib.suppress(ValueError):  # as above
-            result = self.pool.reset_of_play()({"reset_mask": self.mask()})
+            result = self.pool._pool.reset_by({"reset_mask": self.mask()})
             if result is not None and self.rng.random() < 0.5:
                 self.held = result
                 assert self.held[0][1]["drawn"]["drawn"].shape == (1, self.n)
@@ -295,7 +288,6 @@ ACTIONS = (
         "play",
         "play",
         "play",
-        "start_episodes",
         "reset_by",
         "save",
         "restore",

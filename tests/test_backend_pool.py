@@ -501,12 +501,30 @@ class TestVector:
         del gym.registry["test/Rig-v0"]
 
 
-def test_hooks_of_real_plants_are_not_compiled():
-    with pytest.raises(ConfigError, match="the pool is not the native one"):
-        FMUVectorEnv(lambda: RigEnv(Oscillator()), 1, hooks="compiled")
+def test_hooks_of_a_single_real_plant_are_not_compiled():
     env = fmugym.envs.CartPoleEnv(hooks="compiled", backend=Oscillator())
     with env, pytest.raises(ConfigError, match="the pool is not a native one"):
         env.reset()
+
+
+@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
+def test_hooks_of_several_real_plants(hooks):
+    """Programs run around the steps of the rigs; each way gives the same."""
+    rigs = [Oscillator(), Oscillator()]
+    envs = FMUVectorEnv(lambda: RigEnv(rigs), 2, hooks=hooks)
+    assert envs.inside.engine.way == hooks
+    results = [envs.reset()[0]]
+    for action in (0.5, -0.5, 1.0):
+        observations, rewards, *ends, _ = envs.step(np.full((2, 1), action, np.float32))
+        results += [observations, rewards, *ends]
+    envs.close()
+    single = RigEnv(Oscillator())
+    expected = [single.reset()[0]]
+    for action in (0.5, -0.5, 1.0):
+        expected += single.step(np.array([action], np.float32))[:4]
+    single.close()
+    for ours, theirs in zip(results, expected, strict=True):
+        np.testing.assert_array_equal(ours, [theirs, theirs])
 
 
 class Twin:

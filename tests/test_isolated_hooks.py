@@ -19,9 +19,8 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, SimulationError
-from fmugym.pool.process.play import PlayAround
+from fmugym.pool.around import PlayAround, _access
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.vector.engines.compiled import CompiledEngine
 
 each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
 
@@ -97,7 +96,7 @@ def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""
     isolated = make(cls, 70, autoreset_mode=mode)
     here = make(cls, 70, workers=None, autoreset_mode=mode)
-    assert isinstance(isolated.inside.engine, CompiledEngine)
+    assert isolated.inside.engine.way == "compiled"
     assert run_side_by_side(isolated, here, mode, 40)
     for name in ("variables", "previous_state", "action", "inputs", "step_count"):
         np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
@@ -220,16 +219,16 @@ def test_a_pool_without_a_library_steps_nothing(make):
     """Whatever is asked of the native pool that runs the programs, nothing crashes."""
     envs = make(Short, 3)
     envs.reset(seed=0)
-    around = PlayAround(envs.inside.pool._setup, envs.inside.pool._arrays, lambda *_: None)
-    arrays = np.zeros((3, 1), np.float32), np.zeros((2, 3))
-    for name in ("play", "play_before", "play_after"):
+    around = PlayAround(envs.inside.pool, envs.inside.pool._spec)
+    actions = np.zeros((3, 1), np.float32)
+    for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
         with pytest.raises(ValueError, match="not prepared"):
-            getattr(around._pool, name)(*arrays)
+            getattr(around._pool, name)(actions, *more)
     with pytest.raises(TypeError, match="not prepared"):
         around._pool.step_one(0, {})
     before = envs.inside.pool.outputs.copy()
     assert around._pool.step_own() == 3
-    nothing = around._access(())
+    nothing = _access(())
     assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
     assert around._pool.read(nothing, np.zeros((0, 3))) == 0
     np.testing.assert_array_equal(envs.inside.pool.outputs, before)

@@ -13,8 +13,8 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 import fmugym
 from fmugym import ConfigError, SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
+from fmugym.linearization.trajectories import discrete
 from fmugym.pool.native import NativePool
-from fmugym.vector.trajectories import discrete
 
 TORQUES = np.random.default_rng(0).uniform(-0.015, 0.015, (HORIZON, 1)).astype(np.float32)
 STARTS = {"q": "q_0", "q_dot": "q_dot_0"}

@@ -368,8 +368,9 @@ def with_failing(task, monkeypatch):
     prepare = envs.inside.pool.prepare_play
 
     def prepared(*parts):
-        made_of.append(Failing(prepare(*parts)))
-        return made_of[-1]
+        play = prepare(*parts)
+        made_of.append(Failing(play.start_and_step))
+        return play._replace(start_and_step=made_of[-1])
 
     monkeypatch.setattr(envs.inside.pool, "prepare_play", prepared)
     envs.inside.engine._prepare(envs.inside.engine._task)

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from vector_tools import CART_POLE, Drawing, PushedCart, require_equal
 
 from fmugym import ConfigError, FMUVectorEnv, SimulationError, Uniform
-from fmugym.vector.engines.compiled import CompiledEngine
+from fmugym.vector.engines.batch import BatchEngine
 
 
 class Pictured(Drawing):
@@ -126,7 +126,7 @@ def play_both(first, second, steps=40):
 @pytest.mark.parametrize("num_envs", [1, 5, 140])
 def test_both_ways_do_the_same(task, num_envs):
     first, second = made(task, num_envs), made(task, num_envs)
-    assert isinstance(first.inside.engine, CompiledEngine)
+    assert first.inside.engine.way == "compiled"
     assert play_both(first, second) >= 5
     first.close()
     second.close()
@@ -149,7 +149,7 @@ def test_one_call_of_the_pool_does_it(task, monkeypatch):
     def refuse(*_):
         raise AssertionError("the general way")
 
-    monkeypatch.setattr(CompiledEngine, "reset", refuse)
+    monkeypatch.setattr(BatchEngine, "reset", refuse)
     for mask in np.eye(5, dtype=np.bool_):
         envs.reset(options={"reset_mask": mask})
     monkeypatch.undo()

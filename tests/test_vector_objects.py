@@ -226,12 +226,12 @@ class TestContents:
     def test_of_all_kinds(self, value, change):
         env = self.make(held=value)
         contents = Contents(env)
-        assert contents.changed() is None
+        assert contents.changes().inside is None
         change(value)
-        assert contents.changed() == "held"
+        assert contents.changes().inside == "held"
         assert contents.changed_in_place() == {"held"}
         contents.restore()
-        assert contents.changed() is None
+        assert contents.changes().inside is None
         assert env.held is value
         env.close()
 
@@ -239,7 +239,7 @@ class TestContents:
         env = self.make()
         contents = Contents(env)
         env.new = 1
-        assert contents.changed() == "new"
+        assert contents.changes().inside == "new"
         contents.restore()
         assert not hasattr(env, "new")
         env.close()
@@ -251,7 +251,7 @@ class TestContents:
         env.me = env
         contents = Contents(env)
         loop.append(1)
-        assert contents.changed() == "loop"
+        assert contents.changes().inside == "loop"
         contents.restore()
         assert len(loop) == 1
         env.close()

@@ -27,15 +27,15 @@ SAME_STEP, DISABLED = AutoresetMode.SAME_STEP, AutoresetMode.DISABLED
 
 @pytest.fixture
 def outside(monkeypatch):
-    """How many resets have not been made by the pass."""
+    """How many episodes Python has started, and not the pass."""
     calls = []
-    reset = BatchEngine.reset
+    begin = BatchEngine._begin
 
     def counted(self, *args):
         calls.append(args)
-        return reset(self, *args)
+        return begin(self, *args)
 
-    monkeypatch.setattr(BatchEngine, "reset", counted)
+    monkeypatch.setattr(BatchEngine, "_begin", counted)
     return calls
 
 
@@ -213,24 +213,16 @@ class TestGuards:
 
     def test_fitting_ones(self, pool):
         actions = np.zeros(4, np.int64)
-        assert pool.play(actions, np.empty((4, 4)))[1:] == (0, False, None)
-        assert pool.play(actions, None)[1:] == (0, False, None)
+        assert pool.play(actions, False)[1:] == (0, False, None)
+        assert pool.play(actions, True)[1:] == (0, False, None)
 
-    @pytest.mark.parametrize("drawn", [np.empty((4, 3)), np.empty((4, 4))[:, ::-1], 7])
-    def test_others(self, pool, drawn):
-        with pytest.raises((TypeError, ValueError, BufferError)):
-            pool.play(np.zeros(4, np.int64), drawn)
-
-    @pytest.mark.parametrize("part", ["play_before", "play_after"])
-    def test_starts_at_ends_in_two_parts(self, pool, part):
-        with pytest.raises(TypeError, match="two parts"):
-            getattr(pool, part)(np.zeros(4, np.int64), None)
-
-    @pytest.mark.parametrize("shapes", [((3,), (4, 4)), ((4,), (4, 3))])
-    def test_starts(self, pool, shapes):
-        mask, observations = np.ones(shapes[0], np.bool_), np.empty(shapes[1], np.float32)
-        with pytest.raises(ValueError, match=r"must have the shape|has 48 bytes, expected 64"):
-            pool.start(mask, observations, np.empty((4, 4)))
+    @pytest.mark.parametrize("actions", [np.zeros(3, np.int64), np.zeros(8, np.int64)[::2], 7])
+    def test_others(self, pool, actions):
+        for at_ends in (False, True):
+            with pytest.raises((TypeError, ValueError, BufferError)):
+                pool.play(actions, at_ends)
+        with pytest.raises(TypeError, match="expected 2 arguments"):
+            pool.play(np.zeros(4, np.int64))
 
 
 class Tracking(Drawing):
@@ -300,4 +292,3 @@ def test_bundled_tasks_with_observations_of_their_own(env_id, mode, outside):
         ):  # a square may differ in a bit
             np.testing.assert_allclose(mine, other, rtol=1e-9, atol=1e-9)
         require_same_infos(first[-1], second[-1])
-    assert outside

@@ -11,6 +11,7 @@ import pytest
 from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sampled_actions
 
 from fmugym import ConfigError, FMUVectorEnv
+from fmugym.task.values import UNFILLED, LateDict
 
 NUM_ENVS, STEPS = 3, 40
 
@@ -159,39 +160,42 @@ def test_a_refused_step_and_an_error_leave_everything_in_order():
 
 SEEN, REAL, FLAGS, DRAWN = ((3, 4), np.float32), ((3,), float), ((3,), bool), ((4, 3), float)
 ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN
+LATE = LateDict, UNFILLED, dict
 
 
 def test_results_that_fit_are_taken(monkeypatch):
-    require_refused((tuple, 0, (), ARRAYS, dict), monkeypatch, refused=False)
+    require_refused((tuple, 0, (), ARRAYS, LATE), monkeypatch, refused=False)
 
 
 @pytest.mark.parametrize(
     "results",
     [
-        (tuple, 0, (), (), dict),
-        (tuple, 0, (), ARRAYS[:-1], dict),
-        (tuple, 0, (), ARRAYS[:3], dict),
-        (tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), dict),
-        (tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), dict),
-        (tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), dict),
-        (tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), dict),
-        (tuple, (("a", 0), ("b", 1)), (), ARRAYS, dict),
-        (dict, 0, (), ARRAYS, dict),
-        (tuple, 0, (), 7, dict),
-        (tuple, 9, (), ARRAYS, dict),
-        (tuple, None, (), ARRAYS, dict),
-        (tuple, 0, 0, ARRAYS, dict),
-        (tuple, 0, (("a", 1),), ARRAYS, dict),
-        (tuple, 0, (("a",),), ARRAYS, dict),
-        (tuple, 0, ("ab",), ARRAYS, dict),
+        (tuple, 0, (), (), LATE),
+        (tuple, 0, (), ARRAYS[:-1], LATE),
+        (tuple, 0, (), ARRAYS[:3], LATE),
+        (tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), LATE),
+        (tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), LATE),
+        (tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), LATE),
+        (tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), LATE),
+        (tuple, (("a", 0), ("b", 1)), (), ARRAYS, LATE),
+        (dict, 0, (), ARRAYS, LATE),
+        (tuple, 0, (), 7, LATE),
+        (tuple, 9, (), ARRAYS, LATE),
+        (tuple, None, (), ARRAYS, LATE),
+        (tuple, 0, 0, ARRAYS, LATE),
+        (tuple, 0, (("a", 1),), ARRAYS, LATE),
+        (tuple, 0, (("a",),), ARRAYS, LATE),
+        (tuple, 0, ("ab",), ARRAYS, LATE),
         (
             tuple,
             functools.reduce(lambda form, _: (("a", form),), range(999), 0),
             (),
             ARRAYS,
-            dict,
+            LATE,
         ),
         (tuple, 0, (), ARRAYS),
+        (tuple, 0, (), ARRAYS, LATE[:2]),
+        (tuple, 0, (), ARRAYS, dict),
     ],
 )
 def test_results_that_do_not_fit_are_refused(results, monkeypatch):

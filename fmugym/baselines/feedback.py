@@ -20,8 +20,8 @@ from fmugym.baselines.base import (
 from fmugym.errors import ConfigError
 from fmugym.lazy import scipy_module
 from fmugym.linearization import LinearModel
+from fmugym.linearization.trajectories import discrete
 from fmugym.signals import ordinary
-from fmugym.vector.trajectories import discrete
 
 __all__ = ["LQR", "PID", "Hysteresis", "Law"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ __all__ = [
     "ISOLATIONS",
     "FloatArray",
     "MaskArray",
+    "Play",
     "Played",
     "Pool",
     "PoolSpec",
@@ -32,14 +33,43 @@ FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
 
-Played = tuple[Any, int, bool, MaskArray | None]
-"""What a step with compiled hooks returns; see ``NativePool.prepare_play``."""
-
-P = ParamSpec("P")
-R = TypeVar("R")
-
 _MOST_NAMES: Final = 5
 """The most variables that a message names."""
+
+
+Played = tuple[Any, int, bool, MaskArray | None]
+"""What a step with compiled hooks returns; see ``Play.step``."""
+
+
+class Play(NamedTuple):
+    """What a pool does that is prepared for a step with compiled hooks.
+
+    ``before`` and ``after`` surround a step of the FMUs by the caller, who also starts episodes. A
+    pool that steps and starts the FMUs itself has the other functions, too.
+
+    Attributes:
+        before: Takes the actions, and makes the inputs.
+        after: Takes the same actions, and returns what ``step`` returns.
+        step: A function of actions and a flag; it does a step, and starts the episodes that have
+            ended before it. If the flag is True, an episode that ends without a fault is followed
+            by the next one in the same step. It returns the result; how many instances had trouble
+            (a status worse than a warning, or numbers that are not finite); whether any episode is
+            at its end now; and where episodes have started, shape (N,), or None. The infos of the
+            result then tell of these starts. All arrays are new, or those of an earlier step that
+            nobody holds any more.
+        start_and_step: The same; to be called if episodes may start.
+        reset: A function of the options of a reset. If they are a dict of nothing but
+            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
+            it starts these episodes and returns the result of the reset, how many instances had
+            trouble, and whether any episode is at its end now. Otherwise it does nothing and
+            returns None.
+    """
+
+    before: Callable[[Any], None]
+    after: Callable[[Any], Played]
+    step: Callable[[Any, bool], Played] | None = None
+    start_and_step: Callable[[Any, bool], Played] | None = None
+    reset: Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None] | None = None
 
 
 class Pool(ABC):
@@ -212,17 +242,8 @@ class Pool(ABC):
         return False
 
     @property
-    def can_play(self) -> bool:
-        """Whether the pool can run compiled hooks within a step (``NativePool.prepare_play``)."""
-        return False
-
-    @property
     def plays_alone(self) -> bool:
-        """Whether compiled hooks need no other calls of the pool, since it steps the FMUs itself.
-
-        Then it also offers ``start_of_play`` and ``reset_of_play``, and starts episodes within the
-        steps in which others end.
-        """
+        """Whether the pool steps and starts the FMUs itself in a step with compiled hooks."""
         return False
 
     @property
@@ -230,20 +251,14 @@ class Pool(ABC):
         """Whether ``roll_out`` does many steps of compiled hooks in one call."""
         return self.plays_alone
 
-    def prepare_play(
-        self,
-        variables: tuple[Variable, ...],
-        programs: Any,
-        actions: Any,
-        start_values: FloatArray,
-        draws: Any,
-        episodes: Any,
-        surroundings: Any,
-    ) -> Callable[..., Played]:
-        """Make the function that does whole steps, compiled hooks included; see ``NativePool``.
+    def prepare_play(self, *parts: Any) -> Play:
+        """Prepare steps with compiled hooks.
+
+        Args:
+            parts: As for ``NativePool.prepare_play``.
 
         Raises:
-            SimulationError: If the pool does not support it; see ``can_play``.
+            SimulationError: If the pool does not support it.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
 
@@ -254,36 +269,6 @@ class Pool(ABC):
             SimulationError: If the pool does not support it; see ``rolls_out``.
         """
         raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
-
-    def prepare_one(self, *parts: Any) -> Callable[[Any, dict[str, Any]], Any]:
-        """Make the function that does whole steps of a single environment; see ``NativePool``.
-
-        Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
-        """
-        raise SimulationError(f"a {type(self).__name__} cannot run compiled hooks")
-
-    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
-        """The function that starts episodes outside of a step; see ``NativePool``.
-
-        Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
-        """
-        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
-
-    def reset_of_play(
-        self,
-    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
-        """The function that does whole resets with a mask; see ``NativePool``.
-
-        Raises:
-            SimulationError: If the pool does not support it; see ``plays_alone``.
-        """
-        raise SimulationError(f"a {type(self).__name__} cannot draw episodes")
-
-    def watched(self, function: Callable[P, R]) -> Callable[P, R]:
-        """Add the memory that a reset function allocates to the growth counter."""
-        return function
 
     def halt(self) -> None:
         """Stop at once whatever runs on without being stepped; the next reset starts it again."""

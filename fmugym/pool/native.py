@@ -30,7 +30,7 @@ from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
-    Played,
+    Play,
     PoolSpec,
     StatusArray,
     available_processors,
@@ -135,10 +135,9 @@ class NativePool(SavingPool):
         self._prepare_saving(fmu.description, spec)
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
-        self._reset = self.watched(self._pool.reset)
-        self._step_or_reset = self.watched(self._pool.step_or_reset)
-        self._start_of_play = self.watched(self._pool.start)
-        self._reset_of_play = self.watched(self._pool.reset_by)
+        self._reset = self._watched(self._pool.reset)
+        self._step_or_reset = self._watched(self._pool.step_or_reset)
+        self._watched_play = self._watched(self._pool.play), self._watched(self._pool.reset_by)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
         fmu, spec, description = self._fmu, self._spec, self._fmu.description
@@ -198,14 +197,9 @@ class NativePool(SavingPool):
         return access
 
     @property
-    def can_play(self) -> bool:
-        """See ``Pool.can_play``; nobody waits for licences within a step."""
-        return not self._spec.licence_wait
-
-    @property
     def plays_alone(self) -> bool:
         """See ``Pool.plays_alone``."""
-        return self.can_play
+        return True
 
     # The contract of Pool.
 
@@ -325,7 +319,7 @@ class NativePool(SavingPool):
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
 
-    def watched(self, function: Callable[P, R]) -> Callable[P, R]:
+    def _watched(self, function: Callable[P, R]) -> Callable[P, R]:
         """Add the memory that a reset function allocates to the growth counter."""
         return function if self._watch is None else self._watch.around(function)
 
@@ -444,8 +438,8 @@ class NativePool(SavingPool):
         draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
         episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
         surroundings: Mapping[str, Any],
-    ) -> Callable[..., Played]:
-        """Prepare the pool to do whole steps of a vector environment, hooks included.
+    ) -> Play:
+        """Prepare the pool for steps of a vector environment, hooks included.
 
         This replaces what was prepared before. Every step uses the given arrays in place.
 
@@ -477,26 +471,20 @@ class NativePool(SavingPool):
                 and a mask, which returns what infos tell of the episodes that start.
 
         Returns:
-            A function of actions and drawn values (draws, N). It does a step and fills the drawn
-            values of the episodes that start; ``given`` ones are read. With None in their place,
-            an episode that ends without a fault is followed by the next in the same step, otherwise
-            in the next step. It returns the result; how many instances had trouble (a status worse
-            than a warning, or numbers that are not finite); whether any episode has ended that was
-            not followed; and None or, if some were followed, for which environments, shape (N,).
-            The infos of the result are then those of Gymnasium's mode ``SAME_STEP``. All arrays are
-            new, or those of an earlier step that nobody holds any more.
+            The functions that do the steps and the resets. The memory that resets allocate is added
+            to the growth counter.
         """
-        start = self._access(variables)
-        prepare(self._pool, start, programs, actions, start_values, draws, episodes, surroundings)
-        return self._pool.play
+        start, pool = self._access(variables), self._pool
+        prepare(pool, start, programs, actions, start_values, draws, episodes, surroundings)
+        step, reset = self._watched_play
+        return Play(pool.play_before, pool.play_after, pool.play, step, reset)
 
     def roll_out(self, *arrays: Any) -> int:
         """Do many steps of the prepared play in one call; episodes that end are not followed.
 
         Args:
-            arrays: Actions, observations, rewards, terminated and truncated as for the function
-                that ``prepare_play`` returns, each with a first axis for the steps; and memory for
-                drawn values, which are not drawn.
+            arrays: Actions, observations, rewards, terminated and truncated of steps, each with a
+                first axis for the steps.
 
         Returns:
             How many instances or numbers were in trouble; if there are any, not all steps are done.
@@ -525,30 +513,6 @@ class NativePool(SavingPool):
         """
         self._pool.prepare_one(*parts)
         return self._pool.step_one
-
-    def start_of_play(self) -> Callable[..., tuple[int, bool]]:
-        """The function that starts episodes after ``prepare_play``, outside of a step.
-
-        Returns:
-            A function of a mask, observations and drawn values (draws, N). It fills all of the
-            observations, and the drawn values in the mask; ``given`` ones are read. It returns how
-            many instances had trouble, and whether any episode of another one has ended.
-        """
-        return self._start_of_play
-
-    def reset_of_play(
-        self,
-    ) -> Callable[[Any], tuple[tuple[Any, dict[str, Any]], int, bool] | None]:
-        """The function that does whole resets with a mask after ``prepare_play``.
-
-        Returns:
-            A function of the options of a reset. If they are a dict of nothing but
-            ``"reset_mask"``, and that is a contiguous array of N Booleans with at least one True,
-            it starts these episodes and returns the result of the reset, and the numbers that the
-            function of ``start_of_play`` returns. Otherwise it does nothing and returns None. The
-            arrays of the result are new, or those of an earlier call that nobody holds any more.
-        """
-        return self._reset_of_play
 
 
 def prepare(

@@ -17,10 +17,12 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.signals import ordinary
 from fmugym.task.spaces import to_input_types
 
-__all__ = ["blame", "elements_of", "flat_inputs", "no_action", "require_usable"]
+__all__ = ["elements_of", "flat_inputs", "no_action", "take_action"]
 
 _OF_MISFITS: Final = (TypeError, ValueError, LookupError, AttributeError, ArithmeticError)
 """The exceptions that indexing and arithmetic raise for values of a wrong kind or shape."""
+
+_INTEGERS: Final = frozenset({int, np.int64})
 
 _FEW: Final = 64
 """Up to this many elements, Python's floats are faster than numpy."""
@@ -53,12 +55,35 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def require_usable(env: Any, action: Any) -> None:
-    """Refuse an action that is no element of a ``Discrete``, or that has a NaN.
+def take_action(env: Any, action: Any) -> None:
+    """Let hooks make inputs of an action, and write them for the next step of the FMU.
+
+    Args:
+        env: A single environment.
+        action: The action.
 
     Raises:
-        ConfigError: If it is one.
+        ConfigError: If it cannot be used. Then nothing has happened.
     """
+    inside, read = env.inside, env.inside.readings
+    elements = inside.elements
+    if elements is None or type(action) not in _INTEGERS or action not in elements:
+        _require_usable(env, action)
+    before = read.action, read.previous_action, read.previous_state, read.inputs
+    read.previous_action, read.previous_state, read.action = read.action, read.state, action
+    try:
+        read.inputs = inside.input_writer.checked(env._get_inputs(), action)
+    except BaseException as error:  # the FMU was not touched: a better action may follow
+        read.take_back(before)
+        blaming = _blame(env, action, error)
+        if blaming is not None:
+            raise blaming from error
+        raise
+    inside.input_writer.write(read.inputs, inside.input_row)
+
+
+def _require_usable(env: Any, action: Any) -> None:
+    """Refuse an action that is no element of a ``Discrete``, or that has a NaN."""
     elements = env.inside.elements
     if elements is not None:
         if not _is_element(action, elements):
@@ -67,7 +92,7 @@ def require_usable(env: Any, action: Any) -> None:
         raise ConfigError(f"action {shown(action)} has a NaN; every number must be finite")
 
 
-def blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
+def _blame(env: Any, action: Any, error: BaseException) -> ConfigError | None:
     """The error if ``_get_inputs`` failed because of an action outside of the action space."""
     if isinstance(error, FMUGymError) or not isinstance(error, Exception):
         return None

@@ -14,10 +14,8 @@ from fmugym.task.results import FLOAT32_LIMIT, as_info, as_reward
 from fmugym.task.step import NUMBERS, conclude
 
 __all__ = [
-    "IN_POOL",
     "Result",
     "after_step",
-    "fault_of_hooks",
     "first_observation",
     "info_of",
     "judged",
@@ -29,23 +27,16 @@ R = TypeVar("R")
 Result = tuple[Any, float, bool, bool, dict[str, Any]]
 """Observation, reward, terminated, truncated and info."""
 
-IN_POOL: Final = object()
-"""Stands for the default observation of a step, which the pool has; see ``judged``."""
-
 _TERMINATED: Final = int(Status.TERMINATED)
 
 
-def judged(
-    env: Constructed, status: int, values: tuple[float, ...] | None = None, observed: Any = None
-) -> Result:
+def judged(env: Constructed, status: int, values: tuple[float, ...] | None = None) -> Result:
     """Make the result of a step of the FMU.
 
     Args:
         env: The environment.
         status: That of the step.
         values: The outputs; None for those that the pool has.
-        observed: The default observation; None for a copy of the pool's. ``IN_POOL`` is returned
-            as it is unless the step fails.
 
     Raises:
         ConfigError: If a hook returns something unusable.
@@ -64,17 +55,13 @@ def judged(
         values = tuple(inside.output_row.tolist())  # Python's floats are faster
     read.values = values
     read.state = values if inside.no_monitors else values[: inside.output_count]
-    if observed is None and inside.pool_observes:
-        observed = inside.observation_row.copy()
+    observed = inside.observation_row.copy() if inside.pool_observes else None
     cut_off = read.step_count >= inside.step_limit
     observation, reward, terminated, truncated = conclude(env, NUMBERS, stopped, cut_off, observed)
     # One call for all numbers, which is enough for nearly all steps.
     is_small = observed is not None and hypot(reward, *values) <= FLOAT32_LIMIT
-    if not is_small:
-        if observation is IN_POOL:
-            observation = inside.observation_row.copy()
-        if not (isfinite(reward) and inside.is_finite(observation)):
-            return fault_of_hooks(env, reward, observation, (before, variables))
+    if not is_small and not (isfinite(reward) and inside.is_finite(observation)):
+        return _fault_of_hooks(env, reward, observation, (before, variables))
     info = info_of(env) if inside.has_info else {}
     if stopped:
         info["fmu_terminated"] = True
@@ -121,7 +108,7 @@ def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
         env.inside.in_hooks = False
 
 
-def fault_of_hooks(
+def _fault_of_hooks(
     env: Constructed,
     reward: float,
     observation: Any,

@@ -235,28 +235,23 @@ class LateDict(dict[str, Any]):
     """A dict for values that are rarely read; it is filled when first read or written.
 
     Every method of ``dict`` fills it first. C functions that read a dict without calling its
-    methods would find ``_UNFILLED``; no function of the standard library does that.
+    methods would find ``UNFILLED``; no function of the standard library does that.
 
     Args:
-        fill: A function that returns the items.
-        arguments: The arguments of ``fill``.
+        pending: Under ``UNFILLED`` a tuple: a function that returns the items, and its arguments.
     """
 
-    __slots__ = ("_fill",)
-
-    _fill: tuple[Any, ...] | None  # the function and its arguments
+    __slots__ = ()
 
     @classmethod
     def of(cls, fill: Callable[..., Mapping[str, Any]], *arguments: Any) -> LateDict:
-        """Make a dict in a third of the time that a Python constructor takes."""
-        late = cls(_EMPTY)
-        late._fill = fill, *arguments
-        return late
+        """Make a dict that a function of these arguments fills."""
+        return cls({UNFILLED: (fill, *arguments)})
 
     def _filled(self) -> dict[str, Any]:
-        if self._fill is not None:
-            (fill, *arguments), self._fill = self._fill, None
-            dict.clear(self)
+        pending = dict.pop(self, UNFILLED, None)
+        if pending is not None:
+            fill, *arguments = pending
             dict.update(self, fill(*arguments))
         return self
 
@@ -267,8 +262,8 @@ class LateDict(dict[str, Any]):
         return dict, (dict(self.items()),)
 
 
-_UNFILLED: Final = "fmugym: not filled yet"
-_EMPTY: Final = {_UNFILLED: None}  # json.dumps writes {} for a dict without items
+UNFILLED: Final = "fmugym: not filled yet"
+"""The only key of a ``LateDict`` that nobody has read yet."""
 
 _NOT_OF_THE_ITEMS: Final = {
     *("__class_getitem__", "__getattribute__", "__hash__", "__init__", "__new__", "fromkeys"),

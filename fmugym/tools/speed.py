@@ -127,9 +127,7 @@ def _of_vector(make_env: Callable[[], FMUEnv], size: int, seconds: float) -> Spe
         took = _fastest(lambda number: envs.step(actions[number % 16]), seconds)
         envs.reset(seed=0)
         share = _share(envs.inside.prototype, seconds, took)
-        hooks = type(envs.inside.engine).__name__.removesuffix("Engine").lower()
-        named = {"batch": "array", "perenv": "per_env"}.get(hooks, hooks)
-        return Speed(size, named, size / took, took * 1e6, share)
+        return Speed(size, envs.inside.engine.way, size / took, took * 1e6, share)
     finally:
         envs.close()
 

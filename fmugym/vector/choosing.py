@@ -9,12 +9,13 @@ from gymnasium.vector.utils import batch_space
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import Pool
+from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
 from fmugym.vector.engines.base import Engine
 from fmugym.vector.engines.batch import BatchEngine
-from fmugym.vector.engines.compiled import CompiledEngine
 from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.engines.programs import find_programs
 from fmugym.vector.hooks.check import CURE, find_difference
+from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.making import EnvMaker
 
 __all__ = ["make_engine"]
@@ -43,11 +44,11 @@ def make_engine(
         return PerEnvEngine(
             envs, pool, max_episode_steps, batch_space(prototype.action_space, count)
         )
-    if hooks != "array":
-        programs = find_programs(prototype, required=hooks == "compiled")
-        if programs is not None:
-            return CompiledEngine(prototype, count, max_episode_steps, programs)
-    return BatchEngine(prototype, count, max_episode_steps)
+    if hooks == "array":
+        task = TracedTask.without_programs(prototype)
+    else:
+        task = find_programs(prototype, required=hooks == "compiled")
+    return BatchEngine(prototype, count, max_episode_steps, task)
 
 
 def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
@@ -63,8 +64,10 @@ def _make_all(maker: EnvMaker, prototype: FMUEnv, count: int) -> list[FMUEnv]:
 
 
 def _use_arrays(prototype: FMUEnv, hooks: str) -> bool:
-    if hooks == "per_env":
+    if hooks == "per_env" or (hooks == "auto" and not has_native_pool()):
         return False
+    if not has_native_pool():
+        raise ConfigError(f"hooks={hooks!r} is not possible: {HOW_TO_BUILD}")
     difference = find_difference(prototype)
     if difference is None:
         return True

@@ -20,7 +20,7 @@ from fmugym.env import FMUEnv
 from fmugym.signals import Ignoring, ordinary
 from fmugym.vector.hooks.tables import functions_of, places_of
 
-__all__ = ["Contents", "borrowed", "differs"]
+__all__ = ["Changes", "Contents", "borrowed", "differs"]
 
 _NOT_COMPARED: Final = "inside"
 """The attribute that the caller of hooks and the pool change."""
@@ -51,6 +51,20 @@ class _Kept(NamedTuple):
     value: Any
     kind: _Kind
     contents: Any
+
+
+class Changes(NamedTuple):
+    """The names of what hooks have changed, one of each kind, or None.
+
+    Attributes:
+        inside: An attribute that was set, or whose value has changed in place.
+        outside: A global variable that was set, or whose value has changed in place.
+        added: A list or dict outside to which something was only added: a record or a cache, maybe.
+    """
+
+    inside: str | None
+    outside: str | None
+    added: str | None
 
 
 class Contents:
@@ -94,13 +108,23 @@ class Contents:
                 self._kept.append(_Kept(attribute, value, kind, contents))
                 waiting.extend(kind.parts(contents))
 
-    def changed(self) -> str | None:
-        """The name of an attribute that was set, or whose value has changed in place."""
-        before, in_place = self._before, self.changed_in_place()
-        for name, value in self._attributes.items():
-            if name == _NOT_COMPARED:
-                continue
-            if name in in_place or name not in before or differs(before[name], value):
+    def changes(self) -> Changes:
+        """What has changed until now."""
+        kept = list(filter(_has_changed, self._kept[self._first_outside :]))
+        changed = [one.attribute for one in kept if not _was_added_to(one)]
+        added = [one.attribute for one in kept if _was_added_to(one)]
+        for place, name, value in self._outside:
+            if differs(value, place[name]):
+                changed.append(name or type(value).__name__)
+        return Changes(self._changed_inside(), _first(changed), _first(added))
+
+    def _changed_inside(self) -> str | None:
+        before, now, in_place = self._before, self._attributes, self.changed_in_place()
+        names = (name for name in (*now, *before) if name != _NOT_COMPARED)
+        for name in names:
+            if name in in_place or name not in before or name not in now:
+                return name
+            if differs(before[name], now[name]):
                 return name
         return None
 
@@ -108,17 +132,6 @@ class Contents:
         """The names of the attributes whose values have changed in place."""
         kept = self._kept[: self._first_outside]
         return {one.attribute for one in kept if _has_changed(one)}
-
-    def changed_outside(self) -> str | None:
-        """The name of a global variable that was set, or whose value has changed in place.
-
-        What was only added to a list or a dict does not count: it may be a record or a cache.
-        """
-        for place, name, value in self._outside:
-            if differs(value, place[name]):
-                return name or type(value).__name__
-        kept = self._kept[self._first_outside :]
-        return next((k.attribute for k in kept if _has_changed(k) and not _was_added_to(k)), None)
 
     def restore(self) -> None:
         """Undo all changes."""
@@ -159,6 +172,10 @@ def _size_of(value: Any) -> int:
     return len(value) if isinstance(value, (list, dict, set, tuple, deque)) else 1
 
 
+def _first(names: list[str]) -> str | None:
+    return names[0] if names else None
+
+
 def _was_added_to(kept: _Kept) -> bool:
     """Whether a container has all that it had, and more."""
     value, before = kept.value, kept.contents
@@ -194,7 +211,8 @@ def _has_changed(kept: _Kept) -> bool:
 
 
 def _restore_dict(target: dict[str, Any], contents: Mapping[str, Any]) -> None:
-    dict.clear(target)
+    if list(target) != list(contents):  # an interrupt must not find the attributes gone
+        dict.clear(target)
     dict.update(target, contents)
 
 

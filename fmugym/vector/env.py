@@ -225,22 +225,12 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return self.inside.guard.run("step", FMUVectorEnv._step_alone, self, actions)
 
     def _step_alone(self, actions: Any) -> StepResult:
-        if not self.inside.episodes.is_ready or self.closed or self._background.is_pending:
+        inside = self.inside
+        if not inside.episodes.is_ready or self.closed or self._background.is_pending:
             self._refuse_step("step")
-        if not self._waits:
-            return self._step(actions)
-        return self._step_until_ends(actions)
-
-    def _step_until_ends(self, actions: Any) -> StepResult:
-        """Step in the mode ``DISABLED``, in which ended episodes wait for a reset."""
-        engine = self.inside.engine
-        if engine.any_ended:
+        if self._waits and inside.engine.any_ended:
             self._require_ready("step")
-        try:
-            return engine.step(actions, None)
-        except BaseException:
-            self._interrupt()
-            raise
+        return self._step(actions)
 
     @alone
     def step_async(self, actions: Any) -> None:

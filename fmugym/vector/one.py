@@ -21,17 +21,16 @@ from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, info_of, judged
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.results import as_flag, as_reward
-from fmugym.task.step import ORDER
+from fmugym.task.step import NUMBERS, ORDER, conclude_left
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.memory import Memory
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
+from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.purity import names_in_hooks, unchanged_globals
+from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.streams import given_draws
+from fmugym.vector.streams import no_draws
 from fmugym.vector.views import batched, column
 
 __all__ = ["Player", "player_of"]
@@ -130,9 +129,9 @@ class Player:
             memory.programs(task),
             memory.action_group(),
             self._starts,
-            (given_draws(plan), np.zeros((1, 6), np.uint64)),
+            (no_draws(), np.zeros((1, 6), np.uint64)),
             (self._rows.step_count, memory.ended, env.inside.step_limit),
-            memory.surroundings(task, results=None),
+            memory.surroundings(task, (), results=None),
         )
         arrays = tuple(np.zeros(shape, dtype) for shape, dtype in layout.shapes)
         flags = np.zeros(1, np.bool_), np.zeros(1, np.bool_)
@@ -288,15 +287,8 @@ def _with_hooks_left(
 ) -> Result | None:
     """The whole result; None if there are numbers that are not finite."""
     left = env.inside.player.left
-    if "_is_truncated" in left:
-        truncated = as_flag("_is_truncated", env._is_truncated()) | truncated
-    if "_reward_policy" in left and "_get_observation" in left:
-        reward, observation = env._reward_and_observation()
-    elif "_reward_policy" in left:
-        reward = env._reward_policy()
-    elif "_get_observation" in left:
-        observation = env._get_observation()
-    reward = as_reward(reward)
+    concluded = observation, reward, terminated, truncated
+    observation, reward, _, truncated = conclude_left(env, NUMBERS, left, concluded)
     if not (isfinite(reward) and env.inside.is_finite(observation)):
         return None
     if "_get_info" in left:
@@ -386,17 +378,21 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
     """Compile the hooks, and compare the programs with them on states around the present one."""
     if _is_debugged():
         raise UntraceableError("a debugger is attached")
+    require_pure(env)
     near, far = (sample_states(env, (1.0,), states_around(env, r)) for r in _REACHES)
-    with unchanged_globals(env), borrowed(env):
+    with borrowed(env, outside=True) as contents:
         _call_hooks(env, column(near, 0))
-    with unchanged_globals(env):
-        with _repeated(env, numbers, len(near.step_count)):
-            task = compile_hooks(env, [near, far], numbers)
-        if "_get_inputs" in task.left:  # it would have to read before the FMU steps
-            raise UntraceableError("; ".join(task.left.values()))
-        difference = find_difference(env, near, task.left)
-        if difference is not None:
-            raise UntraceableError(difference)
+        changes = contents.changes()
+    changed = changes.outside or changes.added
+    if changed is not None:
+        raise UntraceableError(f"it changes {changed} outside of self")
+    with _repeated(env, numbers, len(near.step_count)):
+        task = compile_hooks(env, [near, far], numbers)
+    if "_get_inputs" in task.left:  # it would have to read before the FMU steps
+        raise UntraceableError("; ".join(task.left.values()))
+    difference = find_difference(env, near, task.left)
+    if difference is not None:
+        raise UntraceableError(difference)
     return task
 
 

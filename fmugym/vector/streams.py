@@ -24,7 +24,7 @@ from fmugym.task.generators import row_of, state_of
 if TYPE_CHECKING:
     from fmugym._native import Draws
 
-__all__ = ["EpisodeStreams", "given_draws"]
+__all__ = ["EpisodeStreams", "no_draws"]
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -148,9 +148,9 @@ class EpisodeStreams:
             self.states[index] = row_of(bits.state)
 
 
-def given_draws(plan: EpisodePlan) -> Draws:
-    """The draws of a plan as values that are drawn before the C extension needs them."""
-    return _draws([Recipe("given", (), (0.0, 0.0))] * len(plan.draws), plan.drawn_rows)
+def no_draws() -> Draws:
+    """Draws of the C extension that are none, because Python starts the episodes."""
+    return _draws((), ())
 
 
 def _native_draws(plan: EpisodePlan) -> Draws | None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
 from fmugym.task.values import EpisodeVariables, ParameterValues
 
-__all__ = ["batched", "column", "copied", "parts", "take"]
+__all__ = ["batched", "column", "some", "take"]
 
 
 def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) -> Readings:
@@ -48,25 +47,34 @@ def batched(env: FMUEnv, count: int, outputs: Any = None, inputs: Any = None) ->
     )
 
 
-def some(batch: Readings, indices: npt.NDArray[np.intp]) -> Readings:
-    """Return copies of what the hooks of some environments of a batch read, in the same form."""
-    values = batch.values[:, indices]
+def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> Readings:
+    """Return copies of what the hooks of some environments of a batch read, in the same form.
+
+    Args:
+        batch: What the hooks of all read.
+        which: Their indices, or a slice.
+    """
+    values: Any = _rows(batch.values, which)
     variables = EpisodeVariables(batch.variables)
-    variables.update({name: np.asarray(row)[..., indices] for name, row in batch.variables.items()})
+    variables.update({name: _rows(row, which) for name, row in batch.variables.items()})
+    parameters = ParameterValues((n, _rows(row, which)) for n, row in batch.parameters.items())
     return Readings(
         values=values,
         out=batch.out.over(lambda: values),
         state=values[: len(batch.state)],
-        previous_state=batch.previous_state[:, indices],
-        inputs=batch.inputs[:, indices],
-        action=batch.action[..., indices],
-        previous_action=batch.previous_action[..., indices],
-        step_count=batch.step_count[indices],
-        done=batch.done[indices],
-        after_end=batch.after_end[indices],
-        parameters=ParameterValues((n, row[indices]) for n, row in batch.parameters.items()),
+        parameters=MappingProxyType(parameters),
         variables=variables,
+        **{name: _rows(getattr(batch, name), which) for name in _ROWS},
     )
+
+
+def _rows(values: Any, which: Any) -> npt.NDArray[Any]:
+    return np.array(np.asarray(values)[..., which])
+
+
+_ROWS: Final = (
+    *("previous_state", "inputs", "action", "previous_action", "step_count", "done", "after_end"),
+)
 
 
 def column(batch: Readings, index: int) -> Readings:
@@ -98,37 +106,3 @@ def take(values: Any, index: int) -> Any:
     """Take one environment's part of an array that has the environments in its last axis."""
     part = np.asarray(values)[..., index]
     return part.item() if part.ndim == 0 and part.dtype.kind == "f" else part[()]
-
-
-def parts(batch: Readings, indices: Any) -> Readings:
-    """Return copies of what the hooks of some environments of a batch read."""
-    names = ("state", "previous_state", "inputs", "action", "previous_action", "step_count", "done")
-    rows = {name: np.asarray(getattr(batch, name))[..., indices] for name in names}
-    outputs: Any = np.asarray(batch.values)[..., indices]
-    variables = EpisodeVariables(batch.variables)
-    variables.update({name: np.asarray(v)[..., indices] for name, v in batch.variables.items()})
-    parameters = {name: np.asarray(v)[..., indices] for name, v in batch.parameters.items()}
-    return replace(
-        batch,
-        values=outputs,
-        out=batch.out.over(lambda: outputs),
-        parameters=MappingProxyType(ParameterValues(parameters)),
-        variables=variables,
-        **rows,
-    )
-
-
-def copied(batch: Readings) -> Readings:
-    """Copy all arrays of a batch, so that hooks may change them."""
-    outputs: Any = np.copy(batch.values)
-    variables = EpisodeVariables(batch.variables)
-    variables.update({name: np.copy(row) for name, row in batch.variables.items()})
-    names = ("state", "previous_state", "inputs", "action", "previous_action", "step_count", "done")
-    rows: dict[str, Any] = {name: np.copy(getattr(batch, name)) for name in names}
-    return replace(
-        batch,
-        values=outputs,
-        out=batch.out.over(lambda: outputs),
-        variables=variables,
-        **rows,
-    )

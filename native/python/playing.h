@@ -51,12 +51,8 @@ enum {
     REWARDS,
     TERMINATED,
     TRUNCATED,
-    DRAWN,
-    MASK,
     TURN_BUFFERS
 };
-
-enum { STEP_ACTIONS, STEP_DRAWN, STEP_ARGUMENTS };
 
 typedef struct {
     Py_buffer buffers[TURN_BUFFERS];

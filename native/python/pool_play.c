@@ -55,14 +55,6 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, int first,
     return true;
 }
 
-/* None stands for episodes that start where others end. */
-static bool take_arrays(PyPool *self, const Playing *playing, PyObject *const *args, PyTurn *t) {
-    return take_array_of_actions(playing, args[STEP_ACTIONS], 0, &t->buffers[ACTIONS]) &&
-           (args[STEP_DRAWN] == Py_None ||
-            take_bytes(args[STEP_DRAWN], &t->buffers[DRAWN], PyBUF_WRITABLE,
-                       playing->play.draws->count * self->pool.settings.count * sizeof(double)));
-}
-
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     const Py_buffer *b = t->buffers;
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
@@ -74,7 +66,6 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .terminated = b[TERMINATED].buf,
         .truncated = b[TRUNCATED].buf,
         .seen = t->seen,
-        .drawn = b[DRAWN].buf,
         .seen_sizes = t->seen_sizes,
     };
     t->call = (Call){
@@ -133,8 +124,14 @@ static void settle_results(const Playing *playing, const ResultArrays *arrays, P
     }
 }
 
-/* Lets episodes start where others end. */
+/* Lets episodes start where others have ended before this step. */
 static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
+    memcpy(arrays->memory[MASK_ARRAY], playing->play.ended, playing->play.count);
+}
+
+/* Lets them also start where others end in this step. */
+static void settle_starts_at_ends(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
     const size_t count = playing->play.count;
 
     t->turn.last_seen = arrays->last_memory;
@@ -142,17 +139,17 @@ static void settle_starts(const Playing *playing, const ResultArrays *arrays, Py
         t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
     }
     t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
-    t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
     for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
         t->seen_sizes[i] = (size_t)playing->judgement.seen_bytes[i] / count;
     }
 }
 
 /* The result, how many instances had trouble, whether any episode is at its end now, and None or
- * where episodes have started that follow others. */
+ * where episodes have started. */
 static PyObject *turn_result(const Playing *playing, const ResultArrays *arrays, const PyTurn *t) {
-    const bool any_started = t->ends.started > 0;
-    PyObject *result = results_of_step(playing->results, arrays, any_started);
+    const bool at_ends = t->turn.started != NULL;
+    const bool any_started = at_ends ? t->ends.started > 0 : t->turn.drawn != NULL;
+    PyObject *result = results_of_step(playing->results, arrays, any_started, at_ends);
     PyObject *tuple = result == NULL ? NULL : PyTuple_New(4);
 
     if (tuple == NULL) {
@@ -198,13 +195,13 @@ void release_turn(const Playing *playing, PyTurn *t) {
 }
 
 /* What comes before the FMUs' part fills nothing that it returns. */
-static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
+static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *actions) {
     const Playing *playing = playing_of(capsule);
     PyTurn t;
     bool done = false;
 
     clear_turn(playing, &t);
-    if (take_arrays(self, playing, args, &t)) {
+    if (take_array_of_actions(playing, actions, 0, &t.buffers[ACTIONS])) {
         settle_turn(self, playing, &t);
         done = play_turn(self, BEFORE, &t);
     }
@@ -212,25 +209,37 @@ static PyObject *play_before_with(PyPool *self, PyObject *capsule, PyObject *con
     return done ? Py_NewRef(Py_None) : NULL;
 }
 
-static bool provide(Results *results, bool starts, ResultArrays *arrays) {
+static bool provide(Results *results, bool starts, bool at_ends, ResultArrays *arrays) {
     return results_provide_step(results, arrays) &&
-           (!starts || results_provide_starts(results, arrays));
+           (!starts || results_provide_starts(results, at_ends, arrays));
 }
 
-static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *const *args) {
+static void settle_step(PyPool *self, const Playing *playing, bool starts, bool at_ends,
+                        const ResultArrays *arrays, PyTurn *t) {
+    settle_turn(self, playing, t);
+    settle_results(playing, arrays, t);
+    if (starts) {
+        settle_starts(playing, arrays, t);
+    }
+    if (at_ends) {
+        settle_starts_at_ends(playing, arrays, t);
+    }
+}
+
+static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *actions,
+                           bool at_ends) {
     const Playing *playing = playing_of(capsule);
-    const bool starts = args[STEP_DRAWN] == Py_None;
+    const Play *play = &playing->play;
+    const bool starts =
+        operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;
     PyTurn t;
     PyObject *result = NULL;
 
     clear_turn(playing, &t);
-    if (provide(playing->results, starts, &arrays) && take_arrays(self, playing, args, &t)) {
-        settle_turn(self, playing, &t);
-        settle_results(playing, &arrays, &t);
-        if (starts) {
-            settle_starts(playing, &arrays, &t);
-        }
+    if (provide(playing->results, starts, at_ends, &arrays) &&
+        take_array_of_actions(playing, actions, 0, &t.buffers[ACTIONS])) {
+        settle_step(self, playing, starts, at_ends, &arrays, &t);
         result = play_turn(self, operation, &t) ? turn_result(playing, &arrays, &t) : NULL;
     }
     results_drop(playing->results, &arrays);
@@ -254,32 +263,29 @@ bool has_results(const PyPool *self) {
     return playing->results != NULL;
 }
 
-static PyObject *play_by(PyObject *object, int operation, PyObject *const *args,
-                         Py_ssize_t nargs) {
+/* Keeps what was prepared alive while it plays. */
+static PyObject *play_by(PyObject *object, int operation, PyObject *actions, bool at_ends) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, STEP_ARGUMENTS) || !is_prepared(self) || !has_results(self)) {
-        return NULL;
-    }
-    if (operation != PLAY && args[STEP_DRAWN] == Py_None) {
-        PyErr_SetString(PyExc_TypeError, "episodes cannot start where others end in two parts");
+    if (!is_prepared(self) || !has_results(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = operation == BEFORE ? play_before_with(self, playing, args)
-                                           : play_with(self, operation, playing, args);
+    PyObject *result = operation == BEFORE
+                           ? play_before_with(self, playing, actions)
+                           : play_with(self, operation, playing, actions, at_ends);
     Py_DECREF(playing);
     return result;
 }
 
 PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return play_by(object, PLAY, args, nargs);
+    return has_arguments(nargs, 2) ? play_by(object, PLAY, args[0], args[1] == Py_True) : NULL;
 }
 
-PyObject *py_play_before(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return play_by(object, BEFORE, args, nargs);
+PyObject *py_play_before(PyObject *object, PyObject *actions) {
+    return play_by(object, BEFORE, actions, false);
 }
 
-PyObject *py_play_after(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    return play_by(object, AFTER, args, nargs);
+PyObject *py_play_after(PyObject *object, PyObject *actions) {
+    return play_by(object, AFTER, actions, false);
 }

@@ -72,9 +72,7 @@ static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *
            take_matrix(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN,
                        horizon, n) &&
            take_matrix(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, horizon,
-                       n) &&
-           take_matrix(args[DRAWN], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws->count, n);
+                       n);
 }
 
 static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
@@ -99,7 +97,7 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, MASK) || !is_prepared(self)) {
+    if (!has_arguments(nargs, TURN_BUFFERS) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);

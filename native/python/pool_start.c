@@ -1,4 +1,4 @@
-/* The methods of the type Pool that start episodes outside of a step: see play.h. */
+/* The method of the type Pool that starts episodes outside of a step: see play.h. */
 
 #include "playing.h"
 
@@ -14,51 +14,6 @@ static void do_start(PyPool *self, bool alone, void *context) {
     t->troubled = pool_start(&self->pool, &t->call, &t->ends.outside);
     t->ends.ended = memchr(play->ended, 1, play->count) != NULL;
 }
-
-static bool take_start_arrays(PyPool *self, const Playing *playing, PyObject *const *args,
-                              PyTurn *t) {
-    const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    Py_buffer *b = t->buffers;
-
-    return take_vector(args[0], &b[MASK], COPIED, "the mask", ITEM_BOOLEAN, n) &&
-           take_observations(self, playing, args[1], t) &&
-           take_matrix(args[2], &b[DRAWN], WRITTEN, "drawn", ITEM_FLOAT64,
-                       (Py_ssize_t)playing->play.draws->count, n);
-}
-
-/* How many instances had trouble, and whether any episode is at its end now. */
-static PyObject *start_result(const PyTurn *t) {
-    return Py_BuildValue("(nO)", (Py_ssize_t)t->troubled, t->ends.ended ? Py_True : Py_False);
-}
-
-static PyObject *start_with(PyPool *self, PyObject *capsule, PyObject *const *args) {
-    const Playing *playing = playing_of(capsule);
-    PyTurn t;
-    bool done = false;
-
-    clear_turn(playing, &t);
-    if (take_start_arrays(self, playing, args, &t)) {
-        settle_turn(self, playing, &t);
-        t.call.mask = (Mask){t.buffers[MASK].buf, t.buffers[MASK].strides[0]};
-        done = perform(self, RESET, do_start, &t) && !is_outside(&t) && report_messages(self);
-    }
-    release_turn(playing, &t);
-    return done ? start_result(&t) : NULL;
-}
-
-PyObject *py_start(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-
-    if (!has_arguments(nargs, 3) || !is_prepared(self)) {
-        return NULL;
-    }
-    PyObject *playing = Py_NewRef(self->playing);
-    PyObject *result = start_with(self, playing, args);
-    Py_DECREF(playing);
-    return result;
-}
-
-/* The usual reset of some episodes, with nothing between the options and what the caller gets */
 
 /* The mask of a dict that holds nothing else, borrowed; NULL, maybe with an exception, if there is
  * none. */

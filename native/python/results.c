@@ -10,12 +10,32 @@ struct Results {
     PyObject *parts;
     PyTypeObject *class;
     allocfunc allocate;
-    PyObject *tell; /* a function: what is told of the episodes that start */
+    PyObject *late, *unfilled, *tell; /* what infos tell of the episodes that start: see LateDict */
     size_t number_of_seen;
     Maker makers[RESULT_ARRAYS], last[MOST_SEEN];
     Form observations, infos;
     Observed *observed;
 };
+
+enum { DRAWN, MASK_OF_DRAWN, FINAL_OBS, MASK_OF_FINAL_OBS, FINAL_INFO, MASK_OF_FINAL_INFO, NAMES };
+
+static PyObject *names[NAMES]; /* of this process: other interpreters cannot load this extension */
+
+/* Making a name takes as long as setting an item. */
+static bool know_names(void) {
+    static const char *const texts[NAMES] = {"drawn",      "_drawn",     "final_obs",
+                                             "_final_obs", "final_info", "_final_info"};
+
+    for (int i = 0; i < NAMES; i++) {
+        if (names[i] == NULL) {
+            names[i] = PyUnicode_InternFromString(texts[i]);
+        }
+        if (names[i] == NULL) {
+            return false;
+        }
+    }
+    return true;
+}
 
 /* Taking over */
 
@@ -67,9 +87,9 @@ static bool take_ends(Results *r) {
 static bool take_parts(Results *r, PyObject *parts) {
     PyObject *observations, *infos, *shapes;
 
-    return PyArg_ParseTuple(parts, "O!OOO!O;results", &PyType_Type, &r->class, &observations,
-                            &infos, &PyTuple_Type, &shapes, &r->tell) &&
-           take_class(r) && numpy_import() && take_makers(r, shapes) &&
+    return PyArg_ParseTuple(parts, "O!OOO!(OOO);results", &PyType_Type, &r->class, &observations,
+                            &infos, &PyTuple_Type, &shapes, &r->late, &r->unfilled, &r->tell) &&
+           know_names() && take_class(r) && numpy_import() && take_makers(r, shapes) &&
            take_forms(r, observations, infos) && take_ends(r);
 }
 
@@ -150,8 +170,8 @@ static bool provide_last(Results *r, ResultArrays *a) {
     return true;
 }
 
-bool results_provide_starts(Results *r, ResultArrays *a) {
-    return provide_last(r, a) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
+bool results_provide_starts(Results *r, bool at_ends, ResultArrays *a) {
+    return (!at_ends || provide_last(r, a)) && provide_some(r, MASK_ARRAY, DRAWN_ARRAY + 1, a);
 }
 
 bool results_provide_reset(Results *r, ResultArrays *a) {
@@ -183,13 +203,22 @@ bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) 
 
 /* Returning */
 
-static bool add_starts(const Results *r, PyObject *infos, const ResultArrays *a) {
-    PyObject *told = PyObject_CallFunctionObjArgs(r->tell, a->arrays[DRAWN_ARRAY],
-                                                  a->arrays[MASK_ARRAY], NULL);
-    const bool added = told != NULL && PyDict_Update(infos, told) == 0;
+/* A dict that calls the function when it is read, which is rare. */
+static PyObject *told_late(const Results *r, const ResultArrays *a) {
+    PyObject *call = PyTuple_Pack(3, r->tell, a->arrays[DRAWN_ARRAY], a->arrays[MASK_ARRAY]);
+    PyObject *pending = PyDict_New(), *late = NULL;
 
-    Py_XDECREF(told);
-    return added;
+    if (pending != NULL && set_item(pending, r->unfilled, Py_XNewRef(call))) {
+        late = PyObject_CallFunctionObjArgs(r->late, pending, NULL);
+    }
+    Py_XDECREF(call);
+    Py_XDECREF(pending);
+    return late;
+}
+
+static bool add_starts(const Results *r, PyObject *infos, const ResultArrays *a) {
+    return set_item(infos, names[DRAWN], told_late(r, a)) &&
+           set_item(infos, names[MASK_OF_DRAWN], Py_NewRef(a->arrays[MASK_ARRAY]));
 }
 
 static Origin origin_of(const Results *r, const ResultArrays *a) {
@@ -205,13 +234,6 @@ static PyObject *infos_within(const Origin *origin, const Form *form) {
     return infos;
 }
 
-static bool set_named(PyObject *dict, const char *name, PyObject *object) {
-    const bool is_set = object != NULL && PyDict_SetItemString(dict, name, object) == 0;
-
-    Py_XDECREF(object);
-    return is_set;
-}
-
 static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
     const char *mask = a->memory[MASK_ARRAY];
     Origin origin = origin_of(r, a);
@@ -219,26 +241,28 @@ static bool add_ends(Results *r, PyObject *infos, const ResultArrays *a) {
     origin.memory = a->last_memory;
     origin.mask = mask;
     PyObject *observed = observed_of(r->observed, mask, a->last, a->last_memory);
-    return set_named(infos, "final_obs", observed) &&
-           set_named(infos, "_final_obs", infos_mask(&origin)) &&
-           set_named(infos, "final_info", infos_within(&origin, &r->infos)) &&
-           set_named(infos, "_final_info", infos_mask(&origin));
+    return set_item(infos, names[FINAL_OBS], observed) &&
+           set_item(infos, names[MASK_OF_FINAL_OBS], infos_mask(&origin)) &&
+           set_item(infos, names[FINAL_INFO], infos_within(&origin, &r->infos)) &&
+           set_item(infos, names[MASK_OF_FINAL_INFO], infos_mask(&origin));
 }
 
-static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started) {
+static PyObject *infos_of_step(Results *r, const ResultArrays *a, bool any_started,
+                               bool at_ends) {
     const Origin origin = origin_of(r, a);
     PyObject *infos = infos_within(&origin, &r->infos);
 
-    if (infos != NULL && any_started && (!add_starts(r, infos, a) || !add_ends(r, infos, a))) {
+    if (infos != NULL && any_started &&
+        (!add_starts(r, infos, a) || (at_ends && !add_ends(r, infos, a)))) {
         Py_CLEAR(infos);
     }
     return infos;
 }
 
 /* Makes the tuple without the constructor of its class, which takes several times as long. */
-PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started) {
+PyObject *results_of_step(Results *r, const ResultArrays *a, bool any_started, bool at_ends) {
     PyObject *observations = form_of(&r->observations, a->arrays);
-    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started);
+    PyObject *infos = observations == NULL ? NULL : infos_of_step(r, a, any_started, at_ends);
     PyObject *result = infos == NULL ? NULL : r->allocate(r->class, 5);
 
     if (result == NULL) {

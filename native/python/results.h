@@ -26,8 +26,9 @@ typedef struct {
 
 /* Takes a tuple: the class of a step's result; the forms of observations and of infos (see forms.h);
  * the shape and type of each array: those of observations and infos, then rewards, terminated,
- * truncated, mask and drawn values; and a function of drawn values and a mask that returns what infos
- * tell of the episodes that start. Returns NULL with an exception if it does not fit. */
+ * truncated, mask and drawn values; and, for what infos tell of the episodes that start, the class
+ * LateDict, the key of what fills it, and a function of drawn values and a mask that does so. Returns
+ * NULL with an exception if it does not fit. */
 Results *results_take(PyObject *parts);
 void results_free(Results *results);
 
@@ -40,8 +41,9 @@ size_t results_size(const Results *results, size_t array);
  * them in any case. */
 bool results_provide_step(Results *results, ResultArrays *arrays);
 bool results_provide_reset(Results *results, ResultArrays *arrays);
-/* Provides, after results_provide_step, what it takes besides if episodes start where others end. */
-bool results_provide_starts(Results *results, ResultArrays *arrays);
+/* Provides, after results_provide_step, what it takes besides if episodes start; and if they do so
+ * where others end. */
+bool results_provide_starts(Results *results, bool at_ends, ResultArrays *arrays);
 void results_drop(const Results *results, ResultArrays *arrays);
 
 /* Copies a mask to the array of the mask. Returns false if it is no array that this can be done
@@ -50,7 +52,8 @@ bool results_copy_mask(const Results *results, PyObject *mask, const ResultArray
 
 /* Returns the result of a step. If episodes have started where others have ended, the infos are those
  * of Gymnasium's mode SAME_STEP. */
-PyObject *results_of_step(Results *results, const ResultArrays *arrays, bool any_started);
+PyObject *results_of_step(Results *results, const ResultArrays *arrays, bool any_started,
+                          bool at_ends);
 /* Returns the observations and infos of a reset. */
 PyObject *results_of_reset(Results *results, const ResultArrays *arrays);
 

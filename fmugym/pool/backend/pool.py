@@ -22,7 +22,7 @@ from fmugym.pool.backend.clock import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
-from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
+from fmugym.pool.base import FloatArray, MaskArray, Play, PoolSpec, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.health import Column, CountedPool, no_counts, note
 from fmugym.pool.spec import is_start_time
@@ -103,6 +103,12 @@ class BackendPool(CountedPool):
             return Worker(name)
         patience = paced.patience(self._spec.time_step)
         return Worker(name, paced.clock, Idle(rig.hold, patience))
+
+    def prepare_play(self, *parts: Any) -> Play:
+        """See ``Pool.prepare_play``."""
+        from fmugym.pool.around import PlayAround
+
+        return PlayAround(self, self._spec).prepare(*parts)
 
     @property
     def is_real(self) -> bool:

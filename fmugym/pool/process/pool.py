@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
     MaskArray,
-    Played,
+    Play,
     PoolSpec,
     StatusArray,
     available_processors,
@@ -46,7 +46,6 @@ from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
-    from fmugym.pool.process.play import PlayAround
     from fmugym.pool.process.rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
@@ -235,25 +234,22 @@ class ProcessPool(SavingPool):
 
     # Compiled hooks
 
-    @property
-    def can_play(self) -> bool:
-        """See ``Pool.can_play``: the programs run in this process, around the workers' steps."""
-        return not self._spec.licence_wait
+    def prepare_play(self, *parts: Any) -> Play:
+        """See ``Pool.prepare_play``: the programs run in this process, around workers' steps."""
+        from fmugym.pool.around import PlayAround
 
-    def prepare_play(self, *parts: Any, **named: Any) -> Callable[..., Played]:
-        """See ``Pool.prepare_play``."""
         self._plays += 1
-        self._parts, self._play = (*parts, *named.values()), None
-        return self._around().prepare(*parts, **named)
+        self._parts, self._play = parts, None
+        return PlayAround(self, self._spec).prepare(*parts)
 
     @property
     def rolls_out(self) -> bool:
         """See ``Pool.rolls_out``; the program in Wine runs no hooks."""
-        return self.can_play and self._setup.wine is None
+        return self._setup.wine is None
 
     def roll_out(self, *arrays: Any) -> int:
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
-        actions, seen, *judged, _ = arrays
+        actions, seen, *judged = arrays
         play = self._play = self._play or self._describe_play()
 
         def tell(supervisor: Supervisor) -> None:
@@ -271,25 +267,6 @@ class ProcessPool(SavingPool):
         from fmugym.pool.process.rollouts import PlayOfWorkers
 
         return PlayOfWorkers(self._arrays, self._parts[1:])
-
-    def _around(self) -> PlayAround:
-        """Make what runs compiled hooks around the workers' steps."""
-        if not self.can_play:
-            raise SimulationError("compiled hooks need the native pool")
-        from fmugym.pool.process.play import PlayAround
-
-        return PlayAround(self._setup, self._arrays, self._advance)
-
-    def _advance(
-        self, variables: tuple[Variable, ...], values: FloatArray, starting: MaskArray
-    ) -> None:
-        """Reset the instances that start an episode, and step the others."""
-        with self._lock:
-            skip = None
-            if np.count_nonzero(starting):
-                skip = starting
-                self.reset(variables, values, starting)
-            self._step(skip)
 
     def save(self) -> SnapshotOfWorkers:
         """See ``SavingPool.save``."""

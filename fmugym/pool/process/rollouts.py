@@ -191,7 +191,7 @@ class RollingWorker:
         flags: tuple[MaskArray, ...] = np.empty(shape, np.bool_), np.empty(shape, np.bool_)
         judged = np.empty(shape), *flags
         arrays = seen[0] if start.is_whole else seen
-        troubled = self._pool.roll_out(start.actions, arrays, *judged, np.zeros((0, n)))
+        troubled = self._pool.roll_out(start.actions, arrays, *judged)
         return troubled, (*seen, *judged)
 
 

@@ -32,12 +32,15 @@ class Engine(ABC):
     """Drives N environments; the caller decides when an ended one starts again.
 
     Attributes:
+        way: The way of calling hooks, see ``FMUVectorEnv``.
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
         has_moved: Whether the last step or reset got as far as the FMUs.
         starts_at_ends: Whether the caller wants the next episode to start in the step that ends one
             (the mode ``SAME_STEP``). An engine may leave that to ``reset``.
     """
+
+    way: str
 
     def __init__(self, num_envs: int) -> None:
         self.ended = np.zeros(num_envs, np.bool_)

@@ -1,9 +1,10 @@
-"""N environments whose hooks run once for all of them, on arrays."""
+"""N environments whose hooks run as programs in the pool's step, or in Python on arrays."""
 
 from __future__ import annotations
 
+import logging
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -17,9 +18,11 @@ from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
+from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
 from fmugym.pool.patience import failed_reset
+from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.construction import plan_of, plan_of_reset
@@ -27,7 +30,7 @@ from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
-from fmugym.task.step import conclude
+from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.task.warm_up import WarmUps
 from fmugym.vector.actions import checked_actions
@@ -35,43 +38,61 @@ from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.engines.layout import Layout
+from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import results
-from fmugym.vector.infos import copy_rows, drawn_info, not_finite, observation_of
+from fmugym.vector.hooks.memory import Memory
+from fmugym.vector.hooks.trace import TracedTask
+from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
-from fmugym.vector.streams import EpisodeStreams
-from fmugym.vector.views import batched, column, parts, some, take
+from fmugym.vector.streams import EpisodeStreams, no_draws
+from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
 
 IndexArray = npt.NDArray[np.intp]
 
 
+logger = logging.getLogger(__name__)
+
+_BOOL = np.dtype(np.bool_)
+
+_REFUSALS = (TypeError, ValueError, BufferError)
+"""What the pool raises if it does not take the arguments of a step."""
+
+
 class BatchEngine(Engine):
     """Turns a prototype into N environments; from then on, its hooks read arrays.
+
+    The pool does a step in one call, programs included. Python calls the hooks that have no program
+    before or after it, once for all environments. The pool also starts episodes by itself, unless
+    there is something to do that only Python can: see ``_pool_starts``.
 
     Args:
         env: The prototype, made with a pool of N instances.
         num_envs: N.
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
+        task: From ``find_programs``.
     """
 
-    def __init__(self, env: FMUEnv, num_envs: int, max_episode_steps: int | None) -> None:
+    def __init__(
+        self, env: FMUEnv, num_envs: int, max_episode_steps: int | None, task: TracedTask
+    ) -> None:
         super().__init__(num_envs)
         self.env = env
         self._n = num_envs
         self._pool = env.inside.pool
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
-        self._longest = 0
         self._idle: MaskArray | None = None
         self._foreign = np.zeros(num_envs, np.bool_)
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
-        self._outputs_before: FloatArray = self._pool.outputs
-        self._variables_before: dict[str, FloatArray] = {}
         self._make_parameters(env.inside.plan)
+        self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
+        self._prepare(task)
         self._note_foreign(slice(None), False)
 
     def _make_parameters(self, plan: EpisodePlan) -> None:
@@ -80,9 +101,49 @@ class BatchEngine(Engine):
         self._parameters = ParameterValues(
             zip(plan.parameter_names, self._start_values, strict=True)
         )
+        self._known = set(self._parameters)
         strings = self.env.fmu.description.strings
         shown = ShownParameters(self._parameters, strings) if strings else self._parameters
         self.env.parameters = MappingProxyType(shown)
+
+    def _prepare(self, task: TracedTask) -> None:
+        """Give the pool everything it needs for steps."""
+        env, memory, streams = self.env, self._memory, self._streams
+        plan, draws = env.inside.plan, streams.native_draws(env.inside.plan)
+        drawn = () if draws is None else plan.draws
+        self._task, self._left = task, task.left
+        self._left_after = {hook for hook in task.left if hook != "_get_inputs"}
+        self.way = "compiled" if task.is_compiled else "array"
+        memory.parameters = self._parameters
+        memory.hold(task)
+        layout = Layout(task, env, self._n)
+        self._new_arrays, self._divided = layout.new_arrays, layout.divided
+        flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
+        drawn_array = (len(drawn), self._n), real
+        arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
+        tell = late_info(plan)
+        self._play = self._pool.prepare_play(
+            plan.model_variables,
+            memory.programs(task),
+            memory.action_group(),
+            self._start_values,
+            (no_draws() if draws is None else draws, streams.states),
+            (env.step_count, self.ended, self._limit),
+            memory.surroundings(task, drawn, (StepResult, *layout.form, arrays, tell)),
+        )
+        has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
+        is_free = env.inside.warm_ups is None and not self._pool.is_attended
+        self._may_start = self._pool.plays_alone and has_all_starts and is_free
+        self._starts_at_ends = self._may_start and not self._left_after
+
+    @property
+    def _pool_starts(self) -> bool:
+        """Whether the pool itself starts episodes, in its step or in a reset.
+
+        Python does so where others step the FMUs, where it has to draw values or to set episode
+        variables, where something goes with resets, and where constants are not those of the plan.
+        """
+        return self._may_start and not self._any_foreign
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -93,6 +154,7 @@ class BatchEngine(Engine):
         self._make_parameters(env.inside.plan)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
+        self._prepare(self._task)
         self._note_foreign(slice(None), True)
 
     def seed_of(self, index: int) -> int | None:
@@ -148,6 +210,19 @@ class BatchEngine(Engine):
             self._columns.pop(name, None)
             if is_row:
                 self._columns[name] = value
+        self._compile_again()
+
+    def _compile_again(self) -> None:
+        """Make other programs: they contain what attributes were, and know some parameters only."""
+        if not self._task.is_compiled:
+            return
+        task = TracedTask.without_programs(self.env)
+        try:
+            task = compile_hooks(self.env, [Readings.of(self.env)], self._columns)
+        except ordinary(Exception) as reason:  # as in find_programs
+            logger.info("the hooks cannot be compiled any more: %s", reason)
+        finally:
+            self._prepare(task)
 
     def call(
         self,
@@ -171,7 +246,8 @@ class BatchEngine(Engine):
         }
         if attributes:
             self._assign(attributes)
-        self.env.variables.update(variables)
+        for variable, row in variables.items():
+            self._row(variable)[...] = row
         return returned
 
     def evaluate(
@@ -201,6 +277,9 @@ class BatchEngine(Engine):
         """Note which environments have another plan's constants: from options, or an older plan."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
+        if self._parameters.keys() != self._known:
+            self._known = set(self._parameters)
+            self._compile_again()
 
     # Episodes.
 
@@ -211,16 +290,59 @@ class BatchEngine(Engine):
         self.has_moved = False
         indices = np.flatnonzero(mask)
         self._streams.seed(seeds, indices)
+        self._streams.require_seeds()
+        started = None if options else self.reset_by({"reset_mask": mask})
+        if started is not None:
+            return started
         plan = plan_of_reset(self.env, options, "reset_mask")
-        drawn = self._begin(mask, indices, plan)
+        drawn = self._streams.draw(plan, indices)
+        self._begin(mask, indices, plan, drawn)
+        try:
+            observations, infos = self._seen_at_start(None, {}, mask, ORDER)
+        finally:
+            self.note_starts(mask)
+        return observations, infos | self._told(plan, drawn, mask.copy())
+
+    def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
+        """See ``Engine.reset_by``."""
+        if not self._pool_starts or self._play.reset is None:
+            return None
+        try:
+            done = self._play.reset(options)
+        except BaseException:
+            self.has_moved = True
+            raise
+        if done is None:
+            return None
+        result, troubled, self.any_ended = done
+        if not troubled and not self._left_after:
+            return result
+        observations, infos = result
+        mask, self.has_moved = infos["_drawn"], True
+        if troubled:
+            self._require_started(np.flatnonzero(mask), self._pool.statuses)
+        return self._seen_at_start(observations, infos, mask, self._left)
+
+    def _seen_at_start(
+        self, observations: Any, infos: dict[str, Any], mask: MaskArray, hooks: Container[str]
+    ) -> tuple[Any, dict[str, Any]]:
+        """Let hooks tell what is seen where episodes have started; refuse impossible starts."""
         self.env.inside.in_hooks = True
         try:
-            observations = self._observe()
+            if "_get_observation" in hooks:
+                observations = self._observe()
             self._require_finite_start(observations, mask)
-            return observations, self._infos(mask) | drawn_info(plan, drawn, mask.copy())
+            if "_get_info" in hooks:
+                infos = self._infos(mask) | infos
+            return observations, infos
         finally:
             self.env.inside.in_hooks = False
-            self.note_starts(mask)
+
+    def _told(self, plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+        """What infos tell of the episodes that have started in a mask."""
+        of_all = np.zeros((len(drawn), self._n))
+        of_all[:, mask] = drawn
+        return drawn_info(plan, of_all, mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
@@ -231,9 +353,10 @@ class BatchEngine(Engine):
                 f"environment {index}: the first observation is not finite: {first}"
             )
 
-    def _begin(self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan) -> FloatArray:
-        """Draw and start episodes; return the values, shape (draws, N)."""
-        drawn = self._streams.draw(plan, indices)
+    def _begin(
+        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, drawn: FloatArray
+    ) -> None:
+        """Start episodes with values that were drawn, shape (draws, M)."""
         values = self._place_episodes(drawn, indices, plan)
         self.has_moved = True
         warm_ups = self.env.inside.warm_ups
@@ -242,9 +365,6 @@ class BatchEngine(Engine):
             self._forget(indices, plan)
         else:
             self._begin_with_warm_up(warm_ups, indices, plan, values)
-        drawn_by_all = np.zeros((len(drawn), self._n))
-        drawn_by_all[:, indices] = drawn
-        return drawn_by_all
 
     def _reset_pool(
         self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, values: FloatArray
@@ -279,7 +399,7 @@ class BatchEngine(Engine):
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
         self._reset_pool(mask, indices, plan, values)
-        written = warm_ups.run(self._pool, parts(Readings.of(self.env), indices), indices)
+        written = warm_ups.run(self._pool, some(Readings.of(self.env), indices), indices)
         self._place(written, written.values(), indices)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
@@ -371,7 +491,6 @@ class BatchEngine(Engine):
         self._streams.require_seeds()
         self.ended[where] = columns["ended"][whence]
         self.any_ended = bool(np.count_nonzero(self.ended))
-        self._longest = max(self._longest, int(self.env.step_count.max()))
         self._note_foreign(indices, self._has_other_constants(columns["parameters"]))
 
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
@@ -410,49 +529,106 @@ class BatchEngine(Engine):
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
-        env, pool = self.env, self._pool
-        self.has_moved = False
-        actions = self._checked(actions)
-        env.inside.in_hooks = True
+        if self._left or (resetting is not None and not self._pool_starts):
+            actions = self._checked_before(actions, resetting)
+        at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
+        step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
+        self.has_moved = True  # unless the call refuses its arguments
+        played: Played
         try:
-            self._take_actions(actions, resetting)
-            if resetting is not None:
-                drawn = self._begin(resetting, resetting.nonzero()[0], env.inside.plan)
-            observed = self._new_observations()
-            self.has_moved = True
-            pool.step(None, resetting, observed)
-            env.step_count += 1
-            if resetting is None:
-                return self._evaluate(observed, None)
-            env.step_count[resetting] = 0
-            result = self._evaluate(observed, resetting)
-            result.infos.update(drawn_info(env.inside.plan, drawn, resetting.copy()))
-            return result
-        finally:
-            env.inside.in_hooks = False
+            if step is None or (resetting is not None and not self._pool_starts):
+                played = self._step_pool(actions, resetting)
+            else:
+                played = step(actions, at_ends)
+        except _REFUSALS as error:
+            return self.step(self._converted(actions, error), resetting)
+        result: StepResult
+        result, troubled, self.any_ended, started = played
+        if troubled or self._left_after:
+            return self._completed(result, troubled, started)
+        return result
 
-    def _take_actions(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
+    def _checked_before(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:
+        """Check actions before anything is drawn, and call ``_get_inputs`` if it has no program."""
+        self.has_moved = False
+        checked = self._flat(actions)
+        if "_get_inputs" in self._left:
+            self._call_get_inputs(checked, resetting)
+        return checked
+
+    @passes_refusals
+    def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
+        """Start the episodes in the mask, and let the FMUs of the other environments step."""
+        play, plan = self._play, self.env.inside.plan
+        if starting is None:
+            play.before(actions)
+            self._pool.step()
+            return play.after(actions)
+        indices = starting.nonzero()[0]
+        drawn = self._streams.draw(plan, indices)
+        play.before(actions)
+        self._begin(starting, indices, plan, drawn)
+        self._pool.step(None, starting)
+        result, troubled, any_ended, _ = play.after(actions)
+        result.infos.update(self._told(plan, drawn, starting))
+        return result, troubled, any_ended, starting
+
+    def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
+        """The actions in the form that the pool takes, if it has refused another one."""
+        require_refusal(error)
+        self.has_moved = False
+        converted = self._flat(actions)
+        if converted is actions:
+            raise error
+        return converted
+
+    def _flat(self, actions: Any) -> npt.NDArray[Any]:
+        """The actions as the pool takes them, environments first.
+
+        Raises:
+            ConfigError: If they do not fit.
+        """
+        space: Any = self.env.action_space
+        with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+            array = checked_actions(space, self._n, actions).astype(space.dtype, copy=False)
+        return np.require(array, requirements=["C", "A"])
+
+    def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
+        """See ``Engine.roll_out``."""
+        if self._left or not self._pool.rolls_out:
+            return None
+        horizon = len(actions)
+        shape = horizon, self._n
+        judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
+        seen = self._arrays_of_steps(horizon)
+        self.has_moved = True
+        arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
+        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged):
+            return None
+        return seen if self._divided is None else self._divided(seen)[0], *judged
+
+    def _arrays_of_steps(self, horizon: int) -> Any:
+        """Make the arrays of many steps, with a first axis for the steps."""
+        arrays = self._new_arrays()
+        if isinstance(arrays, tuple):
+            return tuple(_for_steps(array, horizon) for array in arrays)
+        if isinstance(arrays, dict):
+            return {name: _for_steps(array, horizon) for name, array in arrays.items()}
+        return _for_steps(arrays, horizon)
+
+    # Hooks without a program.
+
+    def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
+        """Call this hook on arrays, before the pool takes over the actions."""
         env = self.env
         before = env.action, env.previous_action, env.previous_state
-        env.previous_action, env.action = env.action, actions
-        self._outputs_before = self._pool.outputs.copy()
-        env.previous_state = self._outputs_before[: env.inside.output_count]
+        env.previous_action, env.action = env.action, np.moveaxis(actions, 0, -1)
+        env.previous_state, env.inside.in_hooks = env.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
-        except BaseException:  # no FMU was touched: valid actions may follow
+        finally:
+            env.inside.in_hooks = False
             env.action, env.previous_action, env.previous_state = before
-            raise
-
-    def _checked(self, actions: Any) -> npt.NDArray[Any]:
-        """Copy the actions, with environments on the last axis, as hooks expect."""
-        space: Any = self.env.action_space
-        array = checked_actions(space, self._n, actions)
-        if array.dtype != space.dtype:
-            with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
-                array = array.astype(space.dtype)
-        if array.ndim <= 2:
-            return np.ascontiguousarray(array.T)
-        return np.ascontiguousarray(np.moveaxis(array, 0, -1))
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
@@ -479,34 +655,43 @@ class BatchEngine(Engine):
                     f"an input of environment {index} is not finite: {inputs[:, index]}"
                 )
 
-    def _new_observations(self) -> npt.NDArray[np.float32] | None:
-        if not self.env.inside.pool_observes:
-            return None
-        return np.empty((self._n, self.env.inside.output_count), np.float32)
-
-    def _evaluate(self, observed: Any, resetting: MaskArray | None) -> StepResult:
-        env, statuses = self.env, self._pool.statuses
-        has_faults = bool(np.count_nonzero(statuses))
-        stopped = self._stopped(statuses) if has_faults else False
-        self._idle = self._failed(statuses) if has_faults else None
-        if resetting is not None:
-            self._idle = resetting if self._idle is None else self._idle | resetting
-        concluded = conclude(env, self, stopped, self._reached_limit(), observed)
-        observations, rewards, terminated, truncated = concluded
-        if resetting is not None:
-            terminated[resetting] = truncated[resetting] = False
-            rewards[resetting] = 0.0
-        if observed is None:
-            observations = results.observations(observations, env.observation_space, self._n)
-        infos = self._infos(np.ones(self._n, np.bool_)) if env.inside.has_info else {}
-        result = StepResult(observations, rewards, terminated, truncated, infos)
-        wrong = not_finite(observations)
-        if resetting is not None and wrong is not None:
-            self._require_finite_start(observations, resetting)
-        env.done = terminated.copy()  # the caller may change what it gets
-        self._handle_faults(result, statuses, has_faults, wrong)
-        self.note_ends(terminated, truncated)
+    def _completed(
+        self, result: StepResult, troubled: int, started: MaskArray | None
+    ) -> StepResult:
+        """Call the hooks that are not compiled, and handle faults."""
+        if self._left_after:
+            result = self._with_hooks_left(result, troubled, started)
+        wrong = not_finite(result.rewards), not_finite(result.observations)
+        if troubled or any(rows is not None for rows in wrong):
+            self._mend(result, started, wrong)
         return result
+
+    def _with_hooks_left(
+        self, result: StepResult, troubled: int, started: MaskArray | None
+    ) -> StepResult:
+        """Call the hooks that are not compiled, in their order."""
+        env, left = self.env, self._left
+        self._idle = self._failed(self._pool.statuses) if troubled else None
+        if started is not None:
+            self._idle = started if self._idle is None else self._idle | started
+        env.inside.in_hooks = True
+        try:
+            concluded = conclude_left(env, self, left, result[:-1])
+            observations, rewards, terminated, truncated = concluded
+            if "_get_observation" in left:
+                observations = results.observations(observations, env.observation_space, self._n)
+            infos = result.infos
+            if "_get_info" in left:
+                infos = self._infos(np.ones(self._n, _BOOL)) | infos
+        finally:
+            env.inside.in_hooks = False
+        if started is not None:
+            terminated[started] = truncated[started] = False
+            rewards[started] = 0.0
+        if "_is_done" in left:
+            self._memory.keep_done(terminated)
+        self.note_ends(terminated, truncated)
+        return StepResult(observations, rewards, terminated, truncated, infos)
 
     # The form of what hooks return.
 
@@ -531,7 +716,7 @@ class BatchEngine(Engine):
         """
         variables = env.variables
         before = {name: self._row(name) for name in variables}
-        self._variables_before = {name: row.copy() for name, row in before.items()}
+        self._memory.before = {name: row.copy() for name, row in before.items()}
         env._update()
         for name, row in before.items():
             if variables[name] is not row:
@@ -548,17 +733,8 @@ class BatchEngine(Engine):
         )
 
     def _restore_variables(self, mask: MaskArray) -> None:
-        for name, values in self._variables_before.items():
+        for name, values in self._memory.before.items():
             results.restore_variable(name, self._row(name), mask, values)
-
-    def _reached_limit(self) -> MaskArray:
-        """Find the episodes at their limit; compare only if the longest may have reached it."""
-        self._longest += 1
-        if self._longest < self._limit:
-            return np.zeros(self._n, np.bool_)
-        self._longest = int(self.env.step_count.max())
-        reached: MaskArray = self.env.step_count >= self._limit
-        return reached
 
     def _observe(self) -> Any:
         env = self.env
@@ -580,22 +756,54 @@ class BatchEngine(Engine):
         failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
         return failed
 
+    def _mend(
+        self,
+        result: StepResult,
+        started: MaskArray | None,
+        wrong: tuple[MaskArray | None, MaskArray | None],
+    ) -> None:
+        """Handle failures and numbers that are not finite: rare, so numpy is fast enough.
+
+        Args:
+            result: Of the step; it is corrected.
+            started: Which environments have started an episode in this step.
+            wrong: Where rewards and observations are not finite.
+        """
+        if started is not None:
+            self._require_started(np.flatnonzero(started), self._pool.statuses)
+            self._require_finite_start(result.observations, started)
+        self._require_possible_inputs(started)
+        self.env.inside.in_hooks = True
+        try:
+            self._handle_faults(result, self._pool.statuses, wrong)
+        finally:
+            self.env.inside.in_hooks = False
+        self.note_ends(result.terminated, result.truncated)
+        if started is not None:
+            self.note_starts(started)
+
+    def _require_possible_inputs(self, resetting: MaskArray | None) -> None:
+        """Refuse inputs that are not finite, which they also are outside of their type's range."""
+        inputs = self._pool.inputs
+        if not self.env.inside.input_writer.all_real and not np.isfinite(inputs).all():
+            wanted = np.array(inputs)
+            results.write_inputs(self.env._get_inputs(), wanted)
+            for index in self._stepping(resetting):
+                fmu_spaces.to_input_types(self.env.inside.interface.inputs, wanted[:, index])
+        self._require_finite_inputs(resetting)
+
     def _handle_faults(
         self,
         result: StepResult,
         statuses: StatusArray,
-        has_faults: bool,
-        wrong_observations: MaskArray | None,
+        wrong: tuple[MaskArray | None, MaskArray | None],
     ) -> None:
         """Handle FMUs that failed or asked to stop, and numbers that are not finite."""
-        wrong_rewards = not_finite(result.rewards)
-        if not has_faults and wrong_rewards is None and wrong_observations is None:
-            return
         stopped, failed = self._stopped(statuses), self._failed(statuses)
         if stopped.any():
             result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
-        for rows in (wrong_rewards, wrong_observations):
+        for rows in wrong:
             for index in _indices(rows, ~failed):
                 reasons[index] = self._not_finite(result, index)
         if reasons:
@@ -634,7 +842,7 @@ class BatchEngine(Engine):
 
     def _undo(self, mask: MaskArray) -> None:
         """Return environments to the state before a step whose numbers are not finite."""
-        self._pool.outputs[:, mask] = self._outputs_before[:, mask]
+        self._pool.outputs[:, mask] = self._memory.kept[:, mask]
         if self.env.inside.own.update:
             self._restore_variables(mask)
         for index in np.flatnonzero(mask).tolist():
@@ -684,3 +892,7 @@ def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
     return row
+
+
+def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
+    return np.empty((horizon, *array.shape), array.dtype)

@@ -7,42 +7,30 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import compress
-from math import isfinite
 from operator import not_
 from types import MappingProxyType
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.vector.utils import iterate
+from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
-from fmugym.task.actions import blame, require_usable
+from fmugym.task.actions import take_action
 from fmugym.task.construction import plan_of, prepare_hooks
-from fmugym.task.judging import (
-    IN_POOL,
-    Result,
-    fault_of_hooks,
-    first_observation,
-    info_of,
-    judged,
-)
+from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
-from fmugym.task.step import conclude
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.base import Engine, StepResult
-from fmugym.vector.engines.outcomes import Outcomes, Unconverted
-from fmugym.vector.engines.taken import Taken, in_time
-from fmugym.vector.stacking import PoolStack, Stack, make_stack
 
 __all__ = ["PerEnvEngine"]
 
@@ -58,6 +46,8 @@ class PerEnvEngine(Engine):
         max_episode_steps: Truncates episodes, in addition to the config's own limit.
         action_space: The space of the actions of all environments.
     """
+
+    way = "per_env"
 
     def __init__(
         self,
@@ -76,26 +66,7 @@ class PerEnvEngine(Engine):
         self._checks_all = self._together and is_array_space(envs[0].action_space)
         self._limit = max_episode_steps or sys.maxsize
         self._action_space = action_space
-        self._stack = stack = self._make_stack()
-        self._observed = IN_POOL if isinstance(stack, PoolStack) else None
-        self._take = stack.take
-        self._form = Unconverted()
-        self._acts_directly: bool | None = None
-
-    def _make_stack(self) -> Stack | PoolStack:
-        space, shared = self._envs[0].observation_space, self._pool.observations
-        is_default = self._together and all(env.inside.pool_observes for env in self._envs)
-        fits = shared.dtype == space.dtype and shared.shape[1:] == space.shape
-        return PoolStack(shared) if is_default and fits else make_stack(space, len(self._envs))
-
-    def _are_direct(self) -> bool:
-        """Whether the actions are the inputs of all, so that no hook has to be asked for them."""
-        if self._acts_directly is None:
-            self._acts_directly = self._checks_all and all(
-                env.inside.action_values is None and "_get_inputs" not in vars(env)
-                for env in self._envs
-            )
-        return self._acts_directly and type(self._envs[0])._get_inputs is FMUEnv._get_inputs
+        self._observations: list[Any] = [None] * len(envs)
 
     def close(self) -> None:
         """See ``Engine.close``."""
@@ -124,7 +95,6 @@ class PerEnvEngine(Engine):
     ) -> list[Any]:
         """See ``Engine.call``."""
         values = [attribute(self._envs[index], name) for index in indices]
-        self._acts_directly = None  # a method may replace a hook
         return [v(*arguments, **keywords) if callable(v) else v for v in values]
 
     def evaluate(
@@ -153,21 +123,21 @@ class PerEnvEngine(Engine):
         for index in np.flatnonzero(mask).tolist():
             seed = None if seeds is None else seeds[index]
             observation, infos[index] = self._reset(index, seed, options)
-            self._stack.put(index, observation)
-        self._acts_directly = None  # a reset may have replaced hooks
+            self._observations[index] = _copied(observation)
         self.note_starts(mask)
-        return self._stack.joined(), gathered(infos, len(self._envs))
+        return self._joined(), gathered(infos, len(self._envs))
 
     def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
         """See ``Engine.step``."""
         self.has_moved = False
         items = self._actions(actions)
-        idle = [False] * len(items) if resetting is None else resetting.tolist()
+        starting = [False] * len(items) if resetting is None else resetting.tolist()
         try:
-            running = [*compress(range(len(idle)), map(not_, idle))]
-            taken = self._step_pool(items, running, resetting) if self._together else None
+            if self._together:
+                self._take_actions(items, [*compress(range(len(items)), map(not_, starting))])
+                self._pool.step(None, resetting, self._pool.observations)
             self.has_moved = True
-            return self._results(items, idle, running, taken)
+            return self._result(self._results(items, starting))
         except BaseException:
             for env in self._envs:
                 env.inside.in_hooks = False
@@ -175,123 +145,48 @@ class PerEnvEngine(Engine):
                     env.inside.ended = True
             raise
 
-    def _results(
-        self, items: Sequence[Any], idle: Sequence[bool], running: list[int], taken: Taken | None
-    ) -> StepResult:
-        outcomes = Outcomes(len(self._envs))
-        if isinstance(self._stack, PoolStack):
-            self._stack.refresh()
-        for index in compress(range(len(idle)), idle):
-            observation, info = self._reset(index, None, {})
-            self._note(outcomes, index, (observation, 0.0, False, False, info))
-        if taken is None:
-            self._step_each(outcomes, items, running)
-        else:
-            self._conclude(outcomes, taken)
-        rewards, terminated, truncated = outcomes.arrays()
-        self.note_ends(terminated, truncated)
-        infos = gathered(outcomes.sorted_infos(), len(self._envs))
-        return StepResult(self._stack.joined(), rewards, terminated, truncated, infos)
-
-    def _step_each(self, outcomes: Outcomes, items: Sequence[Any], running: list[int]) -> None:
-        """Call the steps of environments that have their own."""
-        for index in running:
-            try:
-                result = self._envs[index].step(items[index])
-            except FMUGymError as error:
-                raise _located(error, index) from error
-            self._note(outcomes, index, result)
-
-    def _note(self, outcomes: Outcomes, index: int, result: Result) -> None:
-        """Note the result of a step of one environment, whose numbers are checked."""
-        observation, reward, ended, cut_off, info = result
-        if observation is not IN_POOL:
-            self._stack.put(index, observation)
-        outcomes.note(index, reward, ended, cut_off, info)
-        if self._envs[index].step_count >= self._limit:
-            outcomes.truncated[index] = True
-
-    def _conclude(self, outcomes: Outcomes, taken: Taken) -> None:
-        """Ask the hooks of the environments whose FMUs have stepped for the results.
-
-        Most numbers are checked when all are there, which takes much less time.
-        """
-        status_of, outputs = self._pool.statuses.tolist(), self._pool.outputs
-        envs, indices, actions = self._envs, taken.indices, taken.actions
-        told = in_time(outputs if taken.skipped is None else outputs[:, ~taken.skipped])
+    def _results(self, items: Sequence[Any], starting: Sequence[bool]) -> list[Result]:
+        """Let the environments conclude the step one after another, or start an episode."""
+        results: list[Result] = []
+        statuses, columns = self._pool.statuses.tolist(), self._pool.outputs.T.tolist()
         index = 0
         try:
-            for index, inputs, values in zip(indices, in_time(taken.rows.T), told, strict=True):
-                env = envs[index]
-                read = env.inside.readings
-                if actions is not None:
-                    env.inside.in_hooks = True
-                    read.previous_action, read.previous_state = read.action, read.state
-                    read.action = actions[index]
-                read.inputs = inputs
-                read.step_count += 1
-                if status_of[index] or env.render_mode is not None:
-                    self._conclude_fully(outcomes, index, status_of[index], values)
+            for index, (env, is_start) in enumerate(zip(self._envs, starting, strict=True)):
+                if is_start:
+                    observation, info = self._reset(index, None, {})
+                    result: Result = observation, 0.0, False, False, info
+                elif self._together:
+                    result = _concluded(env, statuses[index], tuple(columns[index]))
                 else:
-                    self._judge(outcomes, index, env, values)
-                env.inside.in_hooks = False
-            for index in outcomes.faulty(self._stack.finite()):
-                self._fault(outcomes, index)
+                    result = env.step(items[index])
+                self._observations[index] = _copied(result[0])
+                results.append(result)
         except FMUGymError as error:
             raise _located(error, index) from error
+        return results
 
-    def _judge(
-        self, outcomes: Outcomes, index: int, env: FMUEnv, values: tuple[float, ...]
-    ) -> None:
-        """Do what ``judged`` does, but leave numbers unchecked where no info follows."""
-        read = env.inside.readings
-        outcomes.values[index] = read.values
-        if env.inside.own.update:
-            outcomes.variables[index] = read.variables.copy()
-        read.values = values
-        read.state = values if env.inside.no_monitors else values[: env.inside.output_count]
-        observed = self._observed
-        if observed is None and env.inside.pool_observes:
-            observed = env.inside.observation_row.copy()
-        steps = read.step_count
-        observation, reward, ended, cut_off = conclude(
-            env, self._form, False, steps >= env.inside.step_limit, observed
+    def _result(self, results: Sequence[Result]) -> StepResult:
+        _, rewards, terminated, cut_off, infos = zip(*results, strict=True)
+        truncated = np.array(cut_off, np.bool_)
+        truncated |= np.array([env.step_count >= self._limit for env in self._envs])
+        result = StepResult(
+            self._joined(),
+            np.array(rewards, np.float64),
+            np.array(terminated, np.bool_),
+            truncated,
+            gathered({i: info for i, info in enumerate(infos) if info}, len(infos)),
         )
-        if env.inside.has_info and _are_finite(env, reward, observation):
-            outcomes.infos[index] = info_of(env)
-        if observation is not IN_POOL and not self._take(index, observation):
-            if env.inside.is_finite(observation):
-                self._stack.put(index, observation)
-            else:
-                outcomes.misfits[index] = observation
-        outcomes.rewards[index] = reward
-        if ended or cut_off:
-            env.inside.ended = True
-            outcomes.terminated[index], outcomes.truncated[index] = ended, cut_off
-        if steps >= self._limit:
-            outcomes.truncated[index] = True
+        self.note_ends(result.terminated, result.truncated)
+        return result
 
-    def _conclude_fully(
-        self, outcomes: Outcomes, index: int, status: int, values: tuple[float, ...]
-    ) -> None:
-        """Let an environment conclude alone: it has pictures, or its FMU a status."""
-        env = self._envs[index]
-        result = judged(env, status, values, self._observed)
-        self._note(outcomes, index, result)
-        env.inside.in_hooks = False
-        if env.render_mode is not None:
-            note_for_picture(env, result[1])
-
-    def _fault(self, outcomes: Outcomes, index: int) -> None:
-        """End an episode because of a number that is not finite."""
-        env, reward = self._envs[index], float(outcomes.rewards[index])
-        observation = outcomes.misfits.get(index)
-        if observation is None:
-            observation = self._stack.row(index)
-        before = outcomes.values[index], outcomes.variables[index]
-        env.inside.in_hooks = True
-        self._note(outcomes, index, fault_of_hooks(env, reward, observation, before))
-        env.inside.in_hooks = False
+    def _joined(self) -> Any:
+        """The observations of all in new arrays."""
+        space, count = self._envs[0].observation_space, len(self._envs)
+        try:
+            empty: Any = create_empty_array(space, n=count, fn=np.zeros)
+            return concatenate(space, self._observations, empty)
+        except ordinary(Exception):  # users' observations may raise anything
+            raise _misfit(space, self._observations) from None
 
     def _reset(
         self, index: int, seed: int | None, options: Mapping[str, Any]
@@ -307,53 +202,24 @@ class PerEnvEngine(Engine):
         except FMUGymError as error:
             raise _located(error, index) from error
 
-    def _step_pool(
-        self, actions: Sequence[Any], running: list[int], resetting: MaskArray | None
-    ) -> Taken:
-        """Step the FMUs whose episodes go on, after checking that all their actions are valid."""
-        rows = self._direct_inputs(actions, running) if self._are_direct() else None
-        taken = None if rows is None else Taken(running, resetting, rows, actions)
-        if taken is None:
-            taken = Taken(running, resetting, self._take_actions(actions, running), None)
-        self._pool.inputs[:, ... if resetting is None else ~resetting] = taken.rows.T
-        self._pool.step(None, resetting, self._pool.observations)
-        return taken
-
-    def _direct_inputs(self, actions: Sequence[Any], running: list[int]) -> FloatArray | None:
-        """Inputs that are the actions, shape (M, k); None if the environments must be asked.
-
-        The environments learn of their actions when they conclude.
-        """
-        return self._envs[0].inside.input_writer.of_actions(np.asarray(actions)[running])
-
-    def _take_actions(self, actions: Sequence[Any], running: list[int]) -> FloatArray:
-        """Ask environments for their inputs, shape (M, k)."""
-        writer, parts, index = self._envs[0].inside.input_writer, [], 0
-        befores: list[tuple[Any, Any, Any, Any]] = []
+    def _take_actions(self, actions: Sequence[Any], running: Sequence[int]) -> None:
+        """Let environments make their inputs; if an action cannot be used, none has taken any."""
+        befores: list[tuple[FMUEnv, Any]] = []
+        given, index = self._pool.inputs.copy(), 0
         try:
             for index in running:
-                env, action = self._envs[index], actions[index]
-                env.inside.in_hooks = True
-                if not self._checks_all:
-                    require_usable(env, action)
+                env = self._envs[index]
                 read = env.inside.readings
-                state, before = read.state, read.action
-                befores.append((before, read.previous_action, read.previous_state, read.inputs))
-                read.previous_action, read.previous_state, read.action = before, state, action
-                parts.append(writer.packed(env._get_inputs(), action))
-            rows = writer.unpacked(parts)
-            finite = np.isfinite(rows)
-            if not finite.all():
-                place = int(finite.all(axis=1).argmin())
-                index = running[place]
-                writer.checked(rows[place], actions[index])
-            return rows
+                before = read.action, read.previous_action, read.previous_state, read.inputs
+                befores.append((env, before))
+                env.inside.in_hooks = True
+                take_action(env, actions[index])
         except BaseException as error:
-            for place, taken in zip(running, befores, strict=False):
-                self._envs[place].inside.readings.take_back(taken)
-            blaming = blame(self._envs[index], actions[index], error) or error
-            if isinstance(blaming, FMUGymError):
-                raise _located(blaming, index) from error
+            for env, before in befores:
+                env.inside.readings.take_back(before)
+            self._pool.inputs[...] = given
+            if isinstance(error, FMUGymError):
+                raise _located(error, index) from error
             raise
 
     def _actions(self, actions: Any) -> Sequence[Any]:
@@ -392,15 +258,43 @@ class PerEnvEngine(Engine):
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
         for index in indices.tolist():
-            self._stack.put(index, first_observation(self._envs[index])[0])
-        return self._stack.joined()
+            self._observations[index] = _copied(first_observation(self._envs[index])[0])
+        return self._joined()
 
 
-def _are_finite(env: FMUEnv, reward: Any, observation: Any) -> bool:
-    """Whether the numbers of a step are finite, so that no fault follows."""
-    if observation is IN_POOL:
-        observation = env.inside.observation_row
-    return isfinite(reward) and env.inside.is_finite(observation)
+def _concluded(env: FMUEnv, status: int, values: tuple[float, ...]) -> Result:
+    """The result of a step that its FMU has done."""
+    env.inside.in_hooks = True
+    env.inside.readings.step_count += 1
+    result = judged(env, status, values)
+    env.inside.in_hooks = False
+    if env.render_mode is not None:
+        note_for_picture(env, result[1])
+    return result
+
+
+def _copied(observation: Any) -> Any:
+    """Copy the arrays of an observation, whose memory may serve the next hook."""
+    if type(observation) is np.ndarray:
+        return observation.copy()
+    if isinstance(observation, dict):
+        return {name: _copied(part) for name, part in observation.items()}
+    return observation
+
+
+def _misfit(space: Any, observations: Sequence[Any]) -> ConfigError:
+    """The error of the first observation that is no element of the space."""
+    found = next((one for one in observations if not _fits(space, one)), observations[0])
+    return ConfigError(f"_get_observation returned {shown(found)}, which is no element of {space}")
+
+
+def _fits(space: Any, observation: Any) -> bool:
+    try:
+        empty: Any = create_empty_array(space, n=1, fn=np.zeros)
+        concatenate(space, [observation], empty)
+    except ordinary(Exception):  # as above
+        return False
+    return True
 
 
 def _located(error: FMUGymError, index: int) -> FMUGymError:

@@ -16,7 +16,7 @@ from fmugym.signals import ordinary
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import DifferenceError, UntraceableError
+from fmugym.vector.hooks.program import DifferenceError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 
 __all__ = ["compile_hooks", "find_programs"]
@@ -27,28 +27,24 @@ _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
 
 
-def find_programs(env: FMUEnv, required: bool = False) -> TracedTask | None:
+def find_programs(env: FMUEnv, required: bool = False) -> TracedTask:
     """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
 
     Args:
         env: A prototype whose hooks work on arrays.
         required: Whether hooks that cannot be compiled are an error.
 
-    Returns:
-        The programs, or None.
-
     Raises:
         ConfigError: If the programs are required, but the hooks cannot be compiled.
     """
     try:
-        _require_playable(env)
         task = compile_hooks(env, [sample_states(env, s) for s in ((1.0,), _WILD_SCALES)])
     except ordinary(Exception) as reason:  # hooks may raise anything
         text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
         logger.info("%s. They run on arrays, which is slower", text)
-        return None
+        return TracedTask.without_programs(env, str(reason))
     for why in task.left.values():
         text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
         if required:
@@ -84,9 +80,3 @@ def compile_hooks(
             return task
         except DifferenceError as difference:
             refused[difference.hook] = str(difference)
-
-
-def _require_playable(env: FMUEnv) -> None:
-    """Refuse environments that the native pool cannot play, whatever their hooks are."""
-    if not env.inside.pool.can_play:
-        raise UntraceableError("the pool is not the native one")

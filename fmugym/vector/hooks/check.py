@@ -22,7 +22,7 @@ from fmugym.task.step import ORDER
 from fmugym.task.values import ParameterValues
 from fmugym.vector.actions import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
-from fmugym.vector.views import batched, column, copied
+from fmugym.vector.views import batched, column, some
 
 __all__ = ["CURE", "find_difference", "sample_of", "sample_states", "states_around"]
 
@@ -257,7 +257,7 @@ class _Comparison(NamedTuple):
         failures = sum(type(result) is _Failure for result, _ in calls)
         if self.alone or failures == count or (failures and may_fail):
             return None  # if it fails either way, the first step will tell
-        together, changed = self._call(copied(self.batch))
+        together, changed = self._call(some(self.batch))
         if changed == "out" or changed in _READ_ONLY:
             return f"changes the arrays in self.{changed} in place"
         if type(together) is _Failure:
@@ -274,10 +274,12 @@ class _Comparison(NamedTuple):
             result = _result_of(self.env, self.name)
             after = _read_only(Readings.of(self.env), self.name)
         changed = [name for name, row in before.items() if differs(row, after[name])]
-        attribute, outside = self.contents.changed(), self.contents.changed_outside()
-        self.contents.restore()
-        if outside is not None:
-            attribute = f"{_OUTSIDE}{outside}"
+        changes = self.contents.changes()
+        if any(changes):
+            self.contents.restore()
+        attribute = changes.inside
+        if changes.outside is not None:
+            attribute = f"{_OUTSIDE}{changes.outside}"
         return result, changed[0] if changed else attribute
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,15 +15,15 @@ from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
 from fmugym.vector.hooks import results
 from fmugym.vector.hooks.graph import TOLERANCES
+from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import (
     DifferenceError,
-    Row,
     UntraceableError,
     evaluate,
     writes_variable,
 )
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.views import copied
+from fmugym.vector.views import some
 
 __all__ = ["require_same"]
 
@@ -45,7 +45,7 @@ def require_same(env: FMUEnv, batch: Readings, task: TracedTask) -> None:
         DifferenceError: If a result differs.
         UntraceableError: If another hook than ``_update`` writes a variable.
     """
-    own = copied(batch)
+    own = some(batch)
     with np.errstate(all="ignore"), borrowed(env, outside=True), reading(env, own):
         comparison = _Comparison(env, task)
         comparison.compare_inputs()
@@ -56,56 +56,32 @@ class _Comparison:
     def __init__(self, env: FMUEnv, task: TracedTask) -> None:
         self._env, self._task = env, task
         self._count = len(env.step_count)
-        self._stored: dict[Row, npt.NDArray[Any]] = {}
-        for name, dtype in task.variables.items():
-            row = results.variable(name, env.variables[name], self._count)
-            env.variables[name] = row.astype(dtype)
-        self._before = {name: row.copy() for name, row in env.variables.items()}
-        self._actions = (
-            np.ascontiguousarray(np.moveaxis(env.action, -1, 0)),
-            np.ascontiguousarray(np.moveaxis(env.previous_action, -1, 0)),
-        )
-
-    def _find(self, row: Row) -> npt.NDArray[Any]:
-        """The values of a row; the program stores in arrays of its own."""
-        if row not in self._stored:
-            self._stored[row] = np.ascontiguousarray(self._values(row)).copy()
-        return self._stored[row]
-
-    def _values(self, row: Row) -> Any:
-        env = self._env
-        kind, *rest = row
-        index: Any = rest[-1]
-        name: Any = rest[0]
-        match kind:
-            case "output":
-                return env.inside.readings.values[index]
-            case "kept":
-                return env.previous_state[index]
-            case "input":
-                return env.inputs[index]
-            case "parameter":
-                return np.asarray(env.parameters[name], np.float64)
-            case "step_count":
-                return env.step_count
-            case "attribute":
-                return getattr(env, name)
-        return self._before[name].reshape(-1, self._count)[index]
+        rows: Any = [*task.inputs.rows, *task.judgement.rows]
+        attributes = {name: getattr(env, name) for kind, name, *_ in rows if kind == "attribute"}
+        parameters = {name: env.parameters[name] for kind, name, *_ in rows if kind == "parameter"}
+        self._played = some(env.inside.readings)
+        ended = np.zeros(self._count, np.bool_)
+        self._memory = memory = Memory(env, self._played, ended, _contiguous(attributes))
+        memory.parameters = _contiguous(parameters, np.float64)
+        memory.hold(task)
+        self._before = memory.before
+        env.variables.update({name: row.copy() for name, row in self._before.items()})
 
     def compare_inputs(self) -> None:
         """Compare the inputs, and keep them for the hooks that follow."""
-        env = self._env
+        env, memory = self._env, self._memory
         before, env.previous_state = env.previous_state, env.state.copy()
-        evaluate(self._task.inputs, self._find, self._actions)
+        evaluate(self._task.inputs, memory.find, memory.actions)
         expected = np.array(env.inputs)
         results.write_inputs(env._get_inputs(), expected)
         self._require_unwritten(self._before)
         for index in range(self._count):
             expected[:, index] = self._typed(expected[:, index])
-        for index, row in enumerate(expected if "_get_inputs" not in self._task.left else ()):
-            self._require_equal("_get_inputs", self._find(("input", index)), row)
+        for row, wanted in zip(self._played.inputs, expected, strict=True):
+            if "_get_inputs" not in self._task.left:
+                self._require_equal("_get_inputs", row, wanted)
         env.inputs, env.previous_state = expected, before
-        self._stored.clear()
+        self._played.inputs[...] = expected
 
     def _typed(self, values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         result = values.copy()
@@ -121,7 +97,7 @@ class _Comparison:
         """Compare what follows the step of the FMU."""
         env, count = self._env, self._count
         seen = tuple(np.zeros((count, *a.shape), a.dtype) for a in self._task.seen)
-        judged = evaluate(self._task.judgement, self._find, self._actions, seen)
+        judged = evaluate(self._task.judgement, self._memory.find, self._memory.actions, seen)
         if env.inside.own.update:
             env._update()
             for name in self._task.updated:
@@ -143,8 +119,9 @@ class _Comparison:
         updated = self._task.updated
         self._require_unwritten(name for name in self._before if name not in updated)
         for name in updated:
-            for index, row in enumerate(self._rows(name)):
-                self._require_equal("_update", self._find(("variable", name, index)), row)
+            stored = self._memory.variables[name].reshape(-1, self._count)
+            for row, wanted in zip(stored, self._rows(name), strict=True):
+                self._require_equal("_update", row, wanted)
 
     def _require_unwritten(self, names: Iterable[str]) -> None:
         for name in names:
@@ -179,6 +156,10 @@ class _Comparison:
         tolerance = self._task.tolerance
         if not _equal(value, expected) and not _nearly_equal(value, expected, tolerance):
             raise DifferenceError(hook)
+
+
+def _contiguous(rows: Mapping[str, Any], dtype: Any = None) -> dict[str, npt.NDArray[Any]]:
+    return {name: np.ascontiguousarray(row, dtype) for name, row in rows.items()}
 
 
 def _equal(value: npt.NDArray[Any], expected: npt.NDArray[Any]) -> bool:

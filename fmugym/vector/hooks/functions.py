@@ -18,6 +18,7 @@ from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of
 from fmugym.vector.hooks.symbols import (
     Symbols,
     as_symbols,
+    asarray,
     each,
     graph_of,
     handlers,
@@ -72,7 +73,7 @@ def _type_of(graph: Graph, values: Sequence[Any]) -> np.dtype[Any]:
 
 def _operand(graph: Graph, value: Any, dtype: np.dtype[Any]) -> Symbols:
     if type(value) in (int, float):
-        return lift(graph, np.asarray(value, dtype))
+        return lift(graph, asarray(value, dtype))
     return as_symbols(graph, value).cast(dtype)
 
 
@@ -113,6 +114,9 @@ def _computed(
     """Values of a function by its operation, by that of a wider type, or composed of others."""
     dtype = operands[0].dtype
     wider = np.dtype(np.bool_) if ufunc in _LOGICAL else _WIDER.get(dtype, dtype)
+    if ufunc in _POWERS and result.kind == "f" and _is_two(graph, operands[1]):
+        squares: Symbols = operands[0].cast(result) * operands[0].cast(result)
+        return squares  # as numpy computes them
     is_missing = operation_of(ufunc, letter_of(dtype)) is None
     operation = operation_of(ufunc, letter_of(wider))
     if is_missing and operation is not None:
@@ -127,6 +131,12 @@ def _computed(
     cells = [one.cells for one in operands]
     return Symbols(graph, each(lambda *some: graph.apply(ufunc, some, result), *cells), result)
 
+
+def _is_two(graph: Graph, exponent: Symbols) -> bool:
+    return exponent.ndim == 0 and graph.value(exponent.cells[()]) == 2.0
+
+
+_POWERS: Final = {np.power, np.float_power}
 
 _LOGICAL: Final = {np.logical_and, np.logical_or, np.logical_xor, np.logical_not}
 

@@ -13,6 +13,9 @@ from fmugym.vector.hooks.program import UntraceableError, is_function, letter_of
 __all__ = ["TOLERANCES", "Cell", "Graph", "Node"]
 
 
+_array: Final = np.array  # while hooks are traced, another function stands in its place
+
+
 class Node(NamedTuple):
     """A value of one environment, and how it is computed.
 
@@ -74,7 +77,7 @@ class Graph:
     def constant(self, value: Any, dtype: np.dtype[Any]) -> Cell:
         """A value that is known. Zeros of different sign are two constants."""
         letter_of(dtype)
-        bits = np.array(value, dtype).tobytes()
+        bits = _array(value, dtype).tobytes()
         return Cell(self._number(Node("constant", bits, (), dtype)), None)
 
     def value(self, cell: Cell) -> Any:
@@ -94,7 +97,7 @@ class Graph:
         if len(lanes) > 1:
             raise UntraceableError("it mixes the values of several environments")
         if not lanes and all(self.node(cell).kind == "constant" for cell in cells):
-            values = [np.array([self.value(cell)]) for cell in cells]
+            values = [_array([self.value(cell)]) for cell in cells]
             with np.errstate(all="ignore"):
                 return self.constant(fold(*values)[0], dtype)
         operands = tuple(cell.node for cell in cells)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from fmugym.pool.extension import has_native_pool
 
 __all__ = [
+    "LETTERS",
     "OPERATIONS",
     "TYPES",
     "DifferenceError",
@@ -115,7 +116,8 @@ def writes_variable(name: str) -> str:
     return f"a hook writes the episode variable {name!r}, which only _update may do"
 
 
-_LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
+LETTERS: Final = {np.dtype(letter): letter for letter in TYPES}
+"""The letters of the types that programs have."""
 
 
 def letter_of(dtype: npt.DTypeLike) -> str:
@@ -124,7 +126,7 @@ def letter_of(dtype: npt.DTypeLike) -> str:
     Raises:
         UntraceableError: If programs have no values of this type.
     """
-    letter = _LETTERS.get(np.dtype(dtype))
+    letter = LETTERS.get(np.dtype(dtype))
     if letter is None:
         raise UntraceableError(f"it computes with {np.dtype(dtype)}")
     return letter

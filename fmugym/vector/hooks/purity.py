@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from copy import deepcopy
 from inspect import getattr_static
 from types import BuiltinFunctionType, FunctionType, MappingProxyType, ModuleType
 from typing import Any, Final
@@ -13,12 +10,10 @@ import gymnasium
 import numpy as np
 
 from fmugym.env import FMUEnv
-from fmugym.task.step import ORDER
-from fmugym.vector.contents import differs
 from fmugym.vector.hooks.program import UntraceableError
-from fmugym.vector.hooks.tables import is_foreign, names_in, places_of, unwrapped
+from fmugym.vector.hooks.tables import functions_of, names_in, places_of
 
-__all__ = ["names_in_hooks", "unchanged_globals"]
+__all__ = ["names_in_hooks", "require_pure"]
 
 _LEAVES: Final = (bool, int, float, complex, str, bytes, type(None), range, np.generic)
 
@@ -54,78 +49,26 @@ def _is_plain(value: Any) -> bool:
     return type(value) in (list, tuple, set, frozenset) and all(map(_is_plain, value))
 
 
-@contextmanager
-def unchanged_globals(env: FMUEnv) -> Iterator[None]:
-    """Refuse hooks that refer to what they could change, except for attributes.
+def require_pure(env: FMUEnv) -> None:
+    """Refuse hooks that refer to what acts on something, or to objects that they could change.
 
-    Numbers, texts, arrays, and lists and dicts of them may be global variables, or variables of
-    a surrounding function. If hooks change one, they are refused, and the change is undone.
+    Numbers, texts, arrays, and lists and dicts of them may be global variables, or variables of a
+    surrounding function; whether hooks change them shows when they are called.
 
     Raises:
         UntraceableError: With the name.
     """
-    reached = _reached(env)
-    for function in reached:
+    for function in functions_of(env):
         _require_plain_attributes(env, function)
-    kept = [
-        (place, name, place[name], deepcopy(place[name]))
-        for function in reached
-        for place, name in _checked_places(function)
-    ]
-    changed: list[str] = []
-    try:
-        yield
-    finally:
-        changed += _undo(kept)
-    if changed:
-        raise UntraceableError(f"it changes {changed[0] or 'a variable'} outside of self")
-
-
-def _undo(kept: list[tuple[Any, str, Any, Any]]) -> list[str]:
-    """Undo the changes of values outside of an environment; return their names."""
-    changed = [one for one in kept if one[0][one[1]] is not one[2] or differs(one[3], one[2])]
-    for place, name, value, copy in changed:
-        _restore(value, copy)
-        place[name] = value
-    return [name for _, name, *_ in changed]
-
-
-def _restore(value: Any, copy: Any) -> None:
-    """Give a list, a dict, a set or an array the contents of its copy."""
-    if isinstance(value, np.ndarray):
-        value[...] = copy
-    elif isinstance(value, list):
-        value[:] = copy
-    elif isinstance(value, dict | set):
-        value.clear()
-        value.update(copy)
+        _require_plain_places(function)
 
 
 def names_in_hooks(env: FMUEnv) -> set[str]:
     """The names of the attributes and globals to which hooks refer."""
-    return {name for function in _reached(env) for name in names_in(function.__code__)}
+    return {name for function in functions_of(env) for name in names_in(function.__code__)}
 
 
-def _reached(env: FMUEnv) -> list[FunctionType]:
-    """The functions of hooks, and those that they call by name or by an attribute."""
-    waiting = [getattr_static(env, name, None) for name in (*ORDER, "_goal_reward")]
-    found: dict[int, FunctionType] = {}
-    while waiting:
-        function = unwrapped(waiting.pop())
-        known = not isinstance(function, FunctionType) or id(function) in found
-        if known or is_foreign(function.__module__ or ""):
-            continue
-        found[id(function)] = function
-        waiting += [place[name] for place, name in places_of(function)]
-        names = [name for name in names_in(function.__code__) if not name.startswith("__")]
-        waiting += [getattr_static(env, name, None) for name in names]
-        if "super" in names:
-            waiting += [vars(cls).get(name) for cls in type(env).__mro__ for name in names]
-    return list(found.values())
-
-
-def _checked_places(function: FunctionType) -> Iterator[tuple[Any, str]]:
-    """The places of plain values that a function refers to."""
+def _require_plain_places(function: FunctionType) -> None:
     acting = _ACTING.intersection(names_in(function.__code__))
     if acting:
         raise UntraceableError(
@@ -135,9 +78,7 @@ def _checked_places(function: FunctionType) -> Iterator[tuple[Any, str]]:
         value = place[name]
         if isinstance(value, ModuleType):
             _require_computing(function, value)
-        elif _is_plain(value) or type(value) is np.ndarray:
-            yield place, name
-        elif not _is_constant(value):
+        elif not _is_plain(value) and type(value) is not np.ndarray and not _is_constant(value):
             raise UntraceableError(
                 f"{function.__name__} refers to {name or 'a variable'}, a {type(value).__name__} "
                 "that it could change"
@@ -167,13 +108,5 @@ def _require_computing(function: FunctionType, module: ModuleType) -> None:
 
 def _is_constant(value: Any) -> bool:
     is_code = isinstance(value, type | FunctionType | BuiltinFunctionType)
-    return (
-        is_code
-        or _is_ours(value)
-        or type(value).__module__.partition(".")[0]
-        in (
-            "numpy",
-            "typing",
-            "functools",
-        )
-    )
+    package = type(value).__module__.partition(".")[0]
+    return is_code or _is_ours(value) or package in ("numpy", "typing", "functools")

@@ -41,6 +41,7 @@ def symbolic_readings(
         shape = np.shape(env.config.episode_variables[name])
         names[name] = rows(shape, "before" if judging else "variable", name, dtype=dtype)
     missing = np.array("it reads self.done before there is one", object)
+    known = dict.fromkeys((*env.inside.interface.parameters, *env.parameters))
     return Readings(
         values=values,
         out=symbolic_outputs(env, values),
@@ -56,7 +57,7 @@ def symbolic_readings(
         after_end=lift(graph, np.zeros(LANES, np.bool_)),
         parameters=MappingProxyType(
             SymbolicParameters(
-                {n: rows((), "parameter", n) for n in env.inside.interface.parameters},
+                {n: rows((), "parameter", n) for n in known},
                 env.fmu.description.strings,
             )
         ),

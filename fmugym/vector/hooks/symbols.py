@@ -22,6 +22,7 @@ __all__ = [
     "LANES",
     "Symbols",
     "as_symbols",
+    "asarray",
     "each",
     "graph_of",
     "handlers",
@@ -41,6 +42,10 @@ NOWHERE: Final = 1_000_003
 """A length that no array has."""
 
 _MOST_ELEMENTS: Final = 20_000
+
+empty: Final = np.empty
+asarray: Final = np.asarray
+"""These are quick also while hooks are traced, when others stand in their places in numpy."""
 
 _KEPT: Final = frozenset(
     {"__array_finalize__", "__array_priority__", "__class__", "__new__", "__init__", "__dir__"}
@@ -122,7 +127,7 @@ class Symbols(np.ndarray[Any, Any]):
         """An array with other cells of the same graph."""
         array = cells
         if not isinstance(cells, np.ndarray):
-            array = np.empty((), object)
+            array = empty((), object)
             array[()] = cells
         return Symbols(self._graph, array, self.dtype if dtype is None else dtype, self._writeable)
 
@@ -252,12 +257,24 @@ def _is_mask(key: Any) -> bool:
 
 
 def each(function: Callable[..., Cell], *cells: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Apply a function element by element to arrays of cells, which are broadcast."""
-    arrays = np.broadcast_arrays(*cells) if len(cells) > 1 else cells
-    result = np.empty(arrays[0].shape, object)
+    """Apply a function element by element to arrays of cells, which are broadcast.
+
+    What it makes of the same nodes in another lane is the same node; so it is called once for them.
+    """
+    together = np.broadcast(*cells)
+    result = empty(together.shape, object)
     flat = result.reshape(-1)
-    for index, elements in enumerate(zip(*(a.reshape(-1) for a in arrays), strict=True)):
-        flat[index] = function(*elements)
+    known: dict[tuple[int, ...], int] = {}
+    for index, elements in enumerate(together):
+        nodes = tuple([cell.node for cell in elements])
+        if nodes in known:
+            lanes = {cell.lane for cell in elements if cell.lane is not None}
+            if len(lanes) == 1:
+                flat[index] = Cell(known[nodes], *lanes)
+                continue
+        flat[index] = cell = function(*elements)
+        if cell.lane is not None:
+            known[nodes] = cell.node
     return result
 
 
@@ -296,7 +313,7 @@ def as_symbols(graph: Graph, value: Any) -> Symbols:
             raise UntraceableError("it makes an array of parts of different shapes")
         dtype = np.result_type(*(part.dtype for part in parts))
         return Symbols(graph, np.stack([part.cast(dtype).cells for part in parts]), dtype)
-    return lift(graph, np.asarray(value))
+    return lift(graph, asarray(value))
 
 
 def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
@@ -314,7 +331,7 @@ def lift(graph: Graph, array: npt.NDArray[Any]) -> Symbols:
     letter_of(array.dtype)
     if array.size > _MOST_ELEMENTS:
         raise UntraceableError("it computes with a large array")
-    cells = np.empty(array.shape, object)
+    cells = empty(array.shape, object)
     flat = cells.reshape(-1)
     for index, value in enumerate(array.reshape(-1)):
         flat[index] = graph.constant(value, array.dtype)
@@ -330,7 +347,7 @@ def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLik
         names: What each element is, an array of objects.
         dtype: Their type.
     """
-    cells = np.empty((*names.shape, LANES), object)
+    cells = empty((*names.shape, LANES), object)
     for place in np.ndindex(names.shape):
         for lane in range(LANES):
             what: Any = names[place]
@@ -340,7 +357,7 @@ def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLik
 
 def spread(graph: Graph, nodes: npt.NDArray[Any], dtype: np.dtype[Any]) -> Symbols:
     """Symbols of nodes, the environments on the last axis."""
-    cells = np.empty((*nodes.shape, LANES), object)
+    cells = empty((*nodes.shape, LANES), object)
     for place in np.ndindex(nodes.shape):
         for lane in range(LANES):
             cells[(*place, lane)] = Cell(int(nodes[place]), lane)
@@ -378,7 +395,7 @@ def same_for_all(symbols: Symbols) -> npt.NDArray[Any]:
     cells = symbols.cells
     if cells.shape[-1:] != (LANES,):
         raise UntraceableError(f"a result has the shape {cells.shape}, environments last")
-    nodes = np.empty(cells.shape[:-1], np.int64)
+    nodes = empty(cells.shape[:-1], np.int64)
     for place in np.ndindex(nodes.shape):
         row = cells[place]
         if len({cell.node for cell in row}) > 1 or any(

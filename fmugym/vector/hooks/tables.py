@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from inspect import getattr_static
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.task.step import ORDER
 from fmugym.vector.hooks.graph import Cell, Graph
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbols import (
@@ -231,10 +233,11 @@ _OURS: Final = ("fmugym", "gymnasium", "numpy")
 
 
 def functions_of(env: Any) -> list[FunctionType]:
-    """The functions of a class, and those that they call by name, without those of packages."""
-    classes = [cls for cls in type(env).__mro__ if not is_foreign(cls.__module__)]
-    waiting = [value for cls in classes for value in vars(cls).values()]
-    waiting += vars(env).values()
+    """The functions of hooks, and those that they call by name or by an attribute.
+
+    Those of packages are left out.
+    """
+    waiting = [getattr_static(env, name, None) for name in (*ORDER, "_goal_reward")]
     found: dict[int, FunctionType] = {}
     while waiting:
         function = unwrapped(waiting.pop())
@@ -243,6 +246,10 @@ def functions_of(env: Any) -> list[FunctionType]:
             continue
         found[id(function)] = function
         waiting += [place[name] for place, name in places_of(function)]
+        names = [name for name in names_in(function.__code__) if not name.startswith("__")]
+        waiting += [getattr_static(env, name, None) for name in names]
+        if "super" in names:
+            waiting += [vars(cls).get(name) for cls in type(env).__mro__ for name in names]
     return list(found.values())
 
 

@@ -21,6 +21,7 @@ from gymnasium import spaces
 from fmugym.env import FMUEnv
 from fmugym.signals import ordinary
 from fmugym.task.readings import READINGS, Readings, reading
+from fmugym.task.step import ORDER
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.lowering import Store, compile_graph
@@ -91,6 +92,27 @@ class TracedTask:
     updated: tuple[str, ...]
     left: Mapping[str, str]
     tolerance: float = 0.0
+
+    @classmethod
+    def without_programs(cls, env: FMUEnv, reason: str = "") -> TracedTask:
+        """A task whose hooks all run on arrays; a program only passes on that an FMU stops."""
+        inside, graph, flag = env.inside, Graph(), np.dtype(np.bool_)
+        idle = {
+            "_update": not inside.own.update,
+            "_is_truncated": not inside.own.is_truncated,
+            "_get_observation": inside.pool_observes,
+            "_get_info": not inside.has_info,
+        }
+        stopped = graph.load("stopped", None, flag, None)
+        others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
+        judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
+        left = {hook: reason for hook in ORDER if not idle.get(hook, False)}
+        return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), left)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there are programs of hooks."""
+        return "_is_done" not in self.left
 
 
 def trace_hooks(
@@ -437,11 +459,11 @@ def in_hook(env: FMUEnv, name: str) -> Iterator[None]:
 
 def require_unchanged(contents: Contents) -> None:
     """Raise an ``UntraceableError`` if a hook has changed an attribute in place."""
-    changed, outside = contents.changed(), contents.changed_outside()
-    if changed is not None:
-        raise UntraceableError(f"it changes self.{changed}")
-    if outside is not None:
-        raise UntraceableError(f"it changes {outside}, which all environments share")
+    changes = contents.changes()
+    if changes.inside is not None:
+        raise UntraceableError(f"it changes self.{changes.inside}")
+    if changes.outside is not None:
+        raise UntraceableError(f"it changes {changes.outside}, which all environments share")
 
 
 def _placed(env: FMUEnv, name: str, error: Exception) -> str:

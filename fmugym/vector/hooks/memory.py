@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,10 @@ from gymnasium import spaces
 
 from fmugym.env import FMUEnv
 from fmugym.pool.base import MaskArray
+from fmugym.task.episode import Draw
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks import results
-from fmugym.vector.hooks.program import Row, letter_of
+from fmugym.vector.hooks.program import LETTERS, Row
 from fmugym.vector.hooks.trace import TracedTask
 
 __all__ = ["Memory"]
@@ -51,8 +52,7 @@ class Memory:
         self._n = len(ended)
         self.ended, self.parameters = ended, readings.parameters
         self.kept, self._done = np.zeros_like(readings.values), np.zeros(self._n, np.bool_)
-        shape, dtype = (self._n, *(env.action_space.shape or ())), env.action_space.dtype
-        self.actions = np.zeros(shape, dtype), np.zeros(shape, dtype)
+        self.actions = _copied(readings.action), _copied(readings.previous_action)
         self.variables: dict[str, npt.NDArray[Any]] = {}
         self.before: dict[str, npt.NDArray[Any]] = {}
 
@@ -75,20 +75,16 @@ class Memory:
         read.done = self._done
         read.variables.update(self.variables)
 
-    def take_over(self) -> None:
-        """Take over what a step on arrays has left in arrays of its own."""
-        read = self._readings
-        for name, row in self.variables.items():
-            row[...] = read.variables[name]
-        for own, theirs in zip(self.actions, (read.action, read.previous_action), strict=True):
-            own[...] = np.moveaxis(theirs, -1, 0)
-        self.show()
+    def keep_done(self, done: MaskArray) -> None:
+        """Keep which tasks have ended, which a hook on arrays has told."""
+        self._done[:] = done
+        self._readings.done = self._done
 
     def programs(self, task: TracedTask) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """The programs, with the arrays that they load and store."""
-        return task.inputs.with_rows(self._find), task.judgement.with_rows(self._find)
+        return task.inputs.with_rows(self.find), task.judgement.with_rows(self.find)
 
-    def _find(self, row: Row) -> Any:
+    def find(self, row: Row) -> Any:
         """The array of a row that a program loads or stores."""
         kind, *rest = row
         index: Any = rest[-1]
@@ -119,7 +115,7 @@ class Memory:
         flat = [actions.reshape(-1) for actions in self.actions]
         return {
             "shape": self.actions[0].shape[1:],
-            "letter": letter_of(dtype),
+            "letter": LETTERS.get(dtype, dtype.char),
             "size": dtype.itemsize,
             "check": check,
             "lowest": low,
@@ -129,8 +125,14 @@ class Memory:
             "none": np.array(env.inside.no_action, dtype).reshape(-1),
         }
 
-    def surroundings(self, task: TracedTask, results: Any) -> dict[str, Any]:
-        """What the pool keeps beside the programs; see ``NativePool.prepare_play``."""
+    def surroundings(self, task: TracedTask, drawn: Sequence[Draw], results: Any) -> dict[str, Any]:
+        """What the pool keeps beside the programs; see ``NativePool.prepare_play``.
+
+        Args:
+            task: The programs.
+            drawn: What the pool draws.
+            results: How it makes results, or None.
+        """
         env, plan = self._env, self._env.inside.plan
         names = plan.parameter_names
         flat = {name: row.reshape(-1, self._n) for name, row in self.variables.items()}
@@ -149,13 +151,19 @@ class Memory:
             ),
             "drawn_variables": tuple(
                 (flat[draw.name][draw.element or 0], number)
-                for number, draw in enumerate(plan.draws)
+                for number, draw in enumerate(drawn)
                 if draw.name in flat
             ),
             "variable_starts": tuple(
                 (row, np.array(value, row.dtype).tobytes())
                 for name, start in constants.items()
+                if name in flat
                 for row, value in zip(flat[name], np.reshape(start, -1), strict=True)
             ),
             "results": results,
         }
+
+
+def _copied(actions: Any) -> npt.NDArray[Any]:
+    """A copy of actions with environments first, in the order of memory."""
+    return np.array(np.moveaxis(actions, -1, 0), order="C")

@@ -14,18 +14,18 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, check_option
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.pool.base import FloatArray
-from fmugym.task.snapshot import Snapshot, checked_snapshot
-from fmugym.task.starting import start_variable
-from fmugym.vector.env import FMUVectorEnv
-from fmugym.vector.perturbations import Matrices, differentiate_by_starts
-from fmugym.vector.sensitivities import (
+from fmugym.linearization.perturbations import Matrices, differentiate_by_starts
+from fmugym.linearization.sensitivities import (
     checked_trajectory,
     float_box,
     moved_both_ways,
     precise_step,
     require_vector,
 )
+from fmugym.pool.base import FloatArray
+from fmugym.task.snapshot import Snapshot, checked_snapshot
+from fmugym.task.starting import start_variable
+from fmugym.vector.env import FMUVectorEnv
 
 __all__ = ["LinearTrajectory", "linearize_along"]
 
