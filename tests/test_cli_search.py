@@ -3,7 +3,9 @@
 import csv
 import io
 import json
+import re
 import shutil
+import sys
 from contextlib import redirect_stderr, redirect_stdout
 
 import numpy as np
@@ -156,7 +158,8 @@ class TestCourse:
         options = "--minutes", "0.05", "--output", tmp_path / "a"
         code, out, err = run(capsys, *arguments, *options)
         assert code == 0, err
-        assert "--minutes" in err  # that it needs more
+        assert "baseline only; for more, give --minutes" in err
+        assert facts_of(tmp_path / "a")["agent"] == facts_of(tmp_path / "a")["baseline"]
         monkeypatch.undo()
         options = words_after(err, "agent;")
         code, again, err = run(capsys, *arguments, *options, "--output", tmp_path / "b")
@@ -225,6 +228,13 @@ class TestOutput:
         assert out.count("\n") == 1
         for fact in ("lazy", "tuned pi", "unseen episodes", "effort", "of at most 1"):
             assert fact in out
+
+    def test_scores_are_plain_lines(self, task, tmp_path, capsys, monkeypatch):
+        """Also in a short search, and where no bar can be shown."""
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+        code, _, err = searched(capsys, task, tmp_path / "a", "--rounds", "25")
+        assert code == 0
+        assert re.search(r"^round 25, best -[\d.]+, lazy -[\d.]+$", err, re.MULTILINE)
 
     def test_json(self, task, tmp_path, capsys):
         code, out, _ = searched(capsys, task, tmp_path / "a", "--rounds", "32", "--json")

@@ -22,10 +22,12 @@ from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
+from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
 from fmugym.tools import searching
 from fmugym.tools.evaluation import HELD_OUT_SEED
 from fmugym.tools.searching import Quest
+from fmugym.vector import FMUVectorEnv
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
 STRETCH = 10.0 ** np.linspace(0, 2, 6)  # lengths of axes, so that variances differ by 1e4
@@ -994,9 +996,22 @@ class TestSearch:
         assert "constant action" in told[0]
         assert facts["baseline"] == "constant action"
 
-    def test_too_few_rounds_are_told(self, tmp_path):
+    def test_few_rounds_give_what_they_have_come_to(self, tmp_path):
+        """Also before the first validation."""
         one = {"pi": CONTROLLERS["pi"]}
-        with pytest.raises(ConfigError, match="3 rounds are too few"):
+        _, facts = searched(tmp_path / "agent", rounds=3, controllers=one)
+        assert facts["agent"] == facts["baseline"] == "tuned pi"
+        assert facts["rounds"] == 3
+        assert Agent.load(tmp_path / "agent").text.startswith("pid of=theta")
+
+    def test_a_search_that_finds_nothing_does_not_block_its_folder(self, tmp_path):
+        one = {"pi": CONTROLLERS["pi"]}
+        limits = {"rounds": None, "steps": MOST_PROBED + 20, "candidates": 32}
+        with pytest.raises(ConfigError, match="0 rounds are too few"):
+            searched(tmp_path / "agent", controllers=one, terminated=None, **limits)
+        _, facts = searched(tmp_path / "agent", rounds=3, controllers=one)
+        assert facts["rounds"] == 3
+        with pytest.raises(FileExistsError):
             searched(tmp_path / "agent", rounds=3, controllers=one)
 
     def test_a_folder_that_exists_is_refused(self, tmp_path):
@@ -1010,3 +1025,98 @@ class TestSearch:
         changes = {"reward": "-abs(tau - 0.05)", "controllers": good}
         _, facts = searched(tmp_path / "agent", rounds=6, **changes)
         assert facts["agent"] == "best"
+
+
+class Budget:
+    """Counts the steps of all environments until the test begins; each takes 0.1 ms."""
+
+    def __init__(self, monkeypatch):
+        self.steps, self.is_open = 0, True
+        step, judge = FMUVectorEnv.step, searching.judge
+
+        def counted(envs, actions):
+            self.steps += envs.num_envs * self.is_open
+            return step(envs, actions)
+
+        def judged(*arguments):
+            self.is_open = False
+            return judge(*arguments)
+
+        monkeypatch.setattr(FMUVectorEnv, "step", counted)
+        monkeypatch.setattr(searching, "judge", judged)
+        monkeypatch.setattr(searching, "monotonic", lambda: 1e-4 * self.steps)
+        monkeypatch.setattr(Probe, "round_time", lambda *_: 0.0)
+
+
+class TestBudget:
+    @pytest.mark.parametrize("envs", [512, 11])
+    @pytest.mark.parametrize("ceiling", [5_000, 40_000])
+    def test_steps_are_a_ceiling_of_all_but_the_test(self, ceiling, envs, tmp_path, monkeypatch):
+        budget = Budget(monkeypatch)
+        limits = {"rounds": None, "minutes": 60, "steps": ceiling, "envs": envs}
+        _, facts = searched(tmp_path / "agent", **limits)
+        assert 0.7 * ceiling < budget.steps <= ceiling
+        assert facts["steps"] == budget.steps
+
+    def test_a_ceiling_below_a_look_at_the_task_is_refused(self, tmp_path, monkeypatch):
+        budget = Budget(monkeypatch)
+        with pytest.raises(ConfigError, match=f"1000 steps.*{MOST_PROBED}"):
+            searched(tmp_path / "agent", steps=1000)
+        assert budget.steps == 0
+        assert not (tmp_path / "agent").exists()
+
+    @pytest.mark.parametrize("seconds", [2.0, 5.0])
+    def test_minutes_are_the_time_of_all_but_the_test(self, seconds, tmp_path, monkeypatch):
+        """And the rounds that fit repeat what was found."""
+        with monkeypatch.context() as patch:
+            budget = Budget(patch)
+            _, facts = searched(tmp_path / "a", rounds=None, minutes=seconds / 60)
+        assert 0.7 * seconds < 1e-4 * budget.steps <= seconds
+        _, again = searched(tmp_path / "b", rounds=facts["rounds"])
+        assert content(tmp_path / "b") == content(tmp_path / "a")
+        assert again["test"] == facts["test"]
+
+    def test_of_slow_fmus_only_the_baseline_is_tuned(self, tmp_path, monkeypatch):
+        """A round of 8 candidates takes 1 s, of which 3 s have less than 20."""
+        told = []
+        with monkeypatch.context() as patch:
+            patch.setattr(Probe, "round_time", lambda self, candidates, _: candidates / 8)
+            limits = {"minutes": 0.05, "candidates": None, "told": told}
+            _, facts = searched(tmp_path / "a", rounds=None, **limits)
+        assert (facts["candidates"], facts["rounds"]) == (8, 15)
+        assert facts["agent"] == facts["baseline"] in {"lazy", "tuned pi"}
+        assert any("baseline only" in line and "--minutes 1" in line for line in told)
+        _, again = searched(tmp_path / "b", rounds=15)
+        assert content(tmp_path / "b") == content(tmp_path / "a")
+        assert again["test"] == facts["test"]
+        _, more = searched(tmp_path / "a", rounds=ROUNDS, resume=True)
+        _, whole = searched(tmp_path / "c")
+        assert more["test"] == whole["test"]
+        assert content(tmp_path / "a") == content(tmp_path / "c")
+
+
+HIDDEN = {"q_0": "pi", "theta_0": 0.5, "b": {"distribution": "uniform", "low": 0.1, "high": 1}}
+
+
+class TestProbe:
+    @pytest.mark.parametrize("envs", [1, 3, 8])
+    def test_its_course_depends_on_no_time(self, envs, monkeypatch):
+        """Episodes differ after the first steps only, and a step seems to take 100 s."""
+        clock = itertools.count(step=100.0)
+        monkeypatch.setattr("fmugym.search.probe.perf_counter", lambda: next(clock))
+        probe = Probe.of(load(parameters=HIDDEN), envs)
+        assert (probe.is_same, probe.only_reward) == (False, None)
+
+    def test_no_episode_is_stepped_beyond_an_end(self, monkeypatch):
+        ends, step = [], FMUVectorEnv.step
+
+        def spied(envs, actions):
+            result = step(envs, actions)
+            ends.append(bool((result[2] | result[3]).any()))
+            return result
+
+        monkeypatch.setattr(FMUVectorEnv, "step", spied)
+        probe = Probe.of(load(), 8)
+        *before, _ = ends[: ends.index(True) + 1]
+        assert not any(before)
+        assert probe.steps <= MOST_PROBED

@@ -110,9 +110,17 @@ class Arena:
         costs, watched = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._costs)], axis=-1)
         return Outcome(totals[0], costs, watched)
 
+    def most_of(self, jobs: int) -> int:
+        """The largest number of steps that so many episodes take in a new arena."""
+        size = self._size_for(jobs)
+        return math.ceil(jobs / size) * size * self._most_steps
+
+    def _size_for(self, jobs: int) -> int:
+        return min(jobs, self._most_envs, _WIDEST)
+
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
-        size = min(jobs, self._most_envs, _WIDEST)
+        size = self._size_for(jobs)
         if size not in self._envs and sum(self._envs) + size > self._most_envs:
             larger = [count for count in self._envs if count > size]
             if larger:

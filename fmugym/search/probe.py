@@ -17,17 +17,20 @@ from fmugym.search.flattening import require_numbers, rows_of
 from fmugym.search.policy import Policy
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["Probe", "document_of"]
+__all__ = ["MOST_PROBED", "Probe", "document_of"]
 
-_ENVS: Final = 8
+_EPISODES: Final = 8
+_STEPS: Final = 100
+"""So many episodes are compared, until all have ended, or for so many steps."""
+
 _QUICK: Final = 2e-3
 _MANY: Final = 128
-"""If a step takes less than this in seconds, so many environments tell its time: the overhead of a
-call is for all of them."""
+_TIMED: Final = 10
+"""If a step takes less than this in seconds, so many environments tell its time by so many steps:
+the overhead of a call is for all of them."""
 
-_STEPS: Final = 200
-_SECONDS: Final = 2.0
-"""A probe takes so many steps, or this time."""
+MOST_PROBED: Final = _EPISODES * _STEPS + _MANY * _TIMED
+"""The steps of a probe, at most."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class Probe:
         seconds: Real time of a step of one environment among many.
         only_reward: The reward of every step; None if it has changed, or an episode has ended by
             success or failure.
+        steps: How many it has taken to know that.
     """
 
     names: tuple[str, ...]
@@ -58,9 +62,10 @@ class Probe:
     is_same: bool
     seconds: float
     only_reward: float | None
+    steps: int
 
     @classmethod
-    def of(cls, make_env: Callable[[], FMUEnv], envs: int = _ENVS) -> Probe:
+    def of(cls, make_env: Callable[[], FMUEnv], envs: int = _EPISODES) -> Probe:
         """Take some steps with random actions, which are the same in all environments.
 
         Args:
@@ -77,11 +82,13 @@ class Probe:
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
             document = document_of(env)
-        with closing(FMUVectorEnv(make_env, min(envs, _ENVS))) as many:
-            is_same, seconds, only_reward = _steps(many)
+        with closing(FMUVectorEnv(make_env, min(envs, _EPISODES))) as many:
+            told, seconds, steps = _timed(many, _EPISODES, _STEPS)
         if seconds < _QUICK:
             with closing(FMUVectorEnv(make_env, min(envs, _MANY))) as many:
-                seconds = _steps(many)[1]
+                _, seconds, more = _timed(many, 1, _TIMED)
+            steps += more
+        rewards, has_ended = np.unique(told[1:, :, 0]), told[:, :, 1].any()
         return cls(
             policy.names,
             str(policy.space),
@@ -90,9 +97,10 @@ class Probe:
             limits,
             document,
             length,
-            is_same,
-            seconds,
-            only_reward,
+            is_same=bool((told == told[:, :1]).all()),
+            seconds=seconds,
+            only_reward=float(rewards[0]) if len(rewards) == 1 and not has_ended else None,
+            steps=steps,
         )
 
     @property
@@ -110,38 +118,34 @@ def document_of(env: Any) -> Mapping[str, Any]:
     return env.task.document if hasattr(env, "task") else {}
 
 
-def _steps(envs: FMUVectorEnv) -> tuple[bool, float, float | None]:
-    """Whether all episodes go the same way, the seconds of a step, and the only reward.
+def _timed(envs: FMUVectorEnv, episodes: int, most: int) -> tuple[FloatArray, float, int]:
+    """What ``_played`` tells of so many episodes, the seconds of a step, and how many there were.
 
     Few environments play several times, so that their number does not matter.
     """
-    count = envs.num_envs
-    begins = range(0, max(count, _ENVS), count)
-    begin = perf_counter()
-    played = [_played(envs, first, _SECONDS / len(begins)) for first in begins]
-    seconds = (perf_counter() - begin) / (sum(len(one) - 1 for one in played) * count)
-    steps = min(map(len, played))
-    together = np.concatenate([one[:steps] for one in played], axis=1)
-    is_same = bool((together == together[:, :1]).all())
-    rewards, terminated = np.unique(together[1:, :, 0]), together[:, :, 1].any()
-    only = float(rewards[0]) if len(rewards) == 1 and not terminated else None
-    return is_same, seconds, only
+    count, begin = envs.num_envs, perf_counter()
+    played = [_played(envs, first, most) for first in range(0, max(count, episodes), count)]
+    steps = sum(len(one) - 1 for one in played) * count
+    seconds = (perf_counter() - begin) / steps
+    shortest = min(map(len, played))
+    told = np.concatenate([one[:shortest] for one in played], axis=1)
+    return told[:, :episodes], seconds, steps
 
 
-def _played(envs: FMUVectorEnv, first: int, seconds: float) -> FloatArray:
+def _played(envs: FMUVectorEnv, first: int, most: int) -> FloatArray:
     """Reward, both kinds of ends and the observation after each step: shape (1 + steps, N, k).
 
-    They are for episodes from the seed ``first`` on. The first row is that of the reset.
+    They are for episodes from the seed ``first`` on, until one of them ends, or for as many steps
+    as there may be. The first row is that of the reset.
     """
     space, count = envs.single_observation_space, envs.num_envs
     envs.single_action_space.seed(0)
     observations, _ = envs.reset(seed=list(range(first, first + count)))
-    told, over, begin = [np.zeros((count, 3))], False, perf_counter()
+    told = [np.zeros((count, 3))]
     seen = [rows_of(space, observations, count)]
-    while not over and len(told) <= _STEPS and perf_counter() - begin < seconds:
+    while len(told) <= most and not told[-1][:, 1:].any():
         action = envs.single_action_space.sample()
         observations, rewards, terminated, truncated, _ = envs.step(np.array([action] * count))
         seen.append(rows_of(space, observations, count))
         told.append(np.stack([rewards, terminated, truncated], axis=1))
-        over = bool((terminated | truncated).all())
     return np.concatenate([told, seen], axis=2)

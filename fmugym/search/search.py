@@ -29,9 +29,13 @@ _FINAL: Final = VALIDATION + 1000
 POPULATION: Final = 32
 EPISODES: Final = 4
 _VALIDATED: Final = 32
-_LAST: Final = 100
 _EVERY: Final = 5
 """Rounds from one validation to the next."""
+
+_LAST: Final = 100
+_PART: Final = 5
+"""The last validation has so many episodes for each agent, but in all no more than this part of the
+episodes of all rounds."""
 
 _TUNING: Final = 15
 """Rounds for the numbers of a controller."""
@@ -114,6 +118,7 @@ class Search:
         seed: Of the candidates and of the episodes.
 
     Attributes:
+        episodes: As given.
         rounds: How many there have been.
         is_over: Whether nothing more is gained.
         baseline: The best agent without a network, once it is known.
@@ -132,7 +137,7 @@ class Search:
         seed: int = 0,
     ) -> None:
         self._sizes, self._limits, self._fixed = sizes, tuple(limits), list(fixed)
-        self._population, self._episodes = population, episodes
+        self._population, self.episodes = population, episodes
         self._rng = np.random.default_rng(seed)
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
         self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
@@ -143,7 +148,12 @@ class Search:
         self._gone: list[Entrant] = []
         self.baseline: Agent | None = None
         self.merit_of_baseline = NO_MERIT
-        self.rounds, self.is_over = 0, False
+        self.rounds, self.is_over, self._played = 0, False, 0
+
+    @property
+    def is_tuned(self) -> bool:
+        """Whether the numbers of all controllers are found, so that policies come next."""
+        return not self._guesses and all(one.rounds >= one.quota for one in self._tuned)
 
     def known(self) -> list[tuple[Agent, Merit]]:
         """The agents that were found until now, and their merits in validation."""
@@ -213,7 +223,7 @@ class Search:
             if one.then is not None:
                 start = one.then.form.extended(one.best, *self._sizes)
                 self._contenders.append(
-                    Entrant(self._cma(one.then, start), one.then, self._episodes)
+                    Entrant(self._cma(one.then, start), one.then, self.episodes)
                 )
                 one.then = None
             if one.starts == _STARTS:
@@ -222,6 +232,7 @@ class Search:
         self.is_over = not self._contenders
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
+        self._played += self._population * entrant.episodes
         entrant.play(arena, self._training(entrant.episodes), self._limits)
         self.rounds += 1
         if entrant.rounds % _EVERY == 0:
@@ -232,17 +243,17 @@ class Search:
 
     @property
     def _validation(self) -> range:
-        return range(VALIDATION, VALIDATION + (_VALIDATED if self._episodes > 1 else 1))
+        return range(VALIDATION, VALIDATION + (_VALIDATED if self.episodes > 1 else 1))
 
     # Who takes part.
 
     def _tuner(self, name: str, tunable: Tunable, quota: int = _TUNING) -> Entrant:
         cma = Axes(tunable.ranges).search(self._population, self._rng)
-        return Entrant(cma, _Tuned(name, tunable), self._episodes, quota)
+        return Entrant(cma, _Tuned(name, tunable), self.episodes, quota)
 
     def _entrant(self, make: _Policies) -> Entrant:
         cma = self._cma(make, np.zeros(make.form.size(*self._sizes)))
-        return Entrant(cma, make, self._episodes)
+        return Entrant(cma, make, self.episodes)
 
     def _cma(self, make: _Policies, start: FloatArray) -> CMA:
         sigma = _SIGMAS[make.form] * (1.0 if make.under.text is None else _CORRECTION)
@@ -288,7 +299,7 @@ class Search:
             rows[:, -acting:] = self._rng.uniform(-1, 1, (self._population, acting))
             rows *= np.sqrt(_HISTORY.shapes(*self._sizes)[0][0])
             make = _Policies(agent, _HISTORY, (np.zeros(count), np.ones(count)))
-            seeds = self._training(self._episodes)
+            seeds = self._training(self.episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
             moments = moments + outcome.watched.sum(axis=(0, 1))
             self.rounds += 1
@@ -304,19 +315,25 @@ class Search:
         best = max(range(len(agents)), key=merits.__getitem__)
         return agents[best], merits[best]
 
-    def winner(self, arena: Arena) -> Agent | None:
-        """The best agent in new episodes of validation, the baseline among them.
+    def last_validation(self) -> tuple[list[Agent], range]:
+        """Who would compete if the search ended now, and the seeds of the episodes.
 
-        The searches' present means take part, too: they may be better than the best ones before,
-        without having shown it in the fewer episodes of earlier validations.
-
-        Returns:
-            The agent; None if the search has been too short to find one.
+        These are the baseline and the best two searches, each by its best numbers and by its
+        present mean. That may be better, without having shown it in the fewer episodes of earlier
+        validations.
         """
-        ready = self._fixed if self.baseline is None else []
-        agents = [*ready, *(agent for agent, _ in self.known())]
-        agents += [one.make.agent(one.cma.mean) for one in self._contenders if one.gained]
-        if not agents:
-            return None
-        seeds = range(_FINAL, _FINAL + (_LAST if self._episodes > 1 else 1))
+        if self.baseline is None:
+            agents, searches = list(self._fixed), [*self._tuned, *self._guesses]
+        else:
+            agents, searches = [self.baseline], [*self._contenders, *self._gone]
+            searches = sorted(searches, key=lambda one: one.merit)[-2:]
+        agents += [one.make.agent(numbers) for one in searches for numbers in one.offers()]
+        count = min(_LAST, max(self.episodes, self._played // (_PART * max(1, len(agents)))))
+        return agents, range(_FINAL, _FINAL + (count if self.episodes > 1 else 1))
+
+    def winner(self, arena: Arena) -> Agent | None:
+        """The best agent in the last validation; None if nobody can compete in it."""
+        agents, seeds = self.last_validation()
+        if len(agents) < 2:
+            return agents[0] if agents else None
         return self._best_of(arena, agents, seeds)[0]

@@ -21,7 +21,7 @@ from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.agent import Agent
 from fmugym.search.entrants import NO_MERIT, Merit
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.probe import Probe, document_of
+from fmugym.search.probe import MOST_PROBED, Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search
 from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
@@ -123,19 +123,16 @@ def search(
         ConfigError: If no policy can be searched for the task, or there is nothing to resume.
         FileExistsError: If the folder exists, unless a search is resumed.
     """
+    begin = monotonic()
     if resume:
         course = _resumed(quest)
     else:
-        require_new(quest.folder)
+        require_new(quest.folder, STATE)
         course = _begun(quest, tell)
         quest.folder.mkdir(parents=True, exist_ok=True)
+    is_enough = _is_enough(quest, course, begin, tell)
     _tell_of_the_plan(quest, course, tell)
-    arena = _arena(quest, course.probe, quest.make_env)
-    with closing(arena):
-        arena.steps, arena.ceiling = course.steps, quest.steps or arena.ceiling
-        _Run(quest, course, arena, advance).run()
-        arena.ceiling = np.inf
-        winner = course.search.winner(arena)
+    winner = _Run(quest, course, tell, advance, begin, is_enough).run()
     if winner is None:
         raise ConfigError(
             f"{course.search.rounds} rounds are too few to find anything: give more --minutes, "
@@ -145,7 +142,10 @@ def search(
 
 
 def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
-    begin = monotonic()
+    if quest.steps is not None and quest.steps <= MOST_PROBED:
+        raise ConfigError(
+            f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
+        )
     probe = Probe.of(quest.make_env, quest.envs)
     for line in _warnings(probe):
         tell(line)
@@ -156,8 +156,8 @@ def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
             guesses = guessed_controllers(probe.document, env)
     tell(_told_baseline([one.name for one in fixed], list(tunable), guesses))
     episodes = 1 if probe.is_same else EPISODES
-    time = quest.seconds - (monotonic() - begin)
-    candidates = quest.candidates or _fitting(probe, time, episodes, tell)
+    is_slow = probe.round_time(POPULATION, episodes) * _ENOUGH > quest.seconds
+    candidates = quest.candidates or (_FEW if is_slow else POPULATION)
     made = Search(
         (len(probe.names), probe.acting),
         fixed,
@@ -168,7 +168,7 @@ def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
         episodes,
         quest.seed,
     )
-    return _Course(made, probe, candidates, quest.seed)
+    return _Course(made, probe, candidates, quest.seed, probe.steps)
 
 
 def _warnings(probe: Probe) -> list[str]:
@@ -206,17 +206,16 @@ def _told_baseline(fixed: list[str], tunable: list[str], guesses: list[str]) -> 
     return "to be beaten: the best constant action, since no controller suggests itself"
 
 
-def _fitting(probe: Probe, seconds: float, episodes: int, tell: Callable[[str], None]) -> int:
-    """As many candidates as leave time for enough rounds."""
-    if probe.round_time(POPULATION, episodes) * _ENOUGH <= seconds:
-        return POPULATION
-    time = probe.round_time(_FEW, episodes)
-    if time * _FEWEST > seconds:
-        tell(
-            f"a round of {_FEW} candidates takes about {time:.3g} s, so the time will do for the "
-            f"baseline only; for more, give --minutes {np.ceil(time * 2 * _FEWEST / 60):.0f}"
-        )
-    return _FEW
+def _is_enough(quest: Quest, course: _Course, begin: float, tell: Callable[[str], None]) -> bool:
+    """Whether the time is enough for policies, and not for the baseline only."""
+    time = course.probe.round_time(_FEW, course.search.episodes)
+    if time * _FEWEST <= quest.seconds - (monotonic() - begin):
+        return True
+    tell(
+        f"a round of {_FEW} candidates takes about {time:.3g} s, so the time will do for the "
+        f"baseline only; for more, give --minutes {np.ceil(time * 2 * _FEWEST / 60):.0f}"
+    )
+    return False
 
 
 def _tell_of_the_plan(quest: Quest, course: _Course, tell: Callable[[str], None]) -> None:
@@ -241,48 +240,101 @@ def _arena(quest: Quest, probe: Probe, make_env: Callable[[], Any]) -> Arena:
 
 
 class _Run:
-    """Lets a search go on until its time is over, and writes what it has found."""
+    """Lets a search go on until its time is over, and writes what it has found.
+
+    Args:
+        quest: What to search.
+        course: The search.
+        tell, advance: As for ``search``.
+        begin: When the time has begun.
+        is_enough: Whether the time is enough for policies, too.
+    """
 
     def __init__(
-        self, quest: Quest, course: _Course, arena: Arena, advance: Callable[[float, str], None]
+        self,
+        quest: Quest,
+        course: _Course,
+        tell: Callable[[str], None],
+        advance: Callable[[float, str], None],
+        begin: float,
+        is_enough: bool,
     ) -> None:
-        self._quest, self._course, self._arena = quest, course, arena
-        self._advance, self._written = advance, monotonic()
+        self._quest, self._course, self._is_enough = quest, course, is_enough
+        self._tell, self._advance = tell, advance
+        self._begin, self._written = begin, monotonic()
+        self._arena = _arena(quest, course.probe, quest.make_env)
+        self._arena.steps = self._steps_before = course.steps
+        self._most = quest.steps or np.inf
         self._noted = NO_MERIT if course.search.baseline is None else self._best()
 
-    def run(self) -> None:
-        """Search. What was found is written also if an exception ends the search.
+    def run(self) -> Agent | None:
+        """Search, and return the winner of the last validation; None if nothing was found.
 
-        What was done in the round that it has interrupted is forgotten, so that those who resume or
-        repeat the search come to the same agent.
+        What was found is written also if an exception ends the search. What was done in the round
+        that it has interrupted is forgotten, so that those who resume or repeat the search come to
+        the same agent.
         """
-        begin = last = monotonic()
         self._keep()
         try:
-            while not self._is_over(last - begin):
-                self._course.search.advance(self._arena)
-                self._keep()
-                self._note()
-                now = monotonic()
-                self._advance(now - last, self._text())
-                last = now
-        except CeilingError:
-            pass
+            with closing(self._arena):
+                self._search()
         finally:
             self._course.search = pickle.loads(self._kept)
             self._write()
+        self._tell(self._text())
+        winner = self._winner()
+        self._write_state()
+        return winner
+
+    def _search(self) -> None:
+        last, took = monotonic(), 0.0
+        while not self._is_over(took):
+            self._arena.ceiling = self._most - self._reserved()
+            try:
+                self._course.search.advance(self._arena)
+            except CeilingError:
+                return
+            if self._arena.steps > self._most - self._reserved():
+                return
+            self._keep()
+            self._note()
+            now = monotonic()
+            last, took = now, now - last
+            self._advance(took, self._text())
+
+    def _winner(self) -> Agent | None:
+        with closing(_arena(self._quest, self._course.probe, self._quest.make_env)) as arena:
+            arena.steps, arena.ceiling = self._course.steps, self._most
+            try:
+                return self._course.search.winner(arena)
+            except CeilingError:  # no round has had enough steps
+                return None
+            finally:
+                self._course.steps = arena.steps
+
+    def _reserved(self) -> int:
+        """The steps that the last validation may take."""
+        agents, seeds = self._course.search.last_validation()
+        return len(agents) * self._arena.most_of(len(seeds)) if len(agents) > 1 else 0
 
     def _keep(self) -> None:
         """Remember the search as it is between two rounds."""
-        self._kept, self._course.steps = pickle.dumps(self._course.search), self._arena.steps
+        self._kept = pickle.dumps(self._course.search)
+
+    def _is_over(self, took: float) -> bool:
+        """Whether the search ends, with or without time for another round like the last one."""
+        found, rounds = self._course.search, self._quest.rounds
+        if found.is_over or (rounds is not None and found.rounds >= rounds):
+            return True
+        if not self._is_enough and found.is_tuned and found.baseline is None:
+            return True
+        now = monotonic()
+        done = self._arena.steps - self._steps_before
+        pace = (now - self._begin) / done if done else self._course.probe.seconds
+        return now - self._begin + took + self._reserved() * pace >= self._quest.seconds
 
     def _best(self) -> Merit:
         return max((merit for _, merit in self._course.search.known()), default=NO_MERIT)
-
-    def _is_over(self, seconds: float) -> bool:
-        found, rounds = self._course.search, self._quest.rounds
-        is_done = rounds is not None and found.rounds >= rounds
-        return found.is_over or is_done or seconds >= self._quest.seconds
 
     def _text(self) -> str:
         """The scores, for a line of progress."""
@@ -310,11 +362,14 @@ class _Run:
 
     def _write(self) -> None:
         """Write the best agent until now, and the state of the search."""
-        self._written = monotonic()
+        self._written, self._course.steps = monotonic(), self._arena.steps
         known = self._course.search.known()
         if known:
             best, _ = max(known, key=lambda one: one[1])
             _save(self._quest.folder, self._course, best)
+        self._write_state()
+
+    def _write_state(self) -> None:
         path = self._quest.folder / STATE
         part = path.with_suffix(".part")
         part.write_bytes(pickle.dumps(self._course))
@@ -329,7 +384,7 @@ def _save(folder: Path, course: _Course, agent: Agent) -> dict[str, Any]:
     facts = {
         "algorithm": "search",
         "agent": agent.name,
-        "baseline": None if found.baseline is None else found.baseline.name,
+        "baseline": (found.baseline or agent).name,
         "controller": agent.text,
         "rounds": found.rounds,
         "candidates": course.candidates,

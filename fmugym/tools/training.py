@@ -211,15 +211,15 @@ def _recorder(plan: Plan, resume: bool) -> Callable[[FMUVectorEnv], Any]:
     return plan.diary.of_training(plan.folder, begin)
 
 
-def require_new(folder: Path) -> None:
-    """Refuse a folder that has more in it than a search for arguments.
+def require_new(folder: Path, *unfinished: str) -> None:
+    """Refuse a folder that has more in it than a search for arguments, or these files.
 
     Raises:
         FileExistsError: If it has.
     """
     if folder.exists() and not {path.name for path in folder.iterdir()} <= {
-        TRIALS,
-        f"{TRIALS}.csv",
+        *(TRIALS, f"{TRIALS}.csv"),
+        *unfinished,
     }:
         raise FileExistsError(f"{folder} exists; name a new folder")
 
