@@ -146,6 +146,39 @@ class TestEpisodeLength:
         }
         assert self.length_of(Task.from_dict(cart)) == (None, "")
 
+    def test_it_is_told_beside_another_time_step(self):
+        """And among the findings, in which nothing says that the length is fine."""
+        house = {
+            "fmu": {"bundled": "House"},
+            "time_step": 60000.0,
+            "episode_length": 60000.0,
+            "agent": {"actions": ["u"], "observations": ["T_m"]},
+            "reward": "-abs(T_m - 293)",
+        }
+        advice, report = advised(Task.from_dict(house))
+        assert advice["time_step"] < 60000 < advice["episode_length"]
+        (found,) = [one for one in report.findings if one.check == "length"]
+        assert found.verdict == "warning"
+        assert f"episode_length = {advice['episode_length']}" in found.cure
+
+
+@pytest.mark.parametrize("reward", ["-1e-6 * q**2", "-1 - 1e-11 * q**2", "2 + 1e-11 * q"])
+def test_a_tiny_reward_beside_large_actions_gets_lines(reward, tmp_path, capsys):
+    """With them, rewards have the size of 1, and begin near 0."""
+    variables = {"tau": {"min": -200, "max": 200}}
+    task = pendulum(variables=variables, reward=reward, time_step=0.001, episode_length=0.05)
+    task.write(tmp_path / "a.toml")
+    assert main(["validate", str(tmp_path / "a.toml")]) in (0, 1)
+    _, _, lines = capsys.readouterr().out.partition("for the task file:\n")
+    pasted = tomllib.loads(lines)
+    assert pasted["agent"]["rescale"] is True
+    env = load(Task.from_dict({**task.document, "reward": pasted["reward"]}))
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    rewards = [env.step(env.action_space.sample())[1] for _ in range(50)]
+    env.close()
+    assert 0.1 <= np.ptp(rewards) <= 10
+
 
 def test_outputs_that_never_change_are_told(lag):
     _, report = advised(lag_task(lag, 0.0))

@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.baselines.base import FloatArray
 from fmugym.declared import Task
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv
@@ -46,7 +47,8 @@ _WIDE: Final = 100.0
 """An observation that is larger by this factor than another one hides it from most networks."""
 
 _TINY: Final = 1e-5
-"""Algorithms with gradients take smaller rewards for noise."""
+"""Algorithms with gradients take smaller rewards for noise, and smaller differences beside the size
+of rewards."""
 
 _EXPLORED: Final = (0.1, 10.0)
 """Between these sizes are actions that they find by steps of about 1."""
@@ -66,8 +68,8 @@ class _Episode:
         reset_time, step_time: Seconds of real time of the reset, and of a step.
     """
 
-    observations: np.ndarray[Any, np.dtype[np.float64]]
-    rewards: np.ndarray[Any, np.dtype[np.float64]]
+    observations: FloatArray
+    rewards: FloatArray
     fault: str | None
     reset_time: float
     step_time: float
@@ -95,7 +97,7 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
         hooks = _hooks(make_env)
         recommended = _recommended(env, first.step_time, hooks, findings)
         reset_method, replay, steps = env.reset_method, Replay.of(env), env.config.max_episode_steps
-        others = tuple(_other_advices(env, recommended))
+        others = (*_other_advices(env, recommended), *_advice_of_reward(env, first.rewards))
     finally:
         env.close()
     report = Report(findings, costs, hooks, reset_method, recommended, others)
@@ -105,18 +107,28 @@ def validate(make_env: Callable[[], FMUEnv]) -> Report:
 def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
     """Add what repetitions of an episode tell."""
     found = list(advise(replay))
-    if steps is not None and not any(getattr(one, "key", "") == "time_step" for one in found):
-        found += advise_episodes(replay, steps)
+    known = {one.key for one in found if isinstance(one, Advice)}
+    if steps is not None:
+        found += (one for one in advise_episodes(replay, steps) if _key_of(one) not in known)
     advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
     doubts = (one for one in found if isinstance(one, Doubt))
-    findings = (Finding("warning", one.check, one.text, one.cure) for one in doubts)
-    recommended = {**report.recommended, **{one.key: one.value for one in advices}}
+    short = (one for one in advices if one.key == "episode_length")
+    findings = [
+        *(Finding("warning", one.check, one.text, one.cure) for one in doubts),
+        *(Finding("warning", "length", one.why, f"give {one.line}") for one in short),
+    ]
+    new = {one.check for one in findings}
+    before = (one for one in report.findings if one.verdict != "ok" or one.check not in new)
     return replace(
         report,
-        findings=(*report.findings, *findings),
-        recommended=recommended,
+        findings=(*before, *findings),
+        recommended={**report.recommended, **{one.key: one.value for one in advices}},
         advices=advices,
     )
+
+
+def _key_of(found: Advice | Doubt) -> str:
+    return found.key if isinstance(found, Advice) else ""
 
 
 def _isolates(env: FMUEnv) -> bool:
@@ -197,7 +209,7 @@ def _play(
     return _Episode(*arrays, fault, after_reset - begin, took)
 
 
-def _flat(observation: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _flat(observation: Any) -> FloatArray:
     if isinstance(observation, Mapping):
         return np.concatenate([_flat(part) for part in observation.values()])
     return np.asarray(observation, np.float64).reshape(-1)
@@ -389,12 +401,29 @@ def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
     ):
         text = f"the same in {len(rewards)} steps, whatever the actions"
         cure = "let it depend on what the actions change"
-    elif max(-low, high) < _TINY:
-        text = f"from {low:.4g} to {high:.4g} with random actions"
-        cure = f"multiply it by {rounded_down(1 / max(-low, high)):g}; only --algorithm minds"
+    elif factor := _factor_of(rewards):
+        text = f"from {low:.4g} to {high:.4g} with random actions, a difference of {high - low:.2g}"
+        cure = f"multiply what differs by {factor:g}; only --algorithm minds"
     else:
         return Finding("ok", "reward", f"from {low:.4g} to {high:.4g} with random actions")
     return Finding("warning", "reward", text, cure)
+
+
+def _factor_of(rewards: FloatArray) -> float:
+    """What makes tiny rewards, or tiny differences, as large as 1; 0 if there are none."""
+    size, spread = np.abs(rewards).max(), np.ptp(rewards)
+    tiny = size if size < _TINY else spread
+    return rounded_down(1 / tiny) if 0.0 < tiny < _TINY * max(1.0, size) else 0.0
+
+
+def _advice_of_reward(env: FMUEnv, rewards: FloatArray) -> Iterator[Advice]:
+    """The line with larger rewards."""
+    task, factor, low = getattr(env, "task", None), _factor_of(rewards), rewards.min()
+    given = task.document.get("reward") if isinstance(task, Task) else None
+    if factor and isinstance(given, str):
+        offset = "" if abs(low) < _TINY else f" {'+' if low < 0 else '-'} {abs(low):.17g}"
+        why = f"rewards differ by {np.ptp(rewards):.2g}, which algorithms take for noise"
+        yield Advice("", "reward", f"{factor:g} * ({given}{offset})", why)
 
 
 def _of_observations(env: FMUEnv, first: _Episode) -> Iterator[Finding]:
