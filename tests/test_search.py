@@ -53,7 +53,8 @@ def rosenbrock(points):
 
 
 def made(separable=False, seed=0):
-    return CMA(np.zeros(6), 0.5, 12, np.random.default_rng(seed), separable=separable)
+    covariance = np.ones(6) if separable else None
+    return CMA(np.zeros(6), 0.5, 12, np.random.default_rng(seed), covariance)
 
 
 def minimized(function, rounds, separable=False):
@@ -117,7 +118,7 @@ class TestCMA:
         """A slope without an end would let mean and steps grow for ever."""
         limits = {"largest": 3.0, "largest_sigma": 2.0}
         rng = np.random.default_rng(0)
-        cma = CMA(np.zeros(5), 0.5, 32, rng, separable=separable, **limits)
+        cma = CMA(np.zeros(5), 0.5, 32, rng, np.ones(5) if separable else None, **limits)
         sizes, steps = [], []
         for _ in range(200):
             points = cma.ask()
@@ -132,7 +133,7 @@ class TestCMA:
         """With it, the search is that of a sphere, and far shorter than without it."""
         inverse = AXES @ np.diag(STRETCH**-2) @ AXES.T
         rng = np.random.default_rng(0)
-        cma = CMA(np.zeros(6), 100.0, 12, rng, covariance=inverse)
+        cma = CMA(np.zeros(6), 100.0, 12, rng, inverse)
         assert cma.sigma == pytest.approx(100.0 * np.sqrt(np.trace(inverse) / 6))
         told = rounds_of(turned_ellipsoid, cma)
         assert told < 1.5 * rounds_of(sphere, made())
@@ -141,7 +142,8 @@ class TestCMA:
     @pytest.mark.parametrize("separable", [False, True])
     def test_few_candidates_go_in_directions_at_right_angles(self, separable):
         """Their lengths are those of normal numbers, and no direction is preferred."""
-        cma = CMA(np.zeros(6), 0.5, 6, np.random.default_rng(0), separable=separable)
+        covariance = np.ones(6) if separable else None
+        cma = CMA(np.zeros(6), 0.5, 6, np.random.default_rng(0), covariance)
         steps = np.array([cma.ask() / cma.sigma for _ in range(500)])
         products = steps @ steps.transpose(0, 2, 1)
         lengths = np.diagonal(products, axis1=1, axis2=2)

@@ -257,18 +257,11 @@ class Search:
 
     def _cma(self, make: _Policies, start: FloatArray) -> CMA:
         sigma = _SIGMAS[make.form] * (1.0 if make.under.text is None else _CORRECTION)
-        is_large = len(start) > _MANY
-        alike = None if is_large else make.form.covariance(make.correlations, *self._sizes)
-        return CMA(
-            start,
-            sigma,
-            self._population,
-            self._rng,
-            separable=is_large,
-            largest=_LARGEST,
-            largest_sigma=_GROWTH * sigma,
-            covariance=alike,
-        )
+        alike = np.ones(len(start))
+        if len(start) <= _MANY:
+            alike = make.form.covariance(make.correlations, *self._sizes)
+        limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
+        return CMA(start, sigma, self._population, self._rng, alike, **limits)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
