@@ -17,6 +17,7 @@ from fmugym.baselines import PID, controller_of
 from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.parsing import search_of
+from fmugym.export.decisions import decision_of
 from fmugym.search.agent import AGENT, Agent
 from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
@@ -527,6 +528,66 @@ class TestPolicy:
         for seed in range(40):
             chosen.add(tuple(policy_with(FORMS[4], env, seed).bind(env).act(np.zeros(3)).tolist()))
         assert chosen == {(a, b) for a in (0, 1) for b in (-1, 0, 1, 2)}
+
+
+class Blocked(fmugym.envs.CartPoleEnv):
+    """Left, nothing and right; where the cart is, only one side is allowed, and later nothing."""
+
+    def _get_action_space(self):
+        return spaces.Discrete(3)
+
+    def _get_inputs(self):
+        return 1.0 * self.action - 1.0
+
+    def action_masks(self):
+        is_right, is_late = self.state[0] > 0, self.step_count >= 5
+        return np.array([is_right & (not is_late), is_late, (not is_right) & (not is_late)])
+
+
+class BlockedPair(Blocked):
+    """Two levels more, of which the first one is allowed at the beginning only."""
+
+    def _get_action_space(self):
+        return spaces.MultiDiscrete([3, 2], start=[0, 4])
+
+    def _get_inputs(self):
+        return 1.0 * self.action[0] - 1.0
+
+    def action_masks(self):
+        return np.append(super().action_masks(), [self.step_count < 2, True])
+
+
+class TestMasks:
+    @pytest.mark.parametrize("kind", [Blocked, BlockedPair])
+    @pytest.mark.parametrize("hooks", ["compiled", "per_env"])
+    def test_are_respected_where_choices_are_made(self, kind, hooks):
+        chosen, allowed = [], []
+        with closing(kind()) as one, closing(FMUVectorEnv(kind, 6, hooks=hooks)) as envs:
+            policy = policy_with(FORMS[1], one, rows=6).bind(envs)
+            observations, _ = envs.reset(seed=3)
+            for _ in range(8):
+                actions = policy.act(observations)
+                chosen.append(actions.reshape(6, -1) - policy.space.start)
+                allowed.append(np.stack(envs.call("action_masks")))
+                observations, *_ = envs.step(actions)
+            for index in range(6):
+                alone = Policy(None, FORMS[1], policy.weights[index], policy.scale).bind(one)
+                observation, _ = one.reset(seed=3 + index)
+                for actions in chosen:
+                    action = alone.act(observation)
+                    assert (action - policy.space.start).ravel().tolist() == actions[index].tolist()
+                    observation, *_ = one.step(action)
+        chosen, allowed = np.array(chosen), np.array(allowed)
+        first = 0
+        for part, count in enumerate(policy.parts):
+            masks = allowed[:, :, first : first + count]
+            assert np.take_along_axis(masks, chosen[:, :, part, None], axis=2).all()
+            first += count
+        assert len(np.unique(chosen[:5, :, 0])) == 2
+
+    def test_a_policy_that_needs_them_is_not_exported(self):
+        with closing(Blocked()) as env, pytest.raises(ConfigError, match="masks"):
+            decision_of(env, policy_with(FORMS[0], env))
 
 
 def recording(network, seen):

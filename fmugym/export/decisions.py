@@ -76,6 +76,8 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
 def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
     law, past = policy.baseline, policy.starts
     _require_known(law, observed)
+    if policy.parts and policy.masks is not None:
+        raise ConfigError("a policy that needs masks of actions cannot be exported")
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
     if isinstance(law, Law):
         starts[_CONTROLLER] = np.array(law.starts, np.float64).reshape(-1)

@@ -161,8 +161,9 @@ class Policy(Controller):
     """A controller whose action a network corrects.
 
     Of a ``Box`` the action is that of the controller, and half of the range times what the network
-    gives. Of a ``Discrete`` or a ``MultiDiscrete`` the largest output of each part chooses. Without
-    weights it is the controller's own action.
+    gives. Of a ``Discrete`` or a ``MultiDiscrete`` the largest output of each part chooses, among
+    what the method ``action_masks`` of the environment allows, if it has one. Without weights it is
+    the controller's own action.
 
     Args:
         baseline: The controller; None for the middle of the range, or the first of the choices.
@@ -191,6 +192,7 @@ class Policy(Controller):
         names = tuple(self._names_of(env) if names is None else names)
         if self.baseline is not None:
             self.baseline.bind(env, names)
+        self.masks = _masks_of(env)
         return super().bind(env, names)
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
@@ -342,10 +344,24 @@ class Policy(Controller):
         outputs = (values @ last[:, :-1] + last[:, -1:])[:, 0].T
         if not self.parts:
             return outputs
+        if self.masks is not None:
+            outputs = np.where(self.masks().T, outputs, -np.inf)
         split = np.split(outputs, np.cumsum(self.parts)[:-1])
         return [
             one[0] + part.argmax(axis=0) for one, part in zip(self._choices, split, strict=True)
         ]
+
+
+def _masks_of(env: Any) -> Callable[[], npt.NDArray[np.bool_]] | None:
+    """A function that tells which choices are allowed now, shape (N, choices); None if all are."""
+    try:
+        attribute_of(env, "action_masks")
+    except AttributeError:
+        return None
+    base = env.unwrapped
+    if hasattr(base, "single_action_space"):
+        return lambda: np.stack(base.call("action_masks"))
+    return lambda: np.array([base.action_masks()])
 
 
 def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:
