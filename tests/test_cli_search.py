@@ -155,7 +155,7 @@ class TestCourse:
         """Also if the FMU was slow, so that candidates were few."""
         monkeypatch.setattr(Probe, "round_time", lambda self, candidates, _: 0.2 * candidates)
         arguments = "train", task, "--episodes", "3"
-        options = "--minutes", "0.05", "--output", tmp_path / "a"
+        options = "--minutes", "0.2", "--output", tmp_path / "a"
         code, out, err = run(capsys, *arguments, *options)
         assert code == 0, err
         assert "baseline only; for more, give --minutes" in err

@@ -932,9 +932,9 @@ def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS
     changes = {name: value for name, value in options.items() if name not in fields}
     make_env = load(document, **{"controllers": CONTROLLERS, **changes})
     given = {"candidates": 8, "episodes": 3} | {name: options[name] for name in fields}
+    given |= {} if told is None else {"tell": told.append}
     quest = Quest(make_env, {"unseen episodes": make_env}, folder, rounds=rounds, **given)
-    told = [] if told is None else told
-    return searching.search(quest, told.append, lambda *_: None, resume=resume)
+    return searching.search(quest, resume=resume)
 
 
 def content(folder):
@@ -1144,6 +1144,7 @@ class TestBudget:
         told = []
         with monkeypatch.context() as patch:
             patch.setattr(Probe, "round_time", lambda self, candidates, _: candidates / 8)
+            patch.setattr(searching, "monotonic", lambda: 0.0)
             limits = {"minutes": 0.05, "candidates": None, "told": told}
             _, facts = searched(tmp_path / "a", rounds=None, **limits)
         assert (facts["candidates"], facts["rounds"]) == (8, 15)

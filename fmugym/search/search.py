@@ -118,7 +118,7 @@ class Search:
         seed: Of the candidates and of the episodes.
 
     Attributes:
-        episodes: As given.
+        population, episodes, seed: As given.
         rounds: How many there have been.
         is_over: Whether nothing more is gained.
         baseline: The best agent without a network, once it is known.
@@ -137,7 +137,7 @@ class Search:
         seed: int = 0,
     ) -> None:
         self._sizes, self._limits, self._fixed = sizes, tuple(limits), list(fixed)
-        self._population, self.episodes = population, episodes
+        self.population, self.episodes, self.seed = population, episodes, seed
         self._rng = np.random.default_rng(seed)
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
         self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
@@ -232,7 +232,7 @@ class Search:
         self.is_over = not self._contenders
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
-        self._played += self._population * entrant.episodes
+        self._played += self.population * entrant.episodes
         entrant.play(arena, self._training(entrant.episodes), self._limits)
         self.rounds += 1
         if entrant.rounds % _EVERY == 0:
@@ -248,7 +248,7 @@ class Search:
     # Who takes part.
 
     def _tuner(self, name: str, tunable: Tunable, quota: int = _TUNING) -> Entrant:
-        cma = Axes(tunable.ranges).search(self._population, self._rng)
+        cma = Axes(tunable.ranges).search(self.population, self._rng)
         return Entrant(cma, _Tuned(name, tunable), self.episodes, quota)
 
     def _entrant(self, make: _Policies) -> Entrant:
@@ -261,7 +261,7 @@ class Search:
         if len(start) <= _MANY:
             alike = make.form.covariance(make.correlations, *self._sizes)
         limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
-        return CMA(start, sigma, self._population, self._rng, alike, **limits)
+        return CMA(start, sigma, self.population, self._rng, alike, **limits)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
@@ -288,8 +288,8 @@ class Search:
         count = _HISTORY.features(*self._sizes)
         moments: FloatArray = np.zeros(())
         for agent in agents:
-            rows = np.zeros((self._population, size))
-            rows[:, -acting:] = self._rng.uniform(-1, 1, (self._population, acting))
+            rows = np.zeros((self.population, size))
+            rows[:, -acting:] = self._rng.uniform(-1, 1, (self.population, acting))
             rows *= np.sqrt(_HISTORY.shapes(*self._sizes)[0][0])
             make = _Policies(agent, _HISTORY, (np.zeros(count), np.ones(count)))
             seeds = self._training(self.episodes)

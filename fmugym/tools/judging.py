@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
@@ -106,8 +106,7 @@ class Verdict:
 
 def judge(
     agents: Mapping[str, Agent],
-    scenarios: Mapping[str, Callable[[], Any]],
-    arena_of: Callable[[Callable[[], Any]], Arena],
+    arenas: Mapping[str, Arena],
     limits: Mapping[str, float],
     episodes: int | None,
 ) -> Verdict:
@@ -115,16 +114,15 @@ def judge(
 
     Args:
         agents: By name.
-        scenarios: Functions that make the environments, by name.
-        arena_of: Makes the arena for one of them.
+        arenas: Those of the scenarios, by name; they are closed.
         limits: What each cost may add up to in an episode, by name.
         episodes: How many episodes of each scenario; None for the default.
     """
-    count = episodes or (_EPISODES if len(scenarios) < 2 else _OF_SCENARIO)
+    count = episodes or (_EPISODES if len(arenas) < 2 else _OF_SCENARIO)
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + count)
     outcomes: dict[str, list[Outcome]] = {name: [] for name in agents}
-    for make_env in scenarios.values():
-        with closing(arena_of(make_env)) as arena:
+    for arena in arenas.values():
+        with closing(arena):
             for name, agent in agents.items():
                 outcomes[name].append(agent.play(arena, seeds))
-    return Verdict(outcomes, list(scenarios), limits)
+    return Verdict(outcomes, list(arenas), limits)

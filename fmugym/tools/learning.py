@@ -169,12 +169,14 @@ def _search(arguments: argparse.Namespace) -> None:
         arguments.output,
         arguments.minutes,
         seed=arguments.seed or 0,
+        tell=tell,
         **counts,
     )
     total = round(quest.seconds) if isfinite(quest.seconds) else None
     with progress(total, "train", "s") as advance:
+        quest = replace(quest, advance=_now_and_then(advance))
         try:
-            verdict, facts = search(quest, tell, _now_and_then(advance), resume=arguments.resume)
+            verdict, facts = search(quest, resume=arguments.resume)
         except KeyboardInterrupt:
             _tell_what_is_kept(arguments.output, STATE)
             raise
@@ -183,8 +185,10 @@ def _search(arguments: argparse.Namespace) -> None:
         say_json({"task": arguments.task, "output": arguments.output, **facts})
     else:
         say(verdict.text())
-        options = f"--rounds {facts['rounds']} --candidates {facts['candidates']}"
-        tell(f"{arguments.output} has the agent; {options} repeats the search")
+        options = (
+            f"; --rounds {facts['rounds']} --candidates {facts['candidates']} repeats the search"
+        )
+        tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
 
 
 def _now_and_then(advance: Advance) -> Callable[[float, str], None]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,9 +27,10 @@ from fmugym.signals import ordinary
 from fmugym.tools.agents import FACTS
 from fmugym.tools.diary import EVALUATIONS
 from fmugym.tools.judging import Verdict, judge
+from fmugym.tools.progress import Advance, no_progress
 from fmugym.tools.training import require_new
 
-__all__ = ["Quest", "search"]
+__all__ = ["STATE", "Quest", "search"]
 
 STATE: Final = "search.pkl"
 _MINUTES: Final = 1.0
@@ -60,13 +61,17 @@ class Quest:
         make_env: Makes the environment, in the physical form of its task.
         scenarios: By name, functions that make the environments of the test.
         folder: Where the agent is written; it must not exist, unless a search is resumed.
-        minutes: Real time without the test; None for one minute, or no limit if there are rounds.
+        minutes: Real time of all but the test; None for one minute, or no limit if there are
+            rounds.
         rounds: The largest number of rounds, those of a resumed search included; None for any.
-        steps: The largest number of steps of all environments together; None for any.
+        steps: The largest number of steps of all environments together, in all but the test; None
+            for any.
         envs: The largest number of environments that step together.
         candidates: Of a round; None for what fits the speed of the FMU.
         seed: Of candidates and episodes.
         episodes: Of the test, in each scenario; None for the default.
+        tell: Gets lines of text.
+        advance: Is told after each round of the seconds since the last one, and of the scores.
     """
 
     make_env: Callable[[], FMUEnv]
@@ -79,6 +84,8 @@ class Quest:
     candidates: int | None = None
     seed: int = 0
     episodes: int | None = None
+    tell: Callable[[str], None] = lambda line: None
+    advance: Advance = no_progress
 
     @property
     def seconds(self) -> float:
@@ -94,149 +101,88 @@ class _Course:
 
     search: Search
     probe: Probe
-    candidates: int
-    seed: int
-    steps: int = 0
+    steps: int
 
 
-def search(
-    quest: Quest,
-    tell: Callable[[str], None],
-    advance: Callable[[float, str], None],
-    *,
-    resume: bool = False,
-) -> tuple[Verdict, dict[str, Any]]:
+def search(quest: Quest, *, resume: bool = False) -> tuple[Verdict, dict[str, Any]]:
     """Search an agent, write it, and let it play the test.
 
     An interruption by Ctrl-C ends the search; the best agent until then is in the folder.
 
     Args:
         quest: What to search.
-        tell: Gets lines of text.
-        advance: Is told after each round of the seconds since the last one, and of the scores.
         resume: Whether to go on with the search in the folder.
 
     Returns:
         The verdict, and the facts of the agent.
 
     Raises:
-        ConfigError: If no policy can be searched for the task, or there is nothing to resume.
+        ConfigError: If no policy can be searched for the task, there is nothing to resume, or the
+            rounds are too few to find anything.
         FileExistsError: If the folder exists, unless a search is resumed.
     """
     begin = monotonic()
-    if resume:
-        course = _resumed(quest)
-    else:
-        require_new(quest.folder, STATE)
-        course = _begun(quest, tell)
-        quest.folder.mkdir(parents=True, exist_ok=True)
-    is_enough = _is_enough(quest, course, begin, tell)
-    _tell_of_the_plan(quest, course, tell)
-    winner = _Run(quest, course, tell, advance, begin, is_enough).run()
-    if winner is None:
-        raise ConfigError(
-            f"{course.search.rounds} rounds are too few to find anything: give more --minutes, "
-            "--rounds or --steps"
-        )
-    return _judged(quest, course, winner, tell)
+    course = _resumed(quest) if resume else _begun(quest)
+    run = _Run(quest, course, begin)
+    run.tell_the_plan()
+    return run.judged(run.winner())
 
 
-def _begun(quest: Quest, tell: Callable[[str], None]) -> _Course:
+def _begun(quest: Quest) -> _Course:
+    require_new(quest.folder, STATE)
     if quest.steps is not None and quest.steps <= MOST_PROBED:
         raise ConfigError(
             f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
         )
     probe = Probe.of(quest.make_env, quest.envs)
-    for line in _warnings(probe):
-        tell(line)
-    fixed, tunable = _declared(probe)
-    guesses: list[str] = []
-    if not fixed and not tunable and probe.document:
-        with closing(quest.make_env()) as env:
-            guesses = guessed_controllers(probe.document, env)
-    tell(_told_baseline([one.name for one in fixed], list(tunable), guesses))
-    episodes = 1 if probe.is_same else EPISODES
-    is_slow = probe.round_time(POPULATION, episodes) * _ENOUGH > quest.seconds
-    candidates = quest.candidates or (_FEW if is_slow else POPULATION)
-    made = Search(
-        (len(probe.names), probe.acting),
-        fixed,
-        {name: search_of(text) for name, text in tunable.items()},
-        [search_of(text) for text in guesses],
-        list(probe.limits.values()),
-        candidates,
-        episodes,
-        quest.seed,
-    )
-    return _Course(made, probe, candidates, quest.seed, probe.steps)
-
-
-def _warnings(probe: Probe) -> list[str]:
-    found = []
-    if probe.only_reward is not None:
-        found.append(
-            f"the reward has been {probe.only_reward:g} in each step: what is to be learned?"
-        )
-    if probe.length is None:
-        found.append(f"episodes have no length; they are stopped after {probe.most_steps} steps")
-    return [f"warning: {text}" for text in found]
-
-
-def _declared(probe: Probe) -> tuple[list[Agent], dict[str, str]]:
-    """The controllers of the task: those that are ready, and the texts of those with ranges."""
     given = probe.document.get("controllers", {})
-    tunable = {name: one for name, one in given.items() if has_range(one)}
-    ready = [
+    tunable = {name: search_of(one) for name, one in given.items() if has_range(one)}
+    fixed = [
         Agent(name, one) if isinstance(one, str) else Agent.constant(name, one, probe.ranges)
         for name, one in given.items()
         if name not in tunable
     ]
-    return ready, tunable
+    guesses: list[str] = []
+    if not given and probe.document:
+        with closing(quest.make_env()) as env:
+            guesses = guessed_controllers(probe.document, env)
+    for line in _first_lines(probe, [one.name for one in fixed], list(tunable), len(guesses)):
+        quest.tell(line)
+    episodes = 1 if probe.is_same else EPISODES
+    is_slow = probe.round_time(POPULATION, episodes) * _ENOUGH > quest.seconds
+    made = Search(
+        (len(probe.names), probe.acting),
+        fixed,
+        tunable,
+        [search_of(text) for text in guesses],
+        list(probe.limits.values()),
+        quest.candidates or (_FEW if is_slow else POPULATION),
+        episodes,
+        quest.seed,
+    )
+    quest.folder.mkdir(parents=True, exist_ok=True)
+    return _Course(made, probe, probe.steps)
 
 
-def _told_baseline(fixed: list[str], tunable: list[str], guesses: list[str]) -> str:
-    declared = [*fixed, *(f"{name} (to be tuned)" for name in tunable)]
-    if declared:
-        return f"to be beaten: {', '.join(declared)}, as the task declares"
-    if guesses:
-        return (
-            f"to be beaten: the best of {len(guesses)} PI controllers for the differences in the "
+def _first_lines(probe: Probe, fixed: list[str], tunable: list[str], guesses: int) -> Iterator[str]:
+    """What may be wrong with the task, and what is to be beaten."""
+    if probe.only_reward is not None:
+        yield (
+            f"warning: the reward has been {probe.only_reward:g} in each step: what is to be "
+            "learned?"
+        )
+    if probe.length is None:
+        yield (f"warning: episodes have no length; they are stopped after {probe.most_steps} steps")
+    if fixed or tunable:
+        names = ", ".join([*fixed, *(f"{name} (to be tuned)" for name in tunable)])
+        yield f"to be beaten: {names}, as the task declares"
+    elif guesses:
+        yield (
+            f"to be beaten: the best of {guesses} PI controllers for the differences in the "
             "reward, since the task declares no controllers"
         )
-    return "to be beaten: the best constant action, since no controller suggests itself"
-
-
-def _is_enough(quest: Quest, course: _Course, begin: float, tell: Callable[[str], None]) -> bool:
-    """Whether the time is enough for policies, and not for the baseline only."""
-    time = course.probe.round_time(_FEW, course.search.episodes)
-    if time * _FEWEST <= quest.seconds - (monotonic() - begin):
-        return True
-    tell(
-        f"a round of {_FEW} candidates takes about {time:.3g} s, so the time will do for the "
-        f"baseline only; for more, give --minutes {np.ceil(time * 2 * _FEWEST / 60):.0f}"
-    )
-    return False
-
-
-def _tell_of_the_plan(quest: Quest, course: _Course, tell: Callable[[str], None]) -> None:
-    limits = []
-    if np.isfinite(quest.seconds):
-        limits.append(f"for {quest.seconds:g} s")
-    if quest.rounds is not None:
-        limits.append(f"until round {quest.rounds}")
-    if quest.steps is not None:
-        limits.append(f"for at most {quest.steps} steps")
-    kind = "one episode, as all are the same" if course.probe.is_same else "new episodes"
-    tell(
-        f"{course.candidates} candidates at a time play {kind} of up to "
-        f"{course.probe.most_steps} steps, {' and '.join(limits)}"
-    )
-
-
-def _arena(quest: Quest, probe: Probe, make_env: Callable[[], Any]) -> Arena:
-    most_steps = probe.most_steps if make_env is quest.make_env else _LONGEST
-    envs = quest.envs if probe.seconds < _SLOW else min(quest.envs, _GROUP)
-    return Arena(make_env, envs, most_steps, list(probe.limits))
+    else:
+        yield "to be beaten: the best constant action, since no controller suggests itself"
 
 
 class _Run:
@@ -245,45 +191,76 @@ class _Run:
     Args:
         quest: What to search.
         course: The search.
-        tell, advance: As for ``search``.
         begin: When the time has begun.
-        is_enough: Whether the time is enough for policies, too.
     """
 
-    def __init__(
-        self,
-        quest: Quest,
-        course: _Course,
-        tell: Callable[[str], None],
-        advance: Callable[[float, str], None],
-        begin: float,
-        is_enough: bool,
-    ) -> None:
-        self._quest, self._course, self._is_enough = quest, course, is_enough
-        self._tell, self._advance = tell, advance
+    def __init__(self, quest: Quest, course: _Course, begin: float) -> None:
+        self._quest, self._course = quest, course
         self._begin, self._written = begin, monotonic()
-        self._arena = _arena(quest, course.probe, quest.make_env)
+        self._arena = self._arena_of(quest.make_env, course.probe.most_steps)
         self._arena.steps = self._steps_before = course.steps
         self._most = quest.steps or np.inf
+        self._few = course.probe.round_time(_FEW, course.search.episodes)
+        self._is_enough = self._few * _FEWEST <= quest.seconds - (monotonic() - begin)
         self._noted = NO_MERIT if course.search.baseline is None else self._best()
 
-    def run(self) -> Agent | None:
-        """Search, and return the winner of the last validation; None if nothing was found.
+    def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
+        envs, probe = self._quest.envs, self._course.probe
+        group = envs if probe.seconds < _SLOW else min(envs, _GROUP)
+        return Arena(make_env, group, most_steps, list(probe.limits))
+
+    def tell_the_plan(self) -> None:
+        """Tell what will be done, and how long."""
+        quest, probe, limits = self._quest, self._course.probe, []
+        if not self._is_enough:
+            quest.tell(
+                f"a round of {_FEW} candidates takes about {self._few:.3g} s, so the time will do "
+                "for the baseline only; for more, give --minutes "
+                f"{np.ceil(self._few * 2 * _FEWEST / 60):.0f}"
+            )
+        if np.isfinite(quest.seconds):
+            limits.append(f"for {quest.seconds:g} s")
+        if quest.rounds is not None:
+            limits.append(f"until round {quest.rounds}")
+        if quest.steps is not None:
+            limits.append(f"for at most {quest.steps} steps")
+        kind = "one episode, as all are the same" if probe.is_same else "new episodes"
+        quest.tell(
+            f"{self._course.search.population} candidates at a time play {kind} of up to "
+            f"{probe.most_steps} steps, {' and '.join(limits)}"
+        )
+
+    def winner(self) -> Agent:
+        """Search, and find the winner of the last validation.
 
         What was found is written also if an exception ends the search. What was done in the round
         that it has interrupted is forgotten, so that those who resume or repeat the search come to
         the same agent.
+
+        Raises:
+            ConfigError: If nothing was found.
         """
-        self._keep()
-        try:
-            with closing(self._arena):
+        with closing(self._arena):
+            self._keep()
+            try:
                 self._search()
-        finally:
-            self._course.search = pickle.loads(self._kept)
-            self._write()
-        self._tell(self._text())
-        winner = self._winner()
-        self._write_state()
+            finally:
+                self._course.search = pickle.loads(self._kept)
+                self._write()
+            self._quest.tell(self._text())
+            self._arena.close()  # a new one takes no more steps than what is reserved
+            self._arena.ceiling = self._most
+            found = self._course.search
+            try:
+                winner = found.winner(self._arena)
+            except CeilingError:  # no round has had enough steps
+                winner = None
+            self._write_state()
+        if winner is None:
+            raise ConfigError(
+                f"{found.rounds} rounds are too few to find anything: give more --minutes, "
+                "--rounds or --steps"
+            )
         return winner
 
     def _search(self) -> None:
@@ -300,17 +277,7 @@ class _Run:
             self._note()
             now = monotonic()
             last, took = now, now - last
-            self._advance(took, self._text())
-
-    def _winner(self) -> Agent | None:
-        with closing(_arena(self._quest, self._course.probe, self._quest.make_env)) as arena:
-            arena.steps, arena.ceiling = self._course.steps, self._most
-            try:
-                return self._course.search.winner(arena)
-            except CeilingError:  # no round has had enough steps
-                return None
-            finally:
-                self._course.steps = arena.steps
+            self._quest.advance(took, self._text())
 
     def _reserved(self) -> int:
         """The steps that the last validation may take."""
@@ -322,16 +289,15 @@ class _Run:
         self._kept = pickle.dumps(self._course.search)
 
     def _is_over(self, took: float) -> bool:
-        """Whether the search ends, with or without time for another round like the last one."""
+        """Whether there is no time for another round like the last one, or nothing left to do."""
         found, rounds = self._course.search, self._quest.rounds
         if found.is_over or (rounds is not None and found.rounds >= rounds):
             return True
         if not self._is_enough and found.is_tuned and found.baseline is None:
             return True
-        now = monotonic()
-        done = self._arena.steps - self._steps_before
-        pace = (now - self._begin) / done if done else self._course.probe.seconds
-        return now - self._begin + took + self._reserved() * pace >= self._quest.seconds
+        done, seconds = self._arena.steps - self._steps_before, monotonic() - self._begin
+        pace = seconds / done if done else self._course.probe.seconds
+        return seconds + took + self._reserved() * pace >= self._quest.seconds
 
     def _best(self) -> Merit:
         return max((merit for _, merit in self._course.search.known()), default=NO_MERIT)
@@ -362,37 +328,53 @@ class _Run:
 
     def _write(self) -> None:
         """Write the best agent until now, and the state of the search."""
-        self._written, self._course.steps = monotonic(), self._arena.steps
-        known = self._course.search.known()
+        self._written, known = monotonic(), self._course.search.known()
         if known:
-            best, _ = max(known, key=lambda one: one[1])
-            _save(self._quest.folder, self._course, best)
+            self._save(max(known, key=lambda one: one[1])[0])
         self._write_state()
 
     def _write_state(self) -> None:
+        self._course.steps = self._arena.steps
         path = self._quest.folder / STATE
         part = path.with_suffix(".part")
         part.write_bytes(pickle.dumps(self._course))
         part.replace(path)
 
+    def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
+        """Write an agent and its facts."""
+        folder, probe, found = self._quest.folder, self._course.probe, self._course.search
+        replace(agent, names=probe.names, actions=probe.actions).save(folder)
+        facts = {
+            "algorithm": "search",
+            "agent": agent.name,
+            "baseline": (found.baseline or agent).name,
+            "controller": agent.text,
+            "rounds": found.rounds,
+            "candidates": found.population,
+            "seed": found.seed,
+            "steps": self._arena.steps,
+            **more,
+        }
+        (folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
+        return facts
 
-def _save(folder: Path, course: _Course, agent: Agent) -> dict[str, Any]:
-    """Write an agent and its facts."""
-    probe, found = course.probe, course.search
-    agent = replace(agent, names=probe.names, actions=probe.actions)
-    agent.save(folder)
-    facts = {
-        "algorithm": "search",
-        "agent": agent.name,
-        "baseline": (found.baseline or agent).name,
-        "controller": agent.text,
-        "rounds": found.rounds,
-        "candidates": course.candidates,
-        "seed": course.seed,
-        "steps": course.steps,
-    }
-    (folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
-    return facts
+    def judged(self, winner: Agent) -> tuple[Verdict, dict[str, Any]]:
+        """Write the winner, and let it play beside the others."""
+        quest, probe, found = self._quest, self._course.probe, self._course.search
+        self._save(winner)
+        if winner is found.baseline:
+            quest.tell(
+                f"nothing was found that beats {winner.name}: the folder has that controller"
+            )
+        agents = {winner.name: winner}
+        for other in [found.baseline or winner, *found.others()]:
+            agents.setdefault(other.name, other)
+        arenas = {
+            name: self._arena_of(make, probe.most_steps if make is quest.make_env else _LONGEST)
+            for name, make in quest.scenarios.items()
+        }
+        verdict = judge(agents, arenas, probe.limits, 1 if probe.is_same else quest.episodes)
+        return verdict, self._save(winner, test=verdict.as_dict())
 
 
 def _resumed(quest: Quest) -> _Course:
@@ -422,26 +404,3 @@ def _resumed(quest: Quest) -> _Course:
             f"the search in {shown(str(folder))} is of a task with another {', '.join(changed)}"
         )
     return course
-
-
-def _judged(
-    quest: Quest, course: _Course, winner: Agent, tell: Callable[[str], None]
-) -> tuple[Verdict, dict[str, Any]]:
-    """Write the winner, and let it play beside the others."""
-    facts = _save(quest.folder, course, winner)
-    found = course.search
-    if winner is found.baseline:
-        tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-    agents = {winner.name: winner}
-    for other in [found.baseline or winner, *found.others()]:
-        agents.setdefault(other.name, other)
-    verdict = judge(
-        agents,
-        quest.scenarios,
-        lambda make_env: _arena(quest, course.probe, make_env),
-        course.probe.limits,
-        1 if course.probe.is_same else quest.episodes,
-    )
-    facts |= {"test": verdict.as_dict()}
-    (quest.folder / FACTS).write_text(json.dumps(facts), encoding="utf-8")
-    return verdict, facts
