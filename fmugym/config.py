@@ -176,7 +176,7 @@ class Foreign(KnownArguments):
     max_instances: int | None = key(
         LARGE_COUNT,
         "How many instances of the FMU this process and its workers may have at once; see "
-        "[Licences](foreign-fmus.md#it-needs-a-licence).",
+        "[Licences](failures.md#it-needs-a-licence).",
         None,
         "no limit",
     )
@@ -187,7 +187,7 @@ class Foreign(KnownArguments):
     )
     preload: tuple[str, ...] = key(
         Kind(_names, NAMES.schema, "libraries"),
-        "Shared libraries that are [loaded before](foreign-fmus.md#a-shared-library-is-missing) "
+        "Shared libraries that are [loaded before](foreign-fmus.md#missing-libraries) "
         "the FMU's own. A relative path is relative to the file of the class or of the task.",
         (),
     )
@@ -244,7 +244,7 @@ class EnvConfig:
     start_time: Any = key(
         Kind(_start_time, {"title": "number, distribution, list of numbers"}),
         "First communication point of an episode in seconds, or [what it is drawn "
-        "from](episodes.md#choose-when-an-episode-begins) at each reset.",
+        "from](config.md#step-sizes-and-times) at each reset.",
         None,
         "the default of the FMU",
     )
@@ -253,7 +253,7 @@ class EnvConfig:
     )
     tolerance: float | None = key(
         POSITIVE,
-        "Tolerance of the FMU's solver, or of [fmugym's](model-exchange.md#choose-a-solver) in "
+        "Tolerance of the FMU's solver, or of [fmugym's](fmi.md#choose-a-solver) in "
         "model exchange.",
         None,
         "that of the FMU's default experiment",
@@ -274,7 +274,7 @@ class EnvConfig:
     episode_variables: Mapping[str, Any] = key(
         Entries(Kind(_variable)),
         "Variables of the task itself by name, such as targets, integrals and histories: numbers, "
-        "distributions, or [arrays](episodes.md#randomize-parameters-and-start-values) of both. "
+        "distributions, or [arrays](hooks.md#remember-something-during-an-episode) of both. "
         "`_update` may write them; it assigns new arrays.",
         {},
     )
@@ -297,7 +297,7 @@ class EnvConfig:
     fault_reward: float = key(NUMBER, "Reward of a failed step.", 0.0)
     isolation: str | None = key(
         option(*ISOLATIONS),
-        'Where the FMU runs: `"process"`: in [worker processes](foreign-fmus.md#it-crashes-or-'
+        'Where the FMU runs: `"process"`: in [worker processes](failures.md#it-crashes-or-'
         'hangs), `"none"`: in your process.',
         None,
         "in your process where possible",
@@ -323,14 +323,14 @@ class EnvConfig:
     )
     solver: str = key(
         option(*SOLVERS),
-        "The [solver](model-exchange.md#choose-a-solver) for model exchange.",
+        "The [solver](fmi.md#choose-a-solver) for model exchange.",
         SOLVERS[0],
     )
     max_step: float | None = key(
         POSITIVE,
         "The longest step of this solver in seconds.",
         None,
-        "see [its page](model-exchange.md#choose-a-solver)",
+        "see [its page](fmi.md#choose-a-solver)",
     )
 
     @classmethod

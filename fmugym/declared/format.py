@@ -500,7 +500,7 @@ WARM_UP: Final = Table(
             FLAG,
             "Whether to keep the FMU's state after the warm-up, for later episodes that begin in "
             "the same way. It is kept in memory, and on disk for later runs, where the FMU's "
-            "[states](snapshots.md) can be serialized.",
+            "[states](planning.md#which-way-is-used) can be serialized.",
             False,
         ),
     },

@@ -70,14 +70,14 @@ class Component(KnownArguments):
     steps: int = key(COUNT, "Communication steps of the component in one of the system.", 1)
     feedthrough: bool | None = key(
         Kind(_no_feedthrough, {"const": False}),
-        "`false`: [no output depends on an input](systems.md#order-and-algebraic-loops) without a "
+        "`false`: [no output depends on an input](systems.md#order) without a "
         "step in between.",
         None,
         "as the FMU tells",
     )
     isolate: bool = key(
         FLAG,
-        "Whether the whole system runs in [worker processes](masters.md#in-worker-processes) "
+        "Whether the whole system runs in [worker processes](systems.md#in-worker-processes) "
         "because of this component, so that a crash ends single episodes only.",
         False,
     )

@@ -64,12 +64,12 @@ SYSTEM: Final = Table(
         "stop_time": Key(NUMBER, "Of the default experiment, in seconds."),
         "master": Key(
             option(*MASTERS),
-            "How values are exchanged; see [How systems run](masters.md#a-step).",
+            "How values are exchanged; see [How systems run](systems.md#how-a-step-runs).",
             MASTERS[0],
         ),
         "loops": Key(
             option(*LOOPS),
-            "How [algebraic loops](masters.md#algebraic-loops) are solved, or that they are "
+            "How [algebraic loops](systems.md#algebraic-loops) are solved, or that they are "
             "refused.",
             LOOPS[0],
         ),
