@@ -97,7 +97,10 @@ class UnknownParameterError(ConfigError, KeyError):
 
 
 class TaskError(ConfigError):
-    """A declared task has a mistake. The text begins with the file, the line and the keys."""
+    """A declared task has mistakes. Each line begins with the file, the line in it and the keys."""
+
+    def __str__(self) -> str:
+        return "\n".join(map(printable, str(self.args[0]).split("\n")))
 
 
 class FMULoadError(FMUGymError):

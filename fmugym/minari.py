@@ -36,7 +36,12 @@ _KEY: Final = "fmugym"
 
 
 def write_dataset(
-    dataset_id: str, recordings: Sequence[Recording], env: FMUEnv, **about: Any
+    dataset_id: str,
+    recordings: Sequence[Recording],
+    env: FMUEnv,
+    *,
+    replaces: bool = False,
+    **about: Any,
 ) -> minari.MinariDataset:
     """Make a dataset of recordings, in Minari's folder on this machine.
 
@@ -44,6 +49,7 @@ def write_dataset(
         dataset_id: Its name, such as ``"house/pi-v0"``.
         recordings: The episodes, at least one.
         env: An environment of the task. It gives the spaces, and its spec if it has one.
+        replaces: Whether a dataset of this name is replaced.
         about: Metadata of Minari, such as ``author``, ``algorithm_name`` and ``description``; and
             ``data_format``.
 
@@ -62,6 +68,8 @@ def write_dataset(
     episodes = [_buffer(number, one, env) for number, one in enumerate(recordings)]
     spec = {"env": env.spec} if env.spec is not None else {}
     spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
+    if replaces and dataset_id in minari.list_local_datasets():
+        minari.delete_dataset(dataset_id)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about metadata that the caller leaves out

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from types import FrameType
 from typing import Final, TypeVar
 
-__all__ = ["RETIRED", "warn_of_gone", "without_retired"]
+__all__ = ["RETIRED", "grouped", "warn_of_gone", "without_retired"]
 
 _Value = TypeVar("_Value")
 
@@ -47,3 +47,22 @@ def warn_of_gone(text: str) -> None:
 def _package_of(frame: FrameType) -> str:
     name: str = frame.f_globals.get("__name__", "")
     return name.partition(".")[0]
+
+
+def grouped(
+    given: Mapping[str, _Value], names: Collection[str], where: str
+) -> tuple[dict[str, _Value], dict[str, _Value]]:
+    """Separate keys that have moved, with a ``FutureWarning`` for each.
+
+    Args:
+        given: What the user gave.
+        names: The keys that have moved.
+        where: Where they stand now.
+
+    Returns:
+        The other keys, and these.
+    """
+    moved = {key: value for key, value in given.items() if key in names}
+    for key in moved:
+        warn_of_gone(f"{key!r} now stands in {where}")
+    return {key: value for key, value in given.items() if key not in moved}, moved

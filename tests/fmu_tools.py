@@ -10,6 +10,7 @@ import building
 import fmpy
 
 import fmugym
+from fmugym.config import FOREIGN
 
 MAJOR_VERSIONS = (1, 2, 3)
 HERE = Path(__file__).parent
@@ -242,7 +243,14 @@ class PlainEnv(fmugym.FMUEnv):
         return False
 
 
+def grouped(config):
+    """A config whose keys for experts stand in their table."""
+    foreign = {key: value for key, value in config.items() if key in FOREIGN.keys}
+    own = {key: value for key, value in config.items() if key not in foreign}
+    return own | ({"foreign": foreign} if foreign else {})
+
+
 def probe_config(**changes):
     """A config for the probe: one input, its integral as output."""
     config = {"model_input_names": "a", "model_output_names": ["sum", "mix"], "time_step": 0.1}
-    return config | changes
+    return grouped(config | changes)

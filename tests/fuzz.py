@@ -3,7 +3,7 @@
     python tests/fuzz.py --count 20000 --seed 0
 
 Each case is a sound FMU with one to four mutations of its bytes, its archive, its model description
-or its library. The program opens and describes it as ``fmugym info`` and ``fmugym skeleton`` do,
+or its library. The program opens and describes it as ``fmugym info`` and ``fmugym new`` do,
 makes a config of it, and extracts it. Nothing of the FMU is loaded. A case also fails with control
 characters in a text for people. If the program ends with a crash or a hang, ``case.fmu`` stays in a
 temporary folder. The bundled FMUs must stay the same for a case to be repeated. See

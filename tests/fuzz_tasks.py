@@ -18,7 +18,7 @@ import tomlkit
 from fuzz_driver import Case, CaseError, main, require
 
 import fmugym
-from fmugym.declared.task import KEYS
+from fmugym.declared.format import TASK
 from fmugym.errors import FMUGymError, FMULoadError, TaskError
 
 PENDULUM = {
@@ -88,7 +88,8 @@ PENDULUM = {
     "kpis": {"worst": {"min": "near"}, "sum": {"sum": "cost * dt_h"}, "both": "worst + sum"},
     "terminated": "abs(angle) > 170",
     "truncated": "elapsed > 5 and not done",
-    "config": {"on_fault": "truncate", "max_instances": 3},
+    "config": {"on_fault": "truncate"},
+    "foreign": {"max_instances": 3},
 }
 
 SWITCHED = {
@@ -180,7 +181,7 @@ def is_placed(error, file):
     text = str(error)
     if file is not None and not text.startswith((file.name, "the path")):
         return False
-    return any(key in text for key in KEYS)
+    return any(key in text for key in TASK.keys)
 
 
 def load(task, file):

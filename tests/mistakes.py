@@ -22,15 +22,7 @@ import tomlkit
 
 import fmugym
 from fmugym.config import EnvConfig
-from fmugym.declared.configuring import _OF_CONFIG, _OF_SECTIONS
-from fmugym.declared.declarations import AGENT_KEYS
-from fmugym.declared.devices import DEVICE_KEYS
-from fmugym.declared.kpis import KPIS
-from fmugym.declared.series import DATA_KEYS
-from fmugym.declared.setpoints import SETPOINTS
-from fmugym.declared.task import KEYS
-from fmugym.declared.variables import VARIABLE_KEYS
-from fmugym.declared.warming import WARM_UP_KEYS
+from fmugym.declared import format as task_format
 from fmugym.errors import shown
 from fmugym.tools.cli import _parser, main
 
@@ -101,13 +93,11 @@ def command(*arguments: str, facts: tuple[str, ...]) -> Mistake:
 
 
 POSITIONAL = {
-    **dict.fromkeys(("info", "new", "skeleton", "stand-in", "compile"), ("model.fmu",)),
+    **dict.fromkeys(("info", "new"), ("model.fmu",)),
     **dict.fromkeys(("validate", "simulate", "evaluate", "bench"), ("task.toml",)),
-    "record": ("task.toml", "--output", "run.csv"),
     "train": ("task.toml", "--output", "agent"),
     "tune": ("task.toml", "pid of=q setpoint=1 kp=0.1..1"),
     "export": ("agent", "--task", "task.toml", "--output", "agent.c"),
-    "dataset": ("a/b-v0",),
     "demo": (),
 }
 """Arguments with which each command would begin."""
@@ -170,9 +160,9 @@ COMMANDS = {
     ("simulate", "task.toml", "--output", "run.xls"): ("run.xls", ".csv"),
     ("evaluate", "task.toml", "--plot", "a.pgn"): ("'a.pgn'", ".png"),
     ("evaluate", "task.toml", "--scenario", "forst"): ("'forst'",),
-    ("record", "task.toml", "--output", "a.cvs"): ("'a.cvs'", ".csv"),
-    ("record", "task.toml", "--output", "a.csv", "--variables", "qq"): ("'qq'", "'q'"),
-    ("record", "task.toml", "--output", "a.csv", "--every", "0.03"): ("0.03", "0.02"),
+    ("simulate", "task.toml", "--output", "a.cvs"): ("'a.cvs'", ".csv"),
+    ("simulate", "task.toml", "--output", "a.csv", "--variables", "qq"): ("'qq'", "'q'"),
+    ("simulate", "task.toml", "--output", "a.csv", "--every", "0.03"): ("0.03", "0.02"),
     ("bench", "task.toml", "--envs", "0"): ("num_envs", "0"),
     ("bench", "task.toml", "--seconds", "-1"): ("--seconds", "-1"),
     ("tune", "task.toml", "pid of=q setpoint=1 kp=1"): ("range", "kp=0.05..5"),
@@ -181,8 +171,8 @@ COMMANDS = {
     ("export", "x", "--task", "task.toml", "--output", "a.c", "--fmi", "4.0"): ("--fmi", "'4.0'"),
     ("demo", "--seed", "-1"): ("seed", "-1"),
     ("demo", "--output", "no/x.png"): ("no/x.png", "'no'"),
-    ("stand-in", "model.fmu"): ("model.fmu", "libgfortran"),
-    ("compile", "model.fmu"): ("model.fmu", "source code"),
+    ("info", "--repair", "task.toml"): ("task.toml", "FMU"),
+    ("info", "--repair", "model.fmu"): ("model.fmu", "source code"),
 }
 
 
@@ -232,18 +222,19 @@ def nested(keys: str, value: Any) -> dict[str, Any]:
     return value
 
 
+SECTIONS = task_format.TASK.keys
 TABLES = {
-    "": KEYS,
-    "agent": AGENT_KEYS,
-    "variables.q": (*VARIABLE_KEYS, *DEVICE_KEYS),
-    "config": _OF_CONFIG,
-    "data.d": DATA_KEYS,
-    "setpoints.s": tuple(SETPOINTS),
-    "kpis.k": tuple(KPIS),
-    "clock": ("from", "to", "step", "exclude"),
-    "scenarios.s": ("start", "length"),
-    "memory.m": ("start", "update", "min", "max"),
-    "expressions.e": ("expr", "min", "max"),
+    "": SECTIONS,
+    "agent": SECTIONS["agent"].kind.keys,
+    "variables.q": SECTIONS["variables"].kind.kind.keys,
+    "config": task_format.CONFIG_OF_TASK.keys,
+    "data.d": SECTIONS["data"].kind.kind.keys,
+    "setpoints.s": SECTIONS["setpoints"].kind.kind.keys,
+    "kpis.k": SECTIONS["kpis"].kind.kind.keys,
+    "clock": task_format.SEASON.keys,
+    "scenarios.s": SECTIONS["scenarios"].kind.kind.keys,
+    "memory.m": SECTIONS["memory"].kind.kind.keys,
+    "expressions.e": SECTIONS["expressions"].kind.kind.keys,
     "reward.r": ("expr", "weight"),
     "variables.q.drop_out": ("probability", "value"),
     "fmu": ("bundled", "fmi_version"),
@@ -258,12 +249,12 @@ def of_keys() -> Iterator[Mistake]:
             wrong = misspelt(key)
             change = nested(f"{table}.{wrong}".lstrip("."), 1)
             yield task(change, f"'{wrong}'", f"did you mean '{key}'", wrong)
-    for key in (key for key in KEYS if key not in {"class", "arguments", "extends", "system"}):
+    for key in SECTIONS.keys() - {"class", "arguments", "extends", "system"}:
         wrong = 3.5 if key in _TEXTS_OR_TABLES else [[]]
         yield task({key: wrong}, key, shown(wrong[0] if key in _TIMES else wrong), WANTED)
-    for key in _OF_SECTIONS:
+    for key in task_format.CONFIG_OF_TASK.elsewhere:
         yield task(nested(f"config.{key}", 1), f"'{key}' is no key of [config]")
-    for key in WARM_UP_KEYS[1:]:
+    for key in ("controller", "cache"):
         wrong = misspelt(key)
         yield task({"warm_up": {"period": "1s", wrong: "x"}}, wrong, f"'{key}'")
 
@@ -348,7 +339,7 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ({"fmu": {"bundled": "Pendulun"}}, ("'Pendulun'", "'Pendulum'")),
     ({"fmu": {"bundled": "Pendulum", "fmi_version": "4.0"}}, ("'4.0'", "'3.0'")),
     ({"variables": {"tau": {"min": "a"}}}, ("tau.min", "'a'")),
-    ({"variables": {"tau": {"min": 1, "max": 0}}}, ("min", "max", "1.0 and 0.0")),
+    ({"variables": {"tau": {"min": 1, "max": 0}}}, ("min", "max", "1 and 0")),
     ({"variables": {"tau": {"unit": "kg"}}}, ("'kg'", "'N.m'")),
     ({"variables": {"tau": {"unit": "xyz"}}}, ("'xyz'", "W/(m2.K)")),
     ({"variables": {"tau": {"unit": 3}}}, ("unit", "3", "text")),
@@ -393,8 +384,8 @@ FILES: tuple[tuple[dict[str, Any], tuple[str, ...]], ...] = (
     ({"terminated": "not"}, ("'not'", "ends too early")),
     ({"config": {"on_fault": "rais"}}, ("'rais'", "'raise'")),
     ({"config": {"isolation": "proces"}}, ("'proces'", "'process'")),
-    ({"config": {"call_timeout": -1}}, ("call_timeout", "-1", "positive")),
-    ({"config": {"preload": 3}}, ("preload", "3", "list of names")),
+    ({"foreign": {"call_timeout": -1}}, ("call_timeout", "-1", "positive")),
+    ({"foreign": {"preload": 3}}, ("preload", "3", "list of names")),
     ({"config": {"stop_time": "a"}}, ("stop_time", "'a'", "number")),
     ({"data": {"d": {"file": "price.csv"}}}, ("'price.csv'", "'prices.csv'")),
     ({"data": {"d": {"file": "prices.csv", "column": "prise"}}}, ("'prise'", "'price'")),

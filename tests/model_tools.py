@@ -97,7 +97,9 @@ class GainEnv(fmugym.FMI2CSEnv):
             "model_output_names": "y",
             "model_parameters": {"gain": gain},
         } | config
-        super().__init__(path, config, log_level, backend=backend, isolation=isolation)
+        super().__init__(
+            path, fmu_tools.grouped(config), log_level, backend=backend, isolation=isolation
+        )
 
     def _is_done(self):
         return self.out["y"] > 1e9

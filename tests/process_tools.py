@@ -91,7 +91,7 @@ class FaultyEnv(fmugym.FMI2CSEnv):
             "bounds": {"u": (-1, 1)},
             "isolation": "process",
         } | config
-        super().__init__(path, config)
+        super().__init__(path, fmu_tools.grouped(config))
 
     def _is_done(self):
         return self.state[0] < -1e9

@@ -84,7 +84,7 @@ def facts(info):
 @pytest.fixture
 def skeleton(capsys):
     def call(path):
-        assert main(["skeleton", str(path)]) == 0
+        assert main(["new", "--class", str(path)]) == 0
         return capsys.readouterr()
 
     return call
@@ -218,7 +218,7 @@ class TestSkeleton:
     @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
     def test_runs_and_keeps_the_contract(self, tmp_path, model, fmi_version):
         fmu = fmugym.bundled_fmu(model, fmi_version)
-        assert run("skeleton", fmu, "--output", tmp_path / "made.py").returncode == 0
+        assert run("new", "--class", fmu, "--output", tmp_path / "made.py").returncode == 0
         command = [sys.executable, "-W", "error", "made.py"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
@@ -237,7 +237,7 @@ class TestSkeleton:
         target = tmp_path / "mine.py"
         target.write_text("precious")
         fmu = str(fmugym.bundled_fmu("Pendulum"))
-        assert main(["skeleton", fmu, "--output", str(target)]) == 1
+        assert main(["new", "--class", fmu, "--output", str(target)]) == 1
         assert "exists" in capsys.readouterr().err
         assert target.read_text() == "precious"
 
@@ -372,7 +372,7 @@ class TestSkeleton:
         assert "locals" in made.err
 
     def test_nothing_to_observe_is_an_error(self, make_fmu, capsys):
-        assert main(["skeleton", str(make_fmu(INPUT))]) == 1
+        assert main(["new", "--class", str(make_fmu(INPUT))]) == 1
         assert "to observe" in capsys.readouterr().err
 
     def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
@@ -380,7 +380,7 @@ class TestSkeleton:
         builder = shutil.which("pythonfmu", path=os.path.dirname(sys.executable))
         command = [builder, "build", "-f", "decay.py", "--no-external-tool"]
         subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
-        made = run("skeleton", tmp_path / "Decay.fmu", "--output", tmp_path / "made.py")
+        made = run("new", "--class", tmp_path / "Decay.fmu", "--output", tmp_path / "made.py")
         assert "no numeric input" in made.stderr
         command = [sys.executable, "made.py"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
@@ -414,7 +414,7 @@ class TestNew:
 def assert_skeleton_runs(path):
     """Write a skeleton beside an FMU and run it."""
     program = path.with_suffix(".py")
-    assert run("skeleton", path, "--output", program).returncode == 0
+    assert run("new", "--class", path, "--output", program).returncode == 0
     command = [sys.executable, program.name]
     done = subprocess.run(
         command, cwd=path.parent, capture_output=True, text=True, timeout=300, check=False
@@ -474,14 +474,14 @@ class TestCommand:
         documents = " ".join(pages.replace("\\\n", " ").split())
         for example in EXAMPLES[name]:
             assert f"\n  {example}\n" in said
-            assert example.replace("skeleton", "new --class") in documents
+            assert example in documents
 
     def test_an_old_file_is_replaced_only_by_force_and_only_by_a_new_one(self, tmp_path, capsys):
         fmu, file = str(fmugym.bundled_fmu("Pendulum")), tmp_path / "a.toml"
         file.write_text("precious")
         assert main(["new", fmu, "--output", str(file)]) == 1
         assert (
-            "a.toml exists; name a new file, or replace it with --force" in capsys.readouterr().err
+            "a.toml exists; name a new one, or replace it with --force" in capsys.readouterr().err
         )
         assert main(["new", fmu + "x", "--output", str(file), "--force"]) == 1
         assert file.read_text() == "precious"
@@ -540,7 +540,11 @@ class TestCommand:
     def test_output_fits_the_narrowest_console(self, make_fmu):
         path = make_fmu(INPUT, OUTPUT, description="25 \u00b0C")
         environment = {**os.environ, "PYTHONIOENCODING": "ascii:strict"}
-        commands = [["info", str(path)], ["info", str(path), "--json"], ["skeleton", str(path)]]
+        commands = [
+            ["info", str(path)],
+            ["info", str(path), "--json"],
+            ["new", "--class", str(path)],
+        ]
         program = f"from fmugym.tools.cli import main\nassert not any(map(main, {commands}))"
         command = [sys.executable, "-c", program]
         done = subprocess.run(command, capture_output=True, text=True, env=environment)

@@ -34,7 +34,7 @@ class TestRecord:
         path = tmp_path / "a.csv"
         options = "--variables", "T*", "--variables", "u", "--every", "3600", "--output", path
         arguments = "--controller", PID, *FROST, *options
-        code, out, err = run(capsys, "record", "fmugym/House-v0", *arguments, "--json")
+        code, out, err = run(capsys, "simulate", "fmugym/House-v0", *arguments, "--json")
         assert (code, err) == (0, "")
         (episodes,) = json.loads(out)["runs"].values()
         rows = list(csv.DictReader(path.read_text().splitlines()))
@@ -47,9 +47,9 @@ class TestRecord:
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         paths = [tmp_path / name for name in ("a.csv", "b.csv", "a.png", "a.html")]
         outputs = [text for path in paths for text in ("--output", path)]
-        code, out, _ = run(capsys, "record", CART_POLE, "--seed", "3", *outputs)
+        code, out, _ = run(capsys, "simulate", CART_POLE, "--seed", "3", *outputs)
         assert code == 0
-        assert out.startswith("random: seed 3: reward")
+        assert out.startswith("seed 3: reward")
         assert paths[0].read_text() == paths[1].read_text() != ""
         assert paths[2].read_bytes().startswith(b"\x89PNG")
         page = paths[3].read_text(encoding="utf-8")
@@ -63,7 +63,7 @@ class TestRecord:
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         path = tmp_path / "a.html"
         who = "--action", "-10", "--action", "10"
-        code, out, _ = run(capsys, "record", CART_POLE, *who, "--output", path)
+        code, out, _ = run(capsys, "simulate", CART_POLE, *who, "--output", path)
         assert code == 0
         assert [line.split(":")[0] for line in out.splitlines()] == ["action -10", "action 10"]
         page = path.read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ class TestRecord:
     def test_parquet(self, tmp_path, capsys):
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
         path = tmp_path / "a.parquet"
-        code, *_ = run(capsys, "record", CART_POLE, "--output", path)
+        code, *_ = run(capsys, "simulate", CART_POLE, "--output", path)
         assert code == 0
         assert TimeSeries.read(path)["reward"].sum() == len(TimeSeries.read(path)) - 1
 
@@ -90,7 +90,7 @@ class TestRecord:
         original = fmugym.FMUEnv.step
         monkeypatch.setattr(fmugym.FMUEnv, "step", step)
         outputs = "--output", tmp_path / "a.csv", "--output", tmp_path / "a.html"
-        code, _, err = run(capsys, "record", CART_POLE, "--action", "0", *outputs)
+        code, _, err = run(capsys, "simulate", CART_POLE, "--action", "0", *outputs)
         assert code == (130 if error is KeyboardInterrupt else 1)
         assert ("enough" in err) == (code == 1)
         assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
@@ -109,7 +109,7 @@ class TestRecord:
     )
     def test_mistakes(self, arguments, fact, tmp_path, capsys, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        code, out, err = run(capsys, "record", CART_POLE, *arguments)
+        code, out, err = run(capsys, "simulate", CART_POLE, *arguments)
         assert (code, out) == (1, "")
         assert fact in err
         assert err.count("\n") == 1
@@ -118,13 +118,13 @@ class TestRecord:
     def test_a_file_that_exists_stays(self, tmp_path, capsys):
         path = tmp_path / "a.html"
         path.write_text("precious")
-        code, _, err = run(capsys, "record", CART_POLE, "--output", path)
+        code, _, err = run(capsys, "simulate", CART_POLE, "--output", path)
         assert (code, path.read_text()) == (1, "precious")
         assert "exists" in err
 
     def test_without_matplotlib_the_extra_is_named(self, tmp_path, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
-        code, _, err = run(capsys, "record", CART_POLE, "--output", tmp_path / "a.html")
+        code, _, err = run(capsys, "simulate", CART_POLE, "--output", tmp_path / "a.html")
         assert code == 1
         assert ".[plot]" in err
 
@@ -283,7 +283,6 @@ class TestJson:
         text = path.read_text()
         if options:
             assert facts["program"] == text
-            assert run(capsys, "skeleton", fmu)[1] == run(capsys, "new", fmu, "--class")[1]
         else:
             assert facts["task"] == tomllib.loads(text)
             assert any("reward" in note for note in facts["notes"])
@@ -325,7 +324,7 @@ class TestInterruption:
 
     def test_of_record(self, tmp_path, capsys):
         options = "--output", tmp_path / "a.csv", "--episodes", "9", "--json"
-        code, out, _ = run(capsys, "record", CART_POLE, *options)
+        code, out, _ = run(capsys, "simulate", CART_POLE, *options)
         assert (code, len(json.loads(out)["runs"]["random"])) == (130, 2)
 
     def test_of_evaluate(self, capsys):

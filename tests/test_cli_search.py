@@ -50,6 +50,25 @@ def task(tmp_path):
     return written(tmp_path)
 
 
+def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_path, capsys):
+    folder = tmp_path / "agent"
+    assert searched(capsys, task, folder)[0] == 0
+    before = facts_of(folder)
+    code, _, err = searched(capsys, task, folder, "--seed", "9")
+    assert (code, "--force" in err) == (1, True)
+    wrong = written(tmp_path, "wrong", reward="-abs(qq)")
+    assert searched(capsys, wrong, folder, "--force")[0] == 1
+    assert facts_of(folder) == before
+    assert searched(capsys, task, folder, "--seed", "9", "--force")[0] == 0
+    assert facts_of(folder) != before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "task.toml", "wrong.toml"]
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "file").touch()
+    assert searched(capsys, task, precious, "--force")[0] == 1
+    assert (precious / "file").exists()
+
+
 def written(tmp_path, name="task", **changes):
     document = {key: value for key, value in (TASK | changes).items() if value is not None}
     path = tmp_path / f"{name}.toml"
@@ -353,7 +372,7 @@ class TestAgents:
         assert code == 0
         assert [one["total_reward"] for one in json.loads(out)["episodes"]] == expected
         table = tmp_path / "table.csv"
-        code, out, _ = run(capsys, "record", task, *options, "--output", table)
+        code, out, _ = run(capsys, "simulate", task, *options, "--output", table)
         assert code == 0
         assert [one["total_reward"] for one in json.loads(out)["runs"][str(folder)]] == expected
         assert table.exists()

@@ -171,11 +171,10 @@ def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
     assert not (tmp_path / "agent").exists()
 
 
-@pytest.mark.parametrize("command", ["simulate", "record", "evaluate", "tune", "train"])
+@pytest.mark.parametrize("command", ["simulate", "evaluate", "tune", "train"])
 def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, capsys):
     fmu = fmugym.bundled_fmu("Pendulum")
     more = {
-        "record": ["--output", tmp_path / "a.csv"],
         "tune": ["pid of=q setpoint=0 kp=0..1"],
         "train": ["--output", tmp_path / "agent"],
     }

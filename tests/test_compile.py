@@ -1,4 +1,4 @@
-"""``fmugym compile``: FMUs with source code."""
+"""``fmugym info --repair``: FMUs with source code."""
 
 import json
 import logging
@@ -47,10 +47,10 @@ class TestCompile:
 
     def test_the_command(self, source_fmu, capsys):
         path = source_fmu(3)
-        assert main(["compile", str(path), "--json"]) == 0
+        assert main(["info", "--repair", str(path), "--json"]) == 0
         made = json.loads(capsys.readouterr().out)["output"]
         assert fmpy.platform_tuple in made
-        assert main(["compile", str(path)]) == 1
+        assert main(["info", "--repair", str(path)]) == 1
         assert "exists" in capsys.readouterr().err
 
 
@@ -58,7 +58,7 @@ class TestRefusals:
     def test_the_error_of_such_an_fmu_names_the_command(self, source_fmu):
         with closing(FMU(source_fmu(3))) as fmu, pytest.raises(FMULoadError) as caught:
             fmu.extract()
-        assert "fmugym compile 'with sources.fmu'" in str(caught.value)
+        assert "fmugym info --repair 'with sources.fmu'" in str(caught.value)
 
     def test_no_source_code(self, tmp_path):
         path = exchange_tools.exchange_fmu(tmp_path / "b.fmu", "dahlquist", 2)

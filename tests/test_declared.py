@@ -18,16 +18,9 @@ from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Task, TaskEnv, Uniform
-from fmugym.declared.declarations import AGENT_KEYS, BUILT_IN
-from fmugym.declared.devices import DEVICE_KEYS
+from fmugym.declared.declarations import BUILT_IN
 from fmugym.declared.expressions import CONSTANTS
 from fmugym.declared.functions import FUNCTIONS
-from fmugym.declared.kpis import KPIS
-from fmugym.declared.series import DATA_KEYS
-from fmugym.declared.setpoints import SETPOINTS
-from fmugym.declared.task import KEYS
-from fmugym.declared.variables import VARIABLE_KEYS
-from fmugym.declared.warming import WARM_UP_KEYS
 from fmugym.errors import TaskError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -287,14 +280,14 @@ class TestFiles:
 
     def test_libraries_to_load_first_are_found_beside_the_file_that_names_them(self, tmp_path):
         (tmp_path / "base").mkdir()
-        config = '\n[config]\npreload = ["./a.so", "lib/b.so", "libm.so.6"]\n'
+        config = '\n[foreign]\npreload = ["./a.so", "lib/b.so", "libm.so.6"]\n'
         write(tmp_path / "base", "base.toml", textwrap.dedent(SMALL) + config)
         task = Task.read(write(tmp_path, "own.toml", 'extends = "base/base.toml"\n'))
         found = [str(tmp_path / "base" / name) for name in ("a.so", "lib/b.so")] + ["libm.so.6"]
-        assert task.document["config"]["preload"] == found
+        assert task.document["foreign"]["preload"] == found
         task.write(tmp_path / "base" / "copy.toml")
         written = tomllib.loads((tmp_path / "base" / "copy.toml").read_text())
-        assert written["config"]["preload"] == ["./a.so", "lib/b.so", "libm.so.6"]
+        assert written["foreign"]["preload"] == ["./a.so", "lib/b.so", "libm.so.6"]
         assert Task.read(tmp_path / "base" / "copy.toml") == task
         with pytest.raises(fmugym.FMULoadError, match=re.escape(found[0])):
             fmugym.load(task)
@@ -518,13 +511,6 @@ def merged(base, own):
 @pytest.mark.parametrize(
     ("heading", "names"),
     [
-        ("Keys", KEYS),
-        ("Variables", [*VARIABLE_KEYS]),
-        ("Sensors and actuators", DEVICE_KEYS),
-        ("Agent", AGENT_KEYS),
-        ("Data and set points", [*DATA_KEYS, *SETPOINTS]),
-        ("Warm-up", WARM_UP_KEYS),
-        ("Figures of an episode", KPIS),
         ("Expressions", [*FUNCTIONS, "previous", *BUILT_IN, *CONSTANTS]),
     ],
 )

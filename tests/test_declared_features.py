@@ -382,7 +382,7 @@ def test_mistakes_of_the_agent(change, fact):
     ],
 )
 def test_mistakes_of_set_points(setpoint, fact):
-    with pytest.raises(TaskError, match=rf"^setpoints\.goal.*{fact}"):
+    with pytest.raises(TaskError, match=rf"(?s)^setpoints\.goal.*{fact}"):
         fmugym.load(BASE | {"setpoints": {"goal": setpoint}})
 
 

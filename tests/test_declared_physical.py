@@ -243,7 +243,7 @@ class TestCommandLine:
         for path in self.files("delta", tmp_path):
             table = tmp_path / f"{path.stem}.csv"
             one = self.found(capsys, "simulate", path, *pid)["episodes"]
-            two = self.found(capsys, "record", path, *pid, "--output", table, "--variables", "u")
+            two = self.found(capsys, "simulate", path, *pid, "--output", table, "--variables", "u")
             three = self.found(capsys, "tune", path, *search, "--episodes", "1")
             results.append((one, two["runs"], three["rewards_of_rounds"], table.read_text()))
         assert results[0] == results[1]

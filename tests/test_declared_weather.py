@@ -6,7 +6,6 @@ forms.
 
 import datetime
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from test_declared_features import AT_REST, BASE
 
 import fmugym
 from fmugym import TaskError
-from fmugym.declared.entries import Entry, Source
+from fmugym.declared import Task
 from fmugym.declared.series import read_data
 
 HEAD = (
@@ -87,7 +86,7 @@ def epw(path, days, columns, per_hour=1, head=HEAD, minute="60"):
 def read(path, column, **more):
     """The series of a column."""
     data = {"file": str(path), "column": column} | more
-    return read_data(Entry(data, ("data", "T"), (Source(None, Path(), "", {}),)))
+    return read_data(Task.from_dict({"data": {"T": data}}).root.child("data").child("T"))
 
 
 def at(series, hours):

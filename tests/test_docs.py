@@ -1,7 +1,6 @@
 """The documents: their Python runs, and their tables and quotations agree with the package."""
 
 import ast
-import dataclasses
 import inspect
 import re
 import subprocess
@@ -15,7 +14,6 @@ import pytest
 
 import fmugym
 import fmugym.lab
-from fmugym.config import EnvConfig
 from fmugym.task.hooks import Hooks
 from fmugym.trial.opening import make_pool
 
@@ -157,14 +155,6 @@ def test_the_classes_of_errors_are_those_of_the_package():
     assert set(documented) == public - {"FMUGymError"} | {fmugym.lab.LabError.__name__}
 
 
-def test_config_table_has_every_key_with_its_default():
-    rows = rows_of(CONFIG, "Config keys")
-    fields = {field.name: field for field in dataclasses.fields(EnvConfig)}
-    assert list(rows) == list(fields)
-    for name, default in rows.items():
-        assert shown_default(fields[name]) == default.strip("`"), name
-
-
 def rows_of(document, heading):
     """The second column of a section's table by the name in the first."""
     found = section(document, heading)
@@ -173,16 +163,6 @@ def rows_of(document, heading):
 
 def section(document, heading):
     return re.split(rf"^#+ {heading}\n", document.read_text(), flags=re.M)[1].split("\n## ")[0]
-
-
-def test_table_of_archive_limits_is_that_of_the_class():
-    units = {"GiB": 2**30, "MiB": 2**20}
-    rows = rows_of(RELIABILITY, "Archive limits")
-    fields = {field.name: field.default for field in dataclasses.fields(fmugym.ArchiveLimits)}
-    assert list(rows) == list(fields)
-    for name, text in rows.items():
-        number, unit = re.match(r"([\d,]+)(?: (GiB|MiB))?", text).groups()
-        assert int(number.replace(",", "")) * units.get(unit, 1) == fields[name], name
 
 
 def test_table_of_health_is_what_is_counted():
@@ -233,12 +213,6 @@ def test_table_of_shapes_is_what_hooks_see():
     envs.close()
     assert len(shapes) > 8
     assert seen == shapes
-
-
-def shown_default(field):
-    if field.default_factory is not dataclasses.MISSING:
-        return repr(field.default_factory())
-    return "required" if field.default is dataclasses.MISSING else repr(field.default)
 
 
 def table(heading):

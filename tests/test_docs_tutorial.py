@@ -51,7 +51,7 @@ def test_its_commands_run(tmp_path, monkeypatch, capsys):
         elif words[0] == "fmugym":
             assert main(shortened(words)[1:]) == 0, words
             printed[words[1]] = capsys.readouterr().out
-    told = {"info", "new", "validate", "simulate", "record", "train", "evaluate"}
+    told = {"info", "new", "validate", "simulate", "train", "evaluate"}
     assert told == set(printed)
     assert "tuned pi" in printed["train"]
     assert "T_op" in printed["info"]

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import values_tools
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, grouped
 from plants import PLANTS
 
 import fmugym
@@ -39,7 +39,7 @@ def config_of(model, **changes):
         "substeps": 2,
         "warm_up": 0.1,
     }
-    return config | changes
+    return grouped(config | changes)
 
 
 def play(env, steps=15):

@@ -9,7 +9,7 @@ import gymnasium as gym
 import lawful_tools
 import numpy as np
 import pytest
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped, probe_config
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
 
@@ -74,7 +74,7 @@ class LawfulEnv(PlainEnv):
             "time_step": 0.8,
             "bounds": {"u": (-1, 1)},
         }
-        super().__init__(path, config | changes, logging.CRITICAL, backend=backend)
+        super().__init__(path, grouped(config | changes), logging.CRITICAL, backend=backend)
 
 
 class TestFiniteInputs:
@@ -328,8 +328,8 @@ def test_bundled_fmus_are_not_watched():
     assert env.unwrapped.health["memory_growth"] == 0
     assert (
         fmugym.EnvConfig.from_dict(
-            {"model_input_names": "u", "model_output_names": "y", "leak_limit": None}
-        ).leak_limit
+            {"model_input_names": "u", "model_output_names": "y", "foreign": {"leak_limit": None}}
+        ).foreign.leak_limit
         is None
     )
     env.close()

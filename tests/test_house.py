@@ -16,6 +16,7 @@ STOREYS = [
     {"signals", "_native"},
     {"errors", "caching", "lazy"},
     {"checks", "retired", "extras", "figures", "scaling", "wine"},
+    {"keys"},
     {"archive", "distributions", "rendering"},
     {"systems"},
     {"fmi"},

@@ -175,21 +175,21 @@ class TestMistakes:
 
 class TestCommand:
     def test_episodes_of_a_controller(self, capsys):
-        command = ["dataset", "test/random-v0", "--task", "fmugym/Pendulum-v0", "--episodes", "2"]
-        assert main([*command, "--json"]) == 0
+        command = ["simulate", "fmugym/Pendulum-v0", "--output", "minari:test/random-v0"]
+        assert main([*command, "--episodes", "2", "--json"]) == 0
         told = json.loads(capsys.readouterr().out)
         assert (told["episodes"], told["steps"]) == (2, 400)
         recordings = read_dataset("test/random-v0")
         assert [bool(one.truncated[-1]) for one in recordings] == [True, True]
 
     def test_back_to_recordings(self, folder, capsys):
-        command = ["dataset", "test/two-v0", "--task", "fmugym/CartPole-v0", "--episodes", "2"]
-        assert main(command) == 0
-        assert main(["dataset", "test/two-v0", "--output", str(folder / "out")]) == 0
+        command = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/two-v0"]
+        assert main([*command, "--episodes", "2"]) == 0
+        assert main(["info", "minari:test/two-v0", "--output", str(folder / "out")]) == 0
         files = sorted((folder / "out").iterdir())
         assert len(files) == 2
-        texts = [argument for file in files for argument in ("--recording", str(file))]
-        again = ["dataset", "test/again-v0", "--task", "fmugym/CartPole-v0", *texts]
+        texts = [argument for file in files for argument in ("--log", str(file))]
+        again = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/again-v0", *texts]
         assert main(again) == 0
         assert len(Recording.load(files[0])) == len(read_dataset("test/again-v0")[0])
 
@@ -198,18 +198,36 @@ class TestCommand:
             env.reset(seed=0)
             for _ in range(20):
                 env.step(env.action_space.sample())
-        command = ["dataset", "test/log-v0", "--task", "fmugym/House-v0", "--log"]
+        command = ["simulate", "fmugym/House-v0", "--output", "minari:test/log-v0", "--log"]
         assert main([*command, str(folder / "week.csv")]) == 0
         assert "1 episodes, 20 steps" in capsys.readouterr().out
 
     @pytest.mark.parametrize(
         ("arguments", "fact"),
         [
-            ([], "--task"),
-            (["--task", "fmugym/CartPole-v0", "--log", "none.csv"], "none.csv"),
-            (["--task", "fmugym/CartPole-v0", "--log", "none.csv", "--column", "x"], "COLUMN="),
+            (["--log", "none.csv"], "none.csv"),
+            (["--log", "none.csv", "--column", "x"], "COLUMN="),
+            (["--output", "more.csv"], "alone"),
         ],
     )
     def test_mistakes(self, arguments, fact, capsys):
-        assert main(["dataset", "test/wrong-v0", *arguments]) == 1
+        name = "minari:test/wrong-v0"
+        assert main(["simulate", "fmugym/CartPole-v0", "--output", name, *arguments]) == 1
         assert fact in capsys.readouterr().err
+
+    def test_a_dataset_is_replaced_only_by_force(self, capsys):
+        command = ["simulate", "fmugym/CartPole-v0", "--output", "minari:test/once-v0"]
+        assert main([*command, "--episodes", "1"]) == 0
+        assert main([*command, "--episodes", "2"]) == 1
+        assert "test/once-v0" in capsys.readouterr().err
+        assert len(read_dataset("test/once-v0")) == 1
+        assert main([*command, "--episodes", "2", "--force"]) == 0
+        assert len(read_dataset("test/once-v0")) == 2
+
+    def test_the_old_name_of_the_command_warns(self, folder, capsys):
+        command = ["dataset", "test/old-v0", "--task", "fmugym/CartPole-v0", "--episodes", "1"]
+        assert main(command) == 0
+        assert "fmugym simulate fmugym/CartPole-v0" in capsys.readouterr().err
+        assert main(["dataset", "test/old-v0", "--output", str(folder / "old")]) == 0
+        assert "fmugym info minari:test/old-v0" in capsys.readouterr().err
+        assert len(list((folder / "old").iterdir())) == 1

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import quirk_table
+from fmu_tools import grouped
 from quirk_table import OUTPUTS, QUIRKS
 
 import fmugym
@@ -55,7 +56,7 @@ class QuirkEnv(fmugym.FMUEnv):
             "model_parameters": {"gain": gain, "tau": 0.3},
             "time_step": STEP,
         } | config
-        super().__init__(path, config)
+        super().__init__(path, grouped(config))
 
     def _is_done(self):
         return self.out["y"] > 1e9

@@ -1,4 +1,4 @@
-"""What is gone does nothing but warn, for one release, wherever a user may still give it."""
+"""What is gone or has moved warns, for one release, wherever a user may still give it."""
 
 import re
 from contextlib import contextmanager
@@ -6,11 +6,12 @@ from contextlib import contextmanager
 import pytest
 
 import fmugym
+from fmugym.config import FOREIGN
 from fmugym.declared.systems import system_of
 from fmugym.declared.task import Task
 from fmugym.retired import RETIRED
 
-pytestmark = pytest.mark.parametrize("key", RETIRED)
+every_retired_key = pytest.mark.parametrize("key", RETIRED)
 HOUSE = fmugym.bundled_fmu("House")
 
 
@@ -23,12 +24,14 @@ def told(key):
     assert {warning.filename for warning in told} == {__file__}
 
 
+@every_retired_key
 def test_in_a_config(key):
     names = {"model_input_names": "u", "model_output_names": "y"}
     with told(key):
         assert fmugym.EnvConfig.from_dict(names | {key: 1}) == fmugym.EnvConfig.from_dict(names)
 
 
+@every_retired_key
 def test_in_a_task_file(key, tmp_path):
     file = tmp_path / "task.toml"
     file.write_text(
@@ -55,13 +58,50 @@ def test_in_a_task_file(key, tmp_path):
     env.close()
 
 
+@every_retired_key
 def test_in_the_section_system(key):
-    task = Task.of({"system": {"components": {"a": {"bundled": "House"}}, key: 1}})
     with told(key):
+        task = Task.of({"system": {"components": {"a": {"bundled": "House"}}, key: 1}})
         system = system_of(task.root.child("system"))
     assert not hasattr(system, key)
 
 
+@every_retired_key
 def test_in_an_argument_of_a_system(key):
     with told(key):
         fmugym.FMUSystem({"a": HOUSE}, **{key: 1})
+
+
+MOVED = {
+    "probe_timeout": None,
+    "call_timeout": 3.0,
+    "reset_method": "reset",
+    "leak_limit": None,
+    "max_instances": 2,
+    "licence_wait": 1.5,
+    "preload": ("libm.so.6",),
+    "archive_limits": fmugym.ArchiveLimits(max_ratio=3),
+}
+
+
+def test_keys_for_experts_may_stand_where_they_stood_in_a_config():
+    assert list(MOVED) == list(FOREIGN.keys)
+    names = {"model_input_names": "u", "model_output_names": "y"}
+    for key, value in MOVED.items():
+        with pytest.warns(FutureWarning, match=rf"'{key}' now stands in the table 'foreign'"):
+            old = fmugym.EnvConfig.from_dict(names | {key: value})
+        assert old == fmugym.EnvConfig.from_dict(names | {"foreign": {key: value}})
+        assert getattr(old.foreign, key) == value
+
+
+def test_keys_for_experts_may_stand_where_they_stood_in_a_task_file(tmp_path):
+    old, new = tmp_path / "old.toml", tmp_path / "new.toml"
+    new.write_text('[foreign]\nmax_instances = 2\npreload = ["lib/a.so"]\n')
+    old.write_text('[config]\nmax_instances = 2\npreload = ["lib/a.so"]\non_fault = "raise"\n')
+    with pytest.warns(FutureWarning, match=r"now stands in \[foreign\]") as warned:
+        task = Task.read(old)
+    assert len(warned) == 2
+    assert task.document["foreign"] == Task.read(new).document["foreign"]
+    assert task.document["config"] == {"on_fault": "raise"}
+    task.write(tmp_path / "written.toml")
+    assert Task.read(tmp_path / "written.toml") == task

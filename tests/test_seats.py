@@ -8,6 +8,7 @@ import threading
 import time
 
 import pytest
+from fmu_tools import grouped
 
 import fmugym
 from fmugym.errors import LicenceError
@@ -20,7 +21,7 @@ class SeatedEnv(fmugym.FMI2CSEnv):
     def __init__(self, backend=None, isolation=None, **config):
         config = {"model_input_names": "tau", "model_output_names": ["q", "q_dot"]} | config
         path = fmugym.bundled_fmu("Pendulum")
-        super().__init__(path, config, backend=backend, isolation=isolation)
+        super().__init__(path, grouped(config), backend=backend, isolation=isolation)
 
     def _is_done(self):
         return abs(self.out["q"]) > 1e9

@@ -12,7 +12,7 @@ import numpy as np
 import odd_values
 import pytest
 from demanding_tools import DemandingEnv, make_fmu
-from fmu_tools import PlainEnv, probe_config
+from fmu_tools import PlainEnv, grouped, probe_config
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
@@ -48,7 +48,7 @@ class Track(fmugym.FMI2CSEnv):
         }
         fmu = fmugym.bundled_fmu("Pendulum", fmi_version)
         options = {"backend": backend, "hooks": hooks, "isolation": isolation}
-        super().__init__(fmu, config | changes, **options)
+        super().__init__(fmu, grouped(config | changes), **options)
 
     fmi_version = None
 

@@ -92,13 +92,15 @@ def compiler(request, monkeypatch):
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
-    (command,) = re.findall(r"^fmugym (stand-in model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE)
+    (command,) = re.findall(
+        r"^fmugym (info --repair model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE
+    )
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
     assert main([replaced.get(word, word) for word in command.split()]) == 0
     said = capsys.readouterr().out
     assert "without _gfortran_matmul_r8" in said
     preload = [str(tmp_path / name)]
-    assert f'"preload": {json.dumps(preload)}' in said
+    assert f'"foreign": {{"preload": {json.dumps(preload)}}}' in said
     assert f"preload = {json.dumps(preload)}" in said
     assert FMU(fmu_path, preload=preload).runs_here
     assert play(fmu_path, preload=preload) == STEPPED
@@ -124,13 +126,13 @@ def test_info_tells_before_anything_is_loaded(fmu_path, tmp_path, monkeypatch, c
         f"does NOT run here: Probe.fmu needs shared libraries that are not found here: {name}"
         in out
     )
-    assert "'fmugym stand-in FMU' makes a replacement" in out
+    assert "'fmugym info --repair FMU' makes a replacement" in out
     assert "runs here\n" not in out
     assert main(["info", str(fmu_path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["runs_here"] is False
     assert [row["name"] for row in facts["missing_libraries"]] == [name]
-    assert main(["skeleton", str(fmu_path)]) == 0
+    assert main(["new", "--class", str(fmu_path)]) == 0
     assert (
         "does not run on this machine: Probe.fmu needs shared libraries" in capsys.readouterr().err
     )
@@ -141,9 +143,12 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
     (name,) = FMU(fmu_path).missing_libraries
     task = tmp_path / "task.toml"
     assert main(["new", str(fmu_path), "--output", str(task)]) == 0
-    assert f"\n[config]\n# The FMU needs this: fmugym stand-in {fmu_path.name}" in task.read_text()
+    assert (
+        f"\n[foreign]\n# The FMU needs this: fmugym info --repair {fmu_path.name}"
+        in task.read_text()
+    )
     assert f'\n# preload = ["./{name}"]' in task.read_text()
-    assert main(["stand-in", str(fmu_path), "--folder", str(tmp_path)]) == 0
+    assert main(["info", "--repair", str(fmu_path), "--output", str(tmp_path)]) == 0
     task.unlink()
     assert main(["new", str(fmu_path), "--output", str(task)]) == 0
     assert f'\npreload = ["./{name}"]' in task.read_text()
@@ -157,7 +162,9 @@ def test_a_task_file_finds_the_stand_in_beside_it(fmu_path, tmp_path, monkeypatc
     assert "linux64: runs here" in said
     assert "reset is right" in said
     Task.read(task).write(tmp_path / "copy.toml")
-    assert tomllib.loads((tmp_path / "copy.toml").read_text())["config"]["preload"] == [f"./{name}"]
+    assert tomllib.loads((tmp_path / "copy.toml").read_text())["foreign"]["preload"] == [
+        f"./{name}"
+    ]
 
 
 def test_info_of_the_fmu_alone_does_not_contradict_its_trial(fmu_path, tmp_path, capsys):
@@ -179,7 +186,7 @@ def test_it_is_built_only_where_it_is_needed_and_nothing_is_there(
         stand_in.build_stand_in(FMU(probe()), tmp_path)
     (name,) = FMU(fmu_path).missing_libraries
     (tmp_path / name).write_text("precious")
-    assert main(["stand-in", str(fmu_path), "--folder", str(tmp_path)]) == 1
+    assert main(["info", "--repair", str(fmu_path), "--output", str(tmp_path)]) == 1
     assert "exists already" in capsys.readouterr().err
     assert (tmp_path / name).read_text() == "precious"
 
@@ -188,7 +195,7 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
     """By default to the working directory; the path in ``preload`` holds elsewhere, too."""
     (name,) = FMU(fmu_path).missing_libraries
     monkeypatch.chdir(tmp_path)
-    assert main(["stand-in", str(fmu_path)]) == 0
+    assert main(["info", "--repair", str(fmu_path)]) == 0
     assert f'preload = ["{tmp_path / name}"]' in capsys.readouterr().out
     assert main(["stand-in", str(fmu_path), "--folder", "a/b"]) == 0
     assert (tmp_path / "a" / "b" / name).is_file()

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import wine_tools
+from fmu_tools import grouped
 from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
 from vector_tools import require_same_alone
@@ -148,7 +149,7 @@ class Sun(FMUEnv):
             "max_episode_steps": 5,
             "start_time": Uniform(0, 100),
         } | config
-        super().__init__(path, config, hooks=hooks, isolation=isolation)
+        super().__init__(path, grouped(config), hooks=hooks, isolation=isolation)
 
     def _get_action_space(self):
         return gymnasium.spaces.Box(-1, 1, (1,), np.float32)

@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 import values_tools
+from fmu_tools import grouped
 from gymnasium import spaces
 from process_tools import run_python
 from values_tools import VERSIONS, pools, versions
@@ -30,7 +31,7 @@ class Reading(fmugym.FMUEnv):
             "time_step": 0.1,
             "probe_timeout": None,
         }
-        super().__init__(path, config | changes, backend=backend, isolation=isolation)
+        super().__init__(path, grouped(config | changes), backend=backend, isolation=isolation)
 
     def _get_action_space(self):
         return spaces.Discrete(2)

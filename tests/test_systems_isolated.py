@@ -491,4 +491,4 @@ class TestLibrariesForWindows:
         library = {"binaries/win64/Model.dll": b"MZ"}
         source = source_tools.write_source_fmu(tmp_path / "of code.fmu", 2, library)
         (obstacle,) = FMUSystem({"a": source}).as_fmu().obstacles
-        assert "fmugym compile 'of code.fmu'" in obstacle
+        assert "fmugym info --repair 'of code.fmu'" in obstacle

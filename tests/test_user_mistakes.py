@@ -99,7 +99,7 @@ def at_construction(error, match, **changes):
             ConfigError, "must be a number, got <class", model_parameters={"gain": fmugym.Uniform}
         ),
         # Types in the config
-        at_construction(ConfigError, "model_parameters must be a dict", model_parameters=[1]),
+        at_construction(ConfigError, "model_parameters must be a table", model_parameters=[1]),
         at_construction(ConfigError, "time_step must be a number", time_step="0.1"),
         at_construction(ConfigError, r"time_step must be .*positive", time_step=0),
         at_construction(ConfigError, "'time_step' is missing", time_step=None),

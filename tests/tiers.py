@@ -35,6 +35,7 @@ SLOW_MODULES = {
     "test_fuzz_signals",
     "test_fuzz_systems",
     "test_fuzz_tasks",
+    "test_keys_in_editors",
     "test_lab_fuzz",
     "test_lab_programs",
     "test_nested_fmus",

@@ -235,7 +235,7 @@ class Env(fmugym.FMUEnv):
 
     def __init__(self, path, isolation=None, **config):
         defaults = {"time_step": STEP, "probe_timeout": None}
-        super().__init__(path, defaults | config, isolation=isolation)
+        super().__init__(path, fmu_tools.grouped(defaults | config), isolation=isolation)
 
     def _is_done(self):
         return self.out["y"][0] > 1e9 if "y" in self.out else False

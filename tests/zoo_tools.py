@@ -85,7 +85,7 @@ class ZooEnv(fmugym.FMUEnv):
             "time_step": STEP,
             "bounds": {"u": (-1, 1)},
         } | config
-        super().__init__(path, config)
+        super().__init__(path, fmu_tools.grouped(config))
 
     def _is_done(self):
         return self.state[0] < -1e9

@@ -280,7 +280,7 @@ class FMU(LoadableFMU, KnownArguments):
         """The end of an error's text; "" if the FMU does not have its source code."""
         if not any(place.startswith("sources/") for place in self._archive.files):
             return ""
-        return f". It has its source code: fmugym compile {shlex.quote(self.path.name)}"
+        return f". It has its source code: fmugym info --repair {shlex.quote(self.path.name)}"
 
     def _extract_to(self, folder: Path, only: str = "") -> None:
         """Extract the files that are needed, or those of one folder of them."""

@@ -42,7 +42,7 @@ def missing_tool(generation_tool: str, needs_execution_tool: bool) -> str | None
 def note_on(library: str) -> str:
     """What to do about a library that is missing, beyond installing it; empty for most."""
     if re.fullmatch(r"libgfortran\.so\.[34]", library):
-        return "no current distribution has it; 'fmugym stand-in FMU' makes a replacement"
+        return "no current distribution has it; 'fmugym info --repair FMU' makes a replacement"
     return ""
 
 

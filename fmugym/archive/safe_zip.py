@@ -20,12 +20,13 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Final, cast
 
-from fmugym.checks import KnownArguments, check_count
+from fmugym.checks import KnownArguments
 from fmugym.errors import FMULoadError, nearest_name, reason
+from fmugym.keys import LARGE_COUNT, check_fields, key
 from fmugym.signals import ordinary
 
 __all__ = ["ArchiveLimits", "SafeZip", "over_limit"]
@@ -61,31 +62,33 @@ _has_devices = sys.platform == "win32"
 
 @dataclass(frozen=True)
 class ArchiveLimits(KnownArguments):
-    """How large an FMU may be before it is refused unread.
-
-    Attributes:
-        max_entries: Number of files and folders in the archive.
-        max_extracted_bytes: Size of all its files together, uncompressed.
-        max_ratio: Ratio of that size to the archive's own, beyond 16 MiB. Zeros reach 1000, the
-            libraries and tables of FMUs 2 to 20.
-        max_xml_bytes: Size of ``modelDescription.xml``.
-        max_variables: Number of variables; 100,000 take some four seconds to read.
+    """How large an FMU may be before it is refused unread; see docs/reliability.md for the limits.
 
     Raises:
         ConfigError: If a limit is not a positive integer.
         ArgumentError: If there is no limit of this name; that is a ``TypeError``, too.
     """
 
-    max_entries: int = 20_000
-    max_extracted_bytes: int = 4 * 2**30
-    max_ratio: int = 200
-    max_xml_bytes: int = 64 * 2**20
-    max_variables: int = 100_000
+    max_entries: int = key(LARGE_COUNT, "Number of files and folders in the archive.", 20_000)
+    max_extracted_bytes: int = key(
+        LARGE_COUNT,
+        "Size of all its files together, uncompressed.",
+        4 * 2**30,
+        "4 GiB",
+    )
+    max_ratio: int = key(
+        LARGE_COUNT,
+        "Ratio of that size to the archive's own, beyond 16 MiB. Zeros reach 1000, the libraries "
+        "and tables of FMUs 2 to 20.",
+        200,
+    )
+    max_xml_bytes: int = key(LARGE_COUNT, "Size of `modelDescription.xml`.", 64 * 2**20, "64 MiB")
+    max_variables: int = key(
+        LARGE_COUNT, "Number of variables; 100,000 take some four seconds to read.", 100_000
+    )
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            object.__setattr__(self, field.name, check_count(field.name, value, sys.maxsize))
+        check_fields(self)
 
 
 class SafeZip:

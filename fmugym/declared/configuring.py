@@ -2,38 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import Any, Final
+from typing import Any
 
 from fmugym.archive.description import ModelDescription
-from fmugym.checks import check_count
-from fmugym.config import EnvConfig
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
 from fmugym.declared.naming import CLOCK, Naming
-from fmugym.declared.quantities import duration
 from fmugym.declared.seasons import read_begin, read_scenarios
 from fmugym.distributions import is_distribution
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["bounds_of", "clock_of", "own_config", "samplings_of", "time_step_of", "times_of"]
-
-_OF_SECTIONS: Final = {
-    **dict.fromkeys(("time_step", "substeps", "warm_up", "start_time"), "it stands above [config]"),
-    "model_input_names": "name the inputs in 'actions' of [agent]",
-    "model_output_names": "name the outputs in 'observations' of [agent]",
-    "model_parameters": "give them in [parameters]",
-    "monitor_names": "a name in an expression is read from the FMU",
-    "samplings": "give variables the key 'sample' in [variables]",
-    "episode_variables": "give them in [memory] or [setpoints]",
-    "bounds": "give variables 'min' and 'max' in [variables]",
-    "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
-    "positive_reward": "give an expression for 'reward'",
-    "negative_reward": "give an expression for 'reward'",
-}
-"""Keys of a config that other sections of a task determine, and how."""
-
-_OF_CONFIG: Final = tuple(f.name for f in fields(EnvConfig) if f.name not in _OF_SECTIONS)
+__all__ = ["bounds_of", "clock_of", "samplings_of", "time_step_of", "times_of"]
 
 
 def time_step_of(root: Entry, description: ModelDescription) -> float:
@@ -42,32 +21,11 @@ def time_step_of(root: Entry, description: ModelDescription) -> float:
     Raises:
         ConfigError: If neither gives a positive one.
     """
-    entry = root.child("time_step")
-    if entry.value is not None:
-        step = entry.check(duration)
-        if step > 0:
-            return step
-        raise entry.error("time_step must be positive, got 0")
-    if description.step_size is None:
+    own: float | None = root.child("time_step").value
+    step = description.step_size if own is None else own
+    if step is None:
         raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
-    return description.step_size
-
-
-def own_config(root: Entry) -> dict[str, Any]:
-    """The keys that a task gives the config itself; each value is checked.
-
-    Raises:
-        ConfigError: If there is no such key, or a value does not fit it.
-    """
-    section = root.child("config")
-    for key, entry in {} if section.value is None else section.items().items():
-        if key in _OF_SECTIONS:
-            raise entry.error(f"{key!r} is no key of [config]: {_OF_SECTIONS[key]}")
-    own = {} if section.value is None else section.table(_OF_CONFIG)
-    for key, entry in own.items():
-        with entry.placing():
-            EnvConfig((), ("any",), **{key: entry.value})  # which checks the value
-    return {key: entry.value for key, entry in own.items()}
+    return step
 
 
 def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
@@ -81,7 +39,7 @@ def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
     if declared.warm_up.period:
         times["warm_up"] = declared.warm_up.period
     if substeps.value is not None:
-        times["substeps"] = substeps.check(check_count)
+        times["substeps"] = substeps.value
     if length.value is not None:
         times["max_episode_steps"] = _episode_steps(length, time_step)
     if start.value is not None:
@@ -103,7 +61,7 @@ def _start_time(declared: Declarations, length: float) -> Any:
 
 
 def _episode_steps(entry: Entry, step: float) -> int:
-    length = entry.check(duration)
+    length = entry.value
     count = whole_number_of_steps(length, step)
     if not count:
         raise entry.error(

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import product
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.checks import check_option
-from fmugym.declared.devices import DEVICE_KEYS
-from fmugym.declared.entries import Entry
+from fmugym.declared.entries import Entry, gathered
 from fmugym.declared.expressions import CONSTANTS, Expression
+from fmugym.declared.format import DEVICE
 from fmugym.declared.functions import FUNCTIONS
 from fmugym.declared.kpis import Kpi, read_kpi
 from fmugym.declared.parts import (
@@ -23,25 +22,20 @@ from fmugym.declared.parts import (
     Memory,
     Term,
     read_derived,
-    read_expression,
     read_memory,
     read_term,
-    section_of,
 )
 from fmugym.declared.series import Series, read_data
 from fmugym.declared.setpoints import Deviation, SetPoints, Steps
 from fmugym.declared.variables import Record, Records, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
-__all__ = ["AGENT_KEYS", "BUILT_IN", "Declarations", "is_reserved"]
+__all__ = ["BUILT_IN", "Declarations", "is_reserved"]
+
+_Read = TypeVar("_Read")
 
 BUILT_IN: Final = ("time", "clock", "elapsed", "step", "dt", "dt_h", "done")
 """Names that every task has in its expressions."""
-
-NORMALIZATIONS: Final = ("limits", "nominal")
-
-AGENT_KEYS: Final = (*("actions", "observations", "forecast", "history", "rescale", "normalize"),)
-"""The keys of the agent."""
 
 _RESERVED: Final = frozenset({*BUILT_IN, *CONSTANTS, *FUNCTIONS, "previous"})
 
@@ -104,21 +98,26 @@ class Declarations:
         """
         declared = cls(root, Records(root, description), is_physical)
         _check_names(root)
-        declared.memory = {e.name: read_memory(e) for e in section_of(root, "memory")}
-        declared.derived = {e.name: read_derived(e) for e in section_of(root, "expressions")}
-        declared.series = {e.name: read_data(e) for e in section_of(root, "data")}
+        declared.memory = _read(root, "memory", read_memory)
+        declared.derived = _read(root, "expressions", read_derived)
+        declared.series = _read(root, "data", read_data)
         declared._read_setpoints()
-        declared.parameters = dict(declared._read_parameters())
-        root.required("agent").table(AGENT_KEYS)
+        declared.parameters = _read(root, "parameters", declared._parameter)
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
-        declared.observed = list(declared._read_observed())
+        observed = declared._listed("observations")
+        gathered(declared._check_observed, observed)
+        declared.observed = [(entry, entry.value) for entry in observed]
         declared.warm_up = read_warm_up(root, declared.actions, declared._controlled())
-        declared.rewards = _terms(root.child("reward"), ("expr", "weight"))
-        declared.costs = _terms(root.child("costs"), ("expr", "limit"))
-        declared.kpis = {e.name: read_kpi(e) for e in section_of(root, "kpis")}
+        reward = root.child("reward")
+        if isinstance(reward.value, Expression):
+            declared.rewards = {"": Term(reward, reward.value)}
+        else:
+            declared.rewards = _read(root, "reward", read_term)
+        declared.costs = _read(root, "costs", read_term)
+        declared.kpis = _read(root, "kpis", read_kpi)
         conditions = [root.child(name) for name in ("terminated", "truncated")]
-        declared.flags = {e.name: read_expression(e) for e in conditions if e.value is not None}
+        declared.flags = {e.name: e.value for e in conditions if e.value is not None}
         return declared
 
     @property
@@ -143,13 +142,11 @@ class Declarations:
         history = self.root.child("agent").child("history")
         if history.value is None:
             return []
-        history.table(("of", "length"))
-        names = history.required("of")
-        entries = [names] if isinstance(names.value, str) else names.elements()
+        entries = history.child("of").elements()
         for entry in entries:
-            if entry.text() not in self.own_names:
-                self.records.find(entry, entry.text(), "variable", self.own_names)
-        return [entry.text() for entry in entries]
+            if entry.value not in self.own_names:
+                self.records.find(entry, entry.value, "variable", self.own_names)
+        return [entry.value for entry in entries]
 
     @property
     def measured(self) -> list[str]:
@@ -200,25 +197,22 @@ class Declarations:
         """The entry of a key of the agent.
 
         Raises:
-            ConfigError: If it is missing.
+            ConfigError: If the task says nothing of an agent.
         """
-        return self.root.required("agent").required(key)
+        return self.root.required("agent").child(key)
 
     @property
     def rescales(self) -> bool:
         """Whether actions go from -1 to 1."""
-        entry = self.root.child("agent").child("rescale")
-        return entry.value is not None and entry.flag() and not self.is_physical
+        return bool(self.agent("rescale").value) and not self.is_physical
 
     @property
     def normalization(self) -> str | None:
         """What observations are normalized by: ``"limits"``, ``"nominal"``; None for nothing."""
-        entry = self.root.child("agent").child("normalize")
-        if isinstance(entry.value, str):
-            kind: str | None = entry.check(check_option, NORMALIZATIONS)
-        else:
-            kind = "limits" if entry.value is not None and entry.flag() else None
-        return None if self.is_physical else kind
+        kind = self.agent("normalize").value
+        if self.is_physical or not kind:
+            return None
+        return "limits" if kind is True else str(kind)
 
     @property
     def unphysical_keys(self) -> tuple[str, ...]:
@@ -245,10 +239,9 @@ class Declarations:
         return size if 0 < size < np.inf else None
 
     def _read_setpoints(self) -> None:
-        points = SetPoints()
-        for entry in section_of(self.root, "setpoints"):
-            points.add(entry)
-        own = {entry.name for entry in section_of(self.root, "setpoints")}
+        points, section = SetPoints(), self.root.child("setpoints").items()
+        gathered(points.add, section.values())
+        own = section.keys()
         for name in {*points.memory, *points.derived} - own:
             if name in {*self.memory, *self.derived, *self.series}:
                 raise self.root.child("setpoints").error(
@@ -272,35 +265,34 @@ class Declarations:
             return [(one.of, one.setpoint) for one in self.deviations.values()]
         written = {*self.own_names, *(record.alias for record in self.actions)}
         measured = [name for _, name in self.observed if name not in written]
-        setpoints = [entry.name for entry in section_of(self.root, "setpoints")]
-        return list(product(measured, setpoints))
+        return list(product(measured, self.root.child("setpoints").items()))
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""
         entry = self.agent(key)
-        names = [entry] if isinstance(entry.value, str) else entry.elements()
+        names = entry.elements()
         if not names:
             raise entry.error(f"{key} must name at least one variable")
-        texts = [name.text() for name in names]
+        texts = [name.value for name in names]
         for text in texts:
             if texts.count(text) > 1:
                 raise entry.error(f"{text!r} is named twice")
         return names
 
-    def _read_parameters(self) -> Iterator[tuple[str, tuple[Record, Any]]]:
-        for entry in section_of(self.root, "parameters"):
-            record = self.records.find(entry, entry.name, "variable")
-            yield entry.name, (record, start_value(record, entry))
+    def _parameter(self, entry: Entry) -> tuple[Record, Any]:
+        record = self.records.find(entry, entry.name, "variable")
+        return record, start_value(record, entry)
 
     def _read_actions(self) -> list[Record]:
         entry = self.agent("actions")
-        actions = [self.records.find(e, e.text(), "action") for e in self._listed("actions")]
+        names = self._listed("actions")
+        actions = gathered(lambda one: self.records.find(one, one.value, "action"), names)
         for record in actions:
             self.records.check_input(entry, record)
             if record.variable is None and not record.is_direct:
                 raise record.entry.error(
                     f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
-                    f"{', '.join(map(repr, DEVICE_KEYS))} are for inputs"
+                    f"{', '.join(map(repr, DEVICE))} are for inputs"
                 )
         if len({bool(record.levels) for record in actions}) > 1:
             raise entry.error("either all actions have levels, or none has")
@@ -319,22 +311,19 @@ class Declarations:
                 record = self.records.input_of(target, series.unit)
                 _require_plain_input(record)
                 yield record.alias, (record, Expression.parse(name))
-        for entry in section_of(self.root, "inputs"):
+        for entry in self.root.child("inputs").items().values():
             record = self.records.find(entry, entry.name, "input")
             if record in self.actions and record.variable is not None:
                 raise entry.error(f"{entry.name!r} is an action already")
             self.records.check_input(entry, record)
             _require_plain_input(record)
-            yield entry.name, (record, read_expression(entry))
+            yield entry.name, (record, entry.value)
 
-    def _read_observed(self) -> Iterator[tuple[Entry, str]]:
-        for entry in self._listed("observations"):
-            name = entry.text()
-            if name not in self.own_names:
-                record = self.records.find(entry, name, "observation", self.own_names)
-                if record not in self.actions:
-                    self.records.check_output(entry, name)
-            yield entry, name
+    def _check_observed(self, entry: Entry) -> None:
+        if entry.value not in self.own_names:
+            record = self.records.find(entry, entry.value, "observation", self.own_names)
+            if record not in self.actions:
+                self.records.check_output(entry, entry.value)
 
 
 def _require_plain_input(record: Record) -> None:
@@ -350,7 +339,7 @@ def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
     seen: set[str] = set()
     for section in ("variables", "memory", "expressions", "data", "setpoints"):
-        for entry in section_of(root, section):
+        for entry in root.child(section).items().values():
             if entry.name in seen:
                 raise entry.error(f"the name {entry.name!r} is given twice")
             if is_reserved(entry.name):
@@ -363,9 +352,7 @@ def _check_names(root: Entry) -> None:
             seen.add(entry.name)
 
 
-def _terms(entry: Entry, keys: tuple[str, ...]) -> dict[str, Term]:
-    if entry.value is None:
-        return {}
-    if entry.name == "reward" and not isinstance(entry.value, Mapping):
-        return {"": Term(entry, read_expression(entry))}
-    return {name: read_term(term, keys) for name, term in entry.items().items()}
+def _read(root: Entry, section: str, read: Callable[[Entry], _Read]) -> dict[str, _Read]:
+    """Read the entries of a section by name."""
+    entries = root.child(section).items()
+    return dict(zip(entries, gathered(read, entries.values()), strict=True))

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import duration
-from fmugym.declared.values import number, number_or_distribution
-from fmugym.distributions import Normal, Uniform, is_distribution
-from fmugym.errors import shown
+from fmugym.declared.format import DEVICE
+from fmugym.distributions import Normal, is_distribution
 
-__all__ = ["DEVICE_KEYS", "IDEAL", "NOISE", "Device", "read_device"]
-
-DEVICE_KEYS: Final = ("delay", "bias", "noise", "saturation", "quantum", "rate", "drop_out")
-"""The keys of sensors and actuators, in the order in which they take effect."""
+__all__ = ["IDEAL", "NOISE", "Device", "read_device"]
 
 NOISE: Final = "noise key"
 """The episode variable from which everything random that is no draw of a reset follows."""
-
-_DROP_OUT_KEYS: Final = ("probability", "value")
 
 _CHANNELS_OF_BIAS: Final = 40_000
 _CHANNELS_OF_DROP_OUT: Final = 50_000
@@ -121,63 +113,9 @@ def _drawn(distribution: Any, channel: int) -> str:
 
 
 def read_device(entry: Entry) -> Device:
-    """Read the keys of a sensor or an actuator from the table of a variable.
-
-    Raises:
-        ConfigError: If a value does not fit its key.
-    """
-    given: dict[str, Any] = {}
-    for key in ("delay", "noise", "quantum", "rate"):
-        one = entry.child(key)
-        if one.value is not None:
-            given[key] = one.check(duration) if key == "delay" else number(one)
-            if not 0 < given[key] < math.inf:
-                raise one.error(f"{key} must be positive, got {given[key]:g}")
-    if entry.child("bias").value is not None:
-        given["bias"] = _bias(entry.child("bias"))
-    if entry.child("saturation").value is not None:
-        given["saturation"] = _saturation(entry.child("saturation"))
-    if entry.child("drop_out").value is not None:
-        given["drop_out"], given["substitute"] = _drop_out(entry.child("drop_out"))
+    """Read the keys of a sensor or an actuator from the table of a variable."""
+    given = {key: one for key, one in (entry.value or {}).items() if key in DEVICE}
+    drop_out = given.pop("drop_out", None)
+    if drop_out is not None:
+        given |= {"drop_out": drop_out["probability"], "substitute": drop_out.get("value")}
     return Device(**given)
-
-
-def _bias(entry: Entry) -> Any:
-    value = number_or_distribution(entry)
-    is_limited = isinstance(value, Normal) and math.isfinite(value.high - value.low)
-    if is_distribution(value) and (is_limited or not isinstance(value, Uniform | Normal)):
-        raise entry.error(
-            f"a bias is a number, or drawn from a uniform or normal distribution without limits, "
-            f"got {shown(value)}"
-        )
-    return value
-
-
-def _saturation(entry: Entry) -> tuple[float, float]:
-    limits = tuple(map(number, entry.elements()))
-    if len(limits) != 2 or not limits[0] < limits[1]:
-        raise entry.error(
-            f"expected the lowest and the highest value, such as [0, 40], got {shown(entry.value)}"
-        )
-    return limits[0], limits[1]
-
-
-def _drop_out(entry: Entry) -> tuple[float, float | None]:
-    """The probability, and what is given instead of a value."""
-    if not isinstance(entry.value, Mapping):
-        return _probability(entry), None
-    table = entry.table(_DROP_OUT_KEYS)
-    substitute = number(table["value"]) if "value" in table else None
-    if substitute is not None and not math.isfinite(substitute):
-        raise table["value"].error(
-            f"expected a finite number, since an observation that is not finite is a fault, got "
-            f"{substitute}"
-        )
-    return _probability(entry.required("probability")), substitute
-
-
-def _probability(entry: Entry) -> float:
-    value = number(entry)
-    if not 0 < value < 1:
-        raise entry.error(f"expected a probability between 0 and 1, got {value:g}")
-    return value

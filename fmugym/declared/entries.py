@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
-from fmugym.checks import check_flag, check_mapping, check_text
-from fmugym.errors import ConfigError, TaskError, shown, unknown_name
-from fmugym.retired import without_retired
+from fmugym.errors import ConfigError, TaskError, printable
 
-__all__ = ["Entry", "Source"]
+__all__ = ["Entry", "Source", "gathered"]
 
-_Value = TypeVar("_Value")
+_Part = TypeVar("_Part")
+_Read = TypeVar("_Read")
 
 _KEY: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
 _KEYS: Final = rf"{_KEY}(?:\s*\.\s*{_KEY})*"
@@ -117,7 +116,7 @@ class Entry:
     def error(self, text: object) -> TaskError:
         """Make an error that says where this value stands."""
         place = self.source.place(self.keys)
-        return TaskError(f"{place}: {text}" if place else str(text))
+        return TaskError(printable(f"{place}: {text}" if place else text))
 
     @contextmanager
     def placing(self) -> Iterator[None]:
@@ -129,40 +128,14 @@ class Entry:
         except ConfigError as error:
             raise self.error(error) from error
 
-    def check(self, check: Callable[..., _Value], *arguments: Any, **options: Any) -> _Value:
-        """Check the value with one of the functions of ``fmugym.checks``."""
-        with self.placing():
-            return check(self.name, self.value, *arguments, **options)
-
     def child(self, key: str) -> Entry:
         """The value under a key of this table; None if it is missing."""
         items = self.value if isinstance(self.value, Mapping) else {}
         return Entry(items.get(key), (*self.keys, key), self.sources)
 
     def items(self) -> dict[str, Entry]:
-        """The values of this table by key.
-
-        Raises:
-            ConfigError: If this is no table.
-        """
-        what = self.name if self.keys else "a task"
-        if not isinstance(self.value, Mapping):
-            raise self.error(f"{what} must be a table, got {shown(self.value)}")
-        with self.placing():
-            items = check_mapping(what, self.value)
-        return {key: self.child(key) for key in items}
-
-    def table(self, known: Iterable[str]) -> dict[str, Entry]:
-        """The values of this table, whose keys must be known.
-
-        Raises:
-            ConfigError: If this is no table, or for an unknown key, with the nearest known one.
-        """
-        known, items = list(known), without_retired(self.items())
-        for key, entry in items.items():
-            if key not in known:
-                raise entry.error(unknown_name("key", key, known))
-        return items
+        """The values of this table by key; none if it is not given."""
+        return {key: self.child(key) for key in self.value or ()}
 
     def required(self, key: str) -> Entry:
         """The value under a key that must be there.
@@ -175,25 +148,28 @@ class Entry:
             raise self.error(f"the key {key!r} is missing")
         return entry
 
-    def text(self) -> str:
-        """The value, which must be a text."""
-        return self.check(check_text)
-
-    def flag(self) -> bool:
-        """The value, which must be true or false."""
-        return self.check(check_flag)
-
     def elements(self) -> list[Entry]:
-        """The elements of a list, as entries with the place of the list.
-
-        Raises:
-            ConfigError: If this is no list.
-        """
-        if not isinstance(self.value, list | tuple):
-            raise self.error(f"expected a list, got {shown(self.value)}")
+        """The elements of a list, as entries with the place of the list."""
         return [Entry(value, self.keys, self.sources) for value in self.value]
 
     def path(self) -> Path:
         """The value as a path; a relative one is relative to the folder of its file."""
-        path = Path(self.text()).expanduser()
+        path = Path(self.value).expanduser()
         return path if path.is_absolute() else self.source.folder / path
+
+
+def gathered(read: Callable[[_Part], _Read], parts: Iterable[_Part]) -> list[_Read]:
+    """Read parts one after the other, and raise one error for all that have mistakes.
+
+    Raises:
+        TaskError: If there are any.
+    """
+    found, errors = list[_Read](), list[str]()
+    for part in parts:
+        try:
+            found.append(read(part))
+        except TaskError as error:
+            errors.append(str(error))
+    if errors:
+        raise TaskError("\n".join(dict.fromkeys(errors)))
+    return found

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
-from fmugym.declared.parts import read_expression
 
 __all__ = ["KPIS", "Kpi", "kpi_name", "read_kpi"]
 
@@ -55,15 +53,6 @@ def kpi_name(name: str) -> str:
 
 
 def read_kpi(entry: Entry) -> Kpi:
-    """Read a figure.
-
-    Raises:
-        ConfigError: If it is neither an expression nor a table with one of ``KPIS``.
-    """
-    if not isinstance(entry.value, Mapping):
-        return Kpi(entry, read_expression(entry), None)
-    table = entry.table((*KPIS, "description"))
-    given = [how for how in KPIS if how in table]
-    if len(given) != 1:
-        raise entry.error(f"give one of {', '.join(KPIS)}")
-    return Kpi(entry, read_expression(table[given[0]]), given[0])
+    """Read a figure."""
+    how = next(how for how in (*KPIS, "expr") if how in entry.value)
+    return Kpi(entry, entry.value[how], None if how == "expr" else how)

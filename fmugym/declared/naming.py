@@ -285,8 +285,10 @@ class Naming:
     @contextmanager
     def _opened(self, name: str) -> Iterator[None]:
         self._open.append(name)
-        yield
-        self._open.pop()
+        try:
+            yield
+        finally:
+            self._open.pop()
 
     def _code_of_record(self, name: str, record: Record, moment: Moment) -> str:
         declared = self._declared

@@ -9,13 +9,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.checks import check_option
 from fmugym.declared.declarations import Declarations
-from fmugym.declared.devices import DEVICE_KEYS, NOISE
+from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import Entry
+from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
-from fmugym.declared.quantities import duration
-from fmugym.declared.values import number
 from fmugym.declared.variables import Record
 from fmugym.pool.spec import whole_number_of_steps
 
@@ -39,7 +37,6 @@ _CHANNELS_OF_FORECASTS: Final = 10_000
 _CHANNELS_OF_BIASES: Final = 5_000
 
 _GROWTHS: Final = {"sqrt": 0.5, "linear": 1.0, "none": 0.0}
-_ERROR_KEYS: Final = ("std", "bias", "growth", "relative")
 
 
 @dataclass(frozen=True)
@@ -111,7 +108,7 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
         ConfigError: If a name has no value before the step.
     """
     entry = declared.root.child("agent").child("history")
-    length = _count(entry.required("length"), time_step) if declared.remembered else 0
+    length = _count(entry.child("length"), time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
     for name in declared.measured:
         record = _sensor_of(declared, name)
@@ -182,7 +179,7 @@ def _check_sensors(declared: Declarations) -> None:
         is_used = record.alias in seen or record in declared.actions
         if not record.device.is_ideal and not is_used:
             raise record.entry.error(
-                f"{', '.join(map(repr, DEVICE_KEYS))} are for actions and for what the agent "
+                f"{', '.join(map(repr, DEVICE))} are for actions and for what the agent "
                 f"observes, and {record.alias!r} is not in its observations"
             )
 
@@ -269,27 +266,18 @@ def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
 
 
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
-    section = declared.root.child("agent").child("forecast")
-    if section.value is None:
-        return
-    for entry in [section] if isinstance(section.value, Mapping) else section.elements():
-        table = entry.table(("of", "horizon", "step", "error"))
-        step = table["step"].check(duration) if "step" in table else time_step
-        count = _count(entry.required("horizon"), step)
-        error = _error_of(table["error"]) if "error" in table else None
-        for channel, one in enumerate(_named(entry), _CHANNELS_OF_FORECASTS):
-            name = one.text()
+    for entry in _forecasts_in(declared):
+        step = entry.value.get("step", time_step)
+        count = _count(entry.child("horizon"), step)
+        error = _error_of(entry.child("error").value)
+        for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
+            name = one.value
             for index in range(1, count + 1):
                 ahead = index * step
                 code = naming.forecast(one, name, ahead)
                 if error is not None:
                     code = error.added(code, index / count, round(ahead / time_step), channel)
                 yield Seen(one, name, code, *declared.limits_of(name), f"[+{ahead:g} s]")
-
-
-def _named(entry: Entry) -> list[Entry]:
-    names = entry.required("of")
-    return [names] if isinstance(names.value, str) else names.elements()
 
 
 class ForecastError(NamedTuple):
@@ -328,45 +316,35 @@ class ForecastError(NamedTuple):
         return f"({code} + {code} * {error})" if self.relative else f"({code} + {error})"
 
 
-def _error_of(entry: Entry) -> ForecastError | None:
-    if not isinstance(entry.value, Mapping):
-        std = _deviation(entry)
-        return ForecastError(std) if std else None
-    table = entry.table(_ERROR_KEYS)
-    growth = table["growth"].check(check_option, _GROWTHS) if "growth" in table else "sqrt"
-    return ForecastError(
-        _deviation(table["std"]) if "std" in table else 0.0,
-        _deviation(table["bias"]) if "bias" in table else 0.0,
-        _GROWTHS[growth],
-        "relative" in table and table["relative"].flag(),
-    )
-
-
-def _deviation(entry: Entry) -> float:
-    value = number(entry)
-    if not 0 <= value < np.inf:
-        raise entry.error(f"a standard deviation is 0 or positive, got {value:g}")
-    return value
+def _error_of(given: Mapping[str, Any] | None) -> ForecastError | None:
+    """How a forecast errs; None if it does not."""
+    if given is None or not (given["std"] or given["bias"]):
+        return None
+    growth = _GROWTHS[given["growth"]]
+    return ForecastError(given["std"], given["bias"], growth, given["relative"])
 
 
 def has_errors(declared: Declarations) -> bool:
     """Whether a forecast has errors."""
-    value = declared.root.child("agent").child("forecast").value
-    parts = [value] if isinstance(value, Mapping) else value or []
-    return any(isinstance(part, Mapping) and bool(part.get("error")) for part in parts)
+    return any(_error_of(entry.child("error").value) for entry in _forecasts_in(declared))
+
+
+def _forecasts_in(declared: Declarations) -> list[Entry]:
+    section = declared.root.child("agent").child("forecast")
+    return [] if section.value is None else section.elements()
 
 
 def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterator[Seen]:
     entry = declared.root.child("agent").child("history")
     for name in declared.remembered:
         limits = declared.limits_of(name)
-        for ago in range(1, 1 + _count(entry.required("length"), time_step)):
+        for ago in range(1, 1 + _count(entry.child("length"), time_step)):
             code = past.measured(entry, name, ago)
             yield Seen(entry, name, code, *limits, f"[-{ago * time_step:g} s]")
 
 
 def _count(entry: Entry, step: float) -> int:
-    length = entry.check(duration)
+    length = entry.value
     count = whole_number_of_steps(length, step) if step > 0 else 0
     if not count:
         raise entry.error(f"{length:g} s is no multiple of the step of {step:g} s")

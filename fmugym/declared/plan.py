@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final
 
 import numpy as np
@@ -14,13 +14,13 @@ from fmugym.declared.blaming import explanation
 from fmugym.declared.configuring import (
     bounds_of,
     clock_of,
-    own_config,
     samplings_of,
     time_step_of,
     times_of,
 )
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
+from fmugym.declared.entries import gathered
 from fmugym.declared.expressions import function_of
 from fmugym.declared.kpis import kpi_name
 from fmugym.declared.named import named_values
@@ -88,8 +88,7 @@ class Plan:
         self._time_step = time_step_of(task.root, description)
         self._warm_steps = self._steps_of_warm_up()
         self._naming = Naming(declared, self._time_step, self._warm_steps)
-        for name in declared.derived:
-            self._naming.code_of(name, Moment.JUDGED)  # which finds mistakes in unused ones
+        gathered(lambda make: make(), self._makers())
         self._kept = histories(declared, self._naming, self._time_step)
         self._seen, self._sensors = observed_values(
             declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
@@ -108,6 +107,16 @@ class Plan:
         found = named_values(self._declared, self._naming)
         read = self._function(_tuple(code for _, code in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
+
+    def _makers(self) -> Iterator[Callable[[], Any]]:
+        """Functions that make code of each expression, so that one error tells all mistakes."""
+        declared = self._declared
+        for name in declared.derived:
+            yield partial(self._naming.code_of, name, Moment.JUDGED)
+        for name, term in {**declared.costs, **declared.rewards}.items():
+            yield partial(self._terms, {name: term})
+        for name in declared.flags:
+            yield partial(self._condition, name)
 
     # The warm-up.
 
@@ -142,7 +151,8 @@ class Plan:
     def _make_config(self) -> dict[str, Any]:
         declared, records = self._declared, self._declared.records
         return {
-            **own_config(self._root),
+            **(self._root.child("config").value or {}),
+            "foreign": self._root.child("foreign").value or {},
             **times_of(declared, self._time_step),
             "model_input_names": [records[name].fmu_name for name in declared.written],
             "model_output_names": [records[name].fmu_name for name in self._naming.outputs],
@@ -312,9 +322,9 @@ class Plan:
         if updates:
             hooks["_update"] = _in_turn(updates)
         if "terminated" in declared.flags:
-            hooks["_is_done"] = self._condition("terminated", Moment.AFTER)
+            hooks["_is_done"] = self._condition("terminated")
         if "truncated" in declared.flags:
-            hooks["_is_truncated"] = self._condition("truncated", Moment.JUDGED)
+            hooks["_is_truncated"] = self._condition("truncated")
         if declared.rewards:
             terms = self._terms(declared.rewards)
             hooks["_reward_policy"] = self._function(_sum(terms))
@@ -405,11 +415,14 @@ class Plan:
         reward = self._function(_sum(self._terms(self._declared.rewards)))
         return lambda env: min(0.0, reward(env))
 
-    def _condition(self, name: str, moment: Moment) -> Hook:
+    def _condition(self, name: str) -> Hook:
         entry = self._root.child(name)
+        moment = Moment.AFTER if name == "terminated" else Moment.JUDGED
         code = self._naming.code(entry, self._declared.flags[name], moment)
         if not code.is_flag:
-            raise entry.error(f"expected a condition such as 'x > 1', got {shown(entry.value)}")
+            raise entry.error(
+                f"expected a condition such as 'x > 1', got {shown(entry.value.text)}"
+            )
         return self._function(code.text)
 
     def _terms(self, terms: Mapping[str, Term], moment: Moment = Moment.JUDGED) -> dict[str, str]:

@@ -16,25 +16,16 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.checks import check_integer, check_option, check_path, require_regular
+from fmugym.checks import check_integer, check_path, require_regular
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import duration
-from fmugym.declared.values import number
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.signals import ordinary
 
-__all__ = ["DATA_KEYS", "Series", "read_data", "read_schedule"]
-
-DATA_KEYS: Final = (
-    *("file", "table", "column", "time", "values", "times", "step", "period", "interpolation"),
-    *("unit", "input", "min", "max"),
-)
-"""The keys of a column of data."""
+__all__ = ["Series", "read_data", "read_schedule"]
 
 _DAY: Final = 86400.0
-_INTERPOLATIONS: Final = ("linear", "previous")
 _CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
 _NAMES_OF_TIME: Final = ("time", "datetime", "timestamp", "date")
 
@@ -91,11 +82,10 @@ class Series:
             values = np.repeat(values, 2)
         else:
             times, values = np.append(times, ends[-1]), np.append(values, wrapped[-1])
-        low, high = entry.child("min"), entry.child("max")
-        least = float(values.min()) if low.value is None else number(low)
-        most = float(values.max()) if high.value is None else number(high)
-        unit = None if entry.child("unit").value is None else entry.child("unit").text()
-        return cls(entry, start, period, times, values, is_stepped, least, most, unit)
+        low = entry.value.get("min", float(values.min()))
+        high = entry.value.get("max", float(values.max()))
+        unit = entry.value.get("unit")
+        return cls(entry, start, period, times, values, is_stepped, low, high, unit)
 
 
 def _require_rising(entry: Entry, times: FloatArray, values: FloatArray, period: float) -> None:
@@ -121,15 +111,14 @@ def read_data(entry: Entry) -> Series:
         ConfigError: If the file or the column is missing, or a cell is no number. The text says
             where.
     """
-    table = entry.table(DATA_KEYS)
+    table = entry.value
     if ("file" in table) == ("values" in table):
         raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
-    kind = table.get("interpolation")
-    is_stepped = kind is not None and kind.check(check_option, _INTERPOLATIONS) == "previous"
+    is_stepped = table["interpolation"] == "previous"
     rows = _rows_of_list(entry) if "values" in table else _rows_of_file(entry, is_stepped)
     times, values, period = rows
     if "period" in table:
-        period = table["period"].check(duration)
+        period = table["period"]
     elif period is None:  # one more row than there are
         period = times[-1] - times[0] + (times[-1] - times[-2] if len(times) > 1 else _DAY)
     return Series.of(entry, times, values, float(period), is_stepped)
@@ -141,38 +130,27 @@ _Rows = tuple[FloatArray, FloatArray, float | None]
 
 def _rows_of_list(entry: Entry) -> _Rows:
     """The values of a list or an array, and their times."""
-    values, times = _listed(entry.child("values")), entry.child("times")
+    values, times, step = (entry.value.get(key) for key in ("values", "times", "step"))
     if not len(values):
         raise entry.error("expected at least one value")
-    if (times.value is None) == (entry.child("step").value is None):
+    if (times is None) == (step is None):
         raise entry.error("give either the 'step' between the values, or their 'times'")
-    if times.value is None:
-        return _even_times(entry.child("step"), len(values)), values, None
-    moments = _listed(times)
-    if len(moments) != len(values):
-        raise times.error(f"there are {len(moments)} times, but {len(values)} values")
-    return moments, values, None
+    if times is None:
+        return _even_times(step, len(values)), values, None
+    if len(times) != len(values):
+        raise entry.child("times").error(f"there are {len(times)} times, but {len(values)} values")
+    return times, values, None
 
 
-def _listed(entry: Entry) -> FloatArray:
-    given = entry.value
-    if isinstance(given, list) and given and all(type(one) is float for one in given):
-        return np.array(given)  # long arrays take a while element by element
-    return np.array([number(one) for one in entry.elements()])
-
-
-def _even_times(step: Entry, count: int) -> FloatArray:
-    seconds = step.check(duration)
-    if seconds <= 0:
-        raise step.error("the step must be positive")
-    return np.arange(count, dtype=np.float64) * seconds
+def _even_times(step: float, count: int) -> FloatArray:
+    return np.arange(count, dtype=np.float64) * step
 
 
 def _rows_of_file(entry: Entry, is_stepped: bool) -> _Rows:
     table, column = _table(entry), entry.required("column")
     name = _name_of(column, table.columns)
-    cells, step = table.columns[name], entry.child("step")
-    if step.value is not None:
+    cells, step = table.columns[name], entry.value.get("step")
+    if step is not None:
         return _even_times(step, len(cells)), _numbers(column, cells), None
     if table.period is None:
         values = _numbers(column, cells)
@@ -192,7 +170,7 @@ def _table(entry: Entry) -> Table:
         return next(iter(tables.values()))
     if name.value is None:
         raise entry.error(f"name one of the tables as 'table': {', '.join(map(repr, tables))}")
-    if name.text() not in tables:
+    if name.value not in tables:
         raise name.error(unknown_name("table", name.value, tables))
     return tables[name.value]
 
@@ -200,8 +178,9 @@ def _table(entry: Entry) -> Table:
 def _name_of(column: Entry, columns: Mapping[str, Cells]) -> str:
     """The name of a column that is given by its name, or by its number from 1 on."""
     if isinstance(column.value, int):
-        return list(columns)[column.check(check_integer, 1, len(columns)) - 1]
-    if column.text() not in columns:
+        with column.placing():
+            return list(columns)[check_integer("column", column.value, 1, len(columns)) - 1]
+    if column.value not in columns:
         raise column.error(unknown_name("column", column.value, columns))
     return str(column.value)
 
@@ -231,7 +210,7 @@ def _numbers(entry: Entry, cells: Cells) -> FloatArray:
 
 def _read_file(file: Entry) -> Mapping[str, Table]:
     """The tables of a file by name. Environments of one task read it once."""
-    path = check_path("file", file.text())
+    path = check_path("file", file.value)
     try:
         require_regular(path)
         status = path.stat()
@@ -292,7 +271,7 @@ def _read_csv(path: Path, lines: Sequence[str]) -> Table:
 def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
     """The times of the rows: seconds, or dates, which count from the beginning of their year."""
     name = entry.child("time")
-    if name.value is not None and name.text() not in rows:
+    if name.value is not None and name.value not in rows:
         raise name.error(unknown_name("column", name.value, rows))
     known = {column.lower(): column for column in rows}
     usual = next((known[word] for word in _NAMES_OF_TIME if word in known), None)
@@ -343,20 +322,20 @@ def _cell(entry: Entry, index: int, cell: Any) -> float:
     return value
 
 
-def read_schedule(entry: Entry) -> Series:
-    """Read the values of a day by the times from which they hold, such as ``"06:00"``.
+def read_schedule(point: Entry) -> Series:
+    """Read a set point whose values hold from times of a day on, such as ``"06:00"``.
 
     Raises:
         ConfigError: If a time or a value does not fit.
     """
-    rows = sorted((_time_of_day(one), number(one)) for one in entry.items().values())
+    entry = point.child("schedule")
+    rows = sorted((_time_of_day(one), one.value) for one in entry.items().values())
     if not rows:
         raise entry.error('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
     if rows[0][0] > 0:  # what holds at midnight began on the day before
         rows.insert(0, (0.0, rows[-1][1]))
     times, values = np.array(rows).T
-    parent = Entry(None, entry.keys[:-1], entry.sources)
-    return Series.of(parent, times, values, _DAY, is_stepped=True)
+    return Series.of(point, times, values, _DAY, is_stepped=True)
 
 
 def _time_of_day(entry: Entry) -> float:

@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
-from fmugym.declared.parts import Derived, Limits, Memory, read_limits, read_memory
-from fmugym.declared.quantities import duration
+from fmugym.declared.format import SETPOINT
+from fmugym.declared.parts import Derived, Limits, Memory, read_limits
 from fmugym.declared.series import Series, read_schedule
-from fmugym.declared.values import number, number_or_distribution
 
-__all__ = ["SETPOINTS", "Deviation", "SetPoints", "Steps"]
+__all__ = ["Deviation", "SetPoints", "Steps"]
 
-SETPOINTS: Final = ("value", "schedule", "steps", "ramp", "sine", "data")
-"""The kinds of set points."""
-
-_CURVES: Final[Mapping[str, tuple[str, dict[str, float | None]]]] = {
-    "ramp": (
-        "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)",
-        {"from": None, "to": None, "begin": 0.0, "duration": None},
-    ),
-    "sine": (
-        "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})",
-        {"mean": 0.0, "amplitude": None, "period": None, "phase": 0.0},
-    ),
+_CURVES: Final = {
+    "ramp": "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)",
+    "sine": "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})",
 }
-"""Formulas of set points that follow a curve, and the defaults of their numbers."""
+"""Formulas of set points that follow a curve."""
 
-_TIMES_OF_CURVES: Final = ("begin", "duration", "period")
+_UNLIMITED: Final = (-np.inf, np.inf)
 
 _CHANNELS_OF_STEPS: Final = 20_000
 
@@ -85,68 +74,43 @@ class SetPoints:
     deviations: dict[str, Deviation] = field(default_factory=dict)
 
     def add(self, entry: Entry) -> None:
-        """Add a set point.
-
-        Raises:
-            ConfigError: If it is of no known kind, or lacks a number.
-        """
-        if not isinstance(entry.value, Mapping) or "distribution" in entry.value:
-            self.memory[entry.name] = read_memory(entry)
-            return
-        table = entry.table((*SETPOINTS, "of", "min", "max"))
-        kinds = [kind for kind in SETPOINTS if kind in table]
-        if len(kinds) != 1:
-            raise entry.error(f"give one of {', '.join(SETPOINTS)}")
-        self._add(entry, kinds[0])
-        if "of" in table:
-            deviation = Deviation(entry.name, table["of"].text())
-            self.deviations[f"{entry.name}_error"] = deviation
-            with table["of"].placing():
+        """Add a set point."""
+        self._add(entry, next(kind for kind in SETPOINT.one_of if kind in entry.value))
+        of = entry.child("of")
+        if of.value is not None:
+            name, deviation = f"{entry.name}_error", Deviation(entry.name, of.value)
+            self.deviations[name] = deviation
+            with of.placing():
                 expression = Expression.parse(f"{deviation.setpoint} - {deviation.of}")
-            limits = (-np.inf, np.inf)
-            self.derived[f"{entry.name}_error"] = Derived(table["of"], expression, limits)
+            self.derived[name] = Derived(of, expression, _UNLIMITED)
 
     def _add(self, entry: Entry, kind: str) -> None:
         match kind:
             case "value":
-                start = number_or_distribution(entry.child("value"))
-                self.memory[entry.name] = Memory(entry, start, None, read_limits(entry))
+                self.memory[entry.name] = Memory(
+                    entry, entry.value["value"], None, read_limits(entry)
+                )
             case "schedule":
-                self.series[entry.name] = read_schedule(entry.child("schedule"))
+                self.series[entry.name] = read_schedule(entry)
             case "steps":
                 self.steps[entry.name] = _steps(entry, len(self.steps))
             case "data":
-                name = Expression.parse(entry.child("data").text())
+                with entry.child("data").placing():
+                    name = Expression.parse(entry.value["data"])
                 self.derived[entry.name] = Derived(entry, name, read_limits(entry))
             case _:
                 self._add_curve(entry, kind)
 
     def _add_curve(self, entry: Entry, kind: str) -> None:
         """Add a curve over the time since the reset; its numbers may be drawn in each episode."""
-        name, (formula, defaults) = entry.name, _CURVES[kind]
-        table = entry.child(kind).table(defaults)
-        for key, default in defaults.items():
-            if key not in table and default is None:
-                raise entry.child(kind).error(f"the key {key!r} is missing")
-            value = _of_curve(table[key]) if key in table else default
-            self.memory[f"{name}_{key}"] = Memory(entry, value, None, (-np.inf, np.inf))
-        names = {key: f"{name}_{key}" for key in defaults}
-        expression = Expression.parse(formula.format(**names))
-        self.derived[name] = Derived(entry, expression, read_limits(entry))
+        numbers = entry.child(kind).items()
+        names = {key: f"{entry.name}_{key}" for key in numbers}
+        for key, one in numbers.items():
+            self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
+        expression = Expression.parse(_CURVES[kind].format(**names))
+        self.derived[entry.name] = Derived(entry, expression, read_limits(entry))
 
 
 def _steps(entry: Entry, number_of_steps: int) -> Steps:
-    table = entry.child("steps")
-    table.table(("low", "high", "every"))
-    limits = number(table.required("low")), number(table.required("high"))
-    every = table.required("every").check(duration)
-    if not limits[0] < limits[1]:
-        raise table.error(f"low must be below high, got {limits[0]:g} and {limits[1]:g}")
-    return Steps(entry, limits, every, _CHANNELS_OF_STEPS + number_of_steps)
-
-
-def _of_curve(entry: Entry) -> Any:
-    """A number of a curve, which may be a duration, or a distribution."""
-    if entry.name in _TIMES_OF_CURVES and not isinstance(entry.value, Mapping):
-        return entry.check(duration)
-    return number_or_distribution(entry)
+    low, high, every = (entry.value["steps"][key] for key in ("low", "high", "every"))
+    return Steps(entry, (low, high), every, _CHANNELS_OF_STEPS + number_of_steps)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -12,36 +11,15 @@ from typing import Any, Final
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU
-from fmugym.checks import check_count, check_flag, check_number
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import duration
 from fmugym.declared.task import Task
 from fmugym.errors import FMULoadError, shown, unknown_name
+from fmugym.keys import table_of
 from fmugym.signals import ordinary
-from fmugym.systems import Component, Connection, FMUSystem
+from fmugym.systems import Component, FMUSystem
 from fmugym.task.starting import structural_values
 
 __all__ = ["describe", "fmu_of", "system_of"]
-
-_KEYS: Final = (
-    *("components", "connections", "name", "description", "units", "master", "loops"),
-    *("loop_tolerance", "loop_iterations", "step_size", "tolerance"),
-)
-_COMPONENT_KEYS: Final = ("fmu", "start_values", "interface", "steps", "feedthrough", "isolate")
-_CONNECTION_KEYS: Final = ("source", "target", "gain", "offset", "convert_units")
-_CHECKS: Final[dict[str, Callable[..., Any]]] = {
-    "loop_tolerance": check_number,
-    "loop_iterations": check_count,
-    "step_size": duration,
-    "tolerance": check_number,
-    "steps": check_count,
-    "feedthrough": check_flag,
-    "isolate": check_flag,
-    "gain": check_number,
-    "offset": check_number,
-    "convert_units": check_flag,
-}
-"""All other keys are texts."""
 
 
 def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
@@ -88,17 +66,11 @@ def _read_archive(path: Path, changed: int, size: int, master: str | None) -> FM
 
 
 def _path(entry: Entry) -> Path:
-    if isinstance(entry.value, str):
-        return Path(entry.value)
-    if not isinstance(entry.value, Mapping):
-        raise entry.error(
-            f"expected the path of an FMU, or a table such as {{ bundled = 'Pendulum' }}, got "
-            f"{shown(entry.value)}"
-        )
-    table = entry.table(("bundled", "fmi_version"))
-    version: Any = table["fmi_version"].value if "fmi_version" in table else "2.0"
+    given = entry.value
+    if isinstance(given, str):
+        return Path(given)
     with entry.placing():
-        return bundled_fmu(entry.required("bundled").text(), version)
+        return bundled_fmu(given["bundled"], given["fmi_version"])
 
 
 def system_of(section: Entry, master: str | None = None) -> FMUSystem:
@@ -112,44 +84,34 @@ def system_of(section: Entry, master: str | None = None) -> FMUSystem:
         ConfigError: If it has a mistake. The text says where.
         FMULoadError: If an FMU cannot be read.
     """
-    table = section.table(_KEYS)
-    named = section.required("components").items()
+    named = section.child("components").items()
     components = {name: _component(entry) for name, entry in named.items()}
     states = tuple(map(_version, components.values()))
-    key = json.dumps(section.value, default=repr), states, master
+    key = repr(section.value), states, master
     known = _known.get(key)
     if known is not None:
         return known
-    options = {name: _value(table[name]) for name in table if name not in _TABLES}
+    options = {**section.value, "components": components}
     if master is not None:
         options["master"] = master
-    if "units" in table:
-        units = table["units"].items()
-        options["units"] = {name: entry.text() for name, entry in units.items()}
     with section.placing():
-        system = FMUSystem(components, _connections(section), **options)
+        system = FMUSystem(**options)
     while len(_known) >= _MOST_KNOWN:
         _known.pop(next(iter(_known)))
     _known[key] = system
     return system
 
 
-_TABLES: Final = ("components", "connections", "units")
 _MOST_KNOWN: Final = 16
 _known: Final[dict[Any, FMUSystem]] = {}
 """Systems by what declares them and the state of their FMUs: environments of a task share one."""
 
 
 def _component(entry: Entry) -> Component:
-    if isinstance(entry.value, str) or entry.child("bundled").value is not None:
-        return Component(_found(entry))
-    table = entry.table(_COMPONENT_KEYS)
-    options = {n: _value(table[n]) for n in table if n not in {"fmu", "start_values"}}
-    if "start_values" in table:
-        given = table["start_values"].items()
-        options["start_values"] = {name: one.value for name, one in given.items()}
+    fmu = entry if entry.child("fmu").value is None else entry.child("fmu")
+    own = {name: entry.value[name] for name in table_of(Component).keys if name in entry.value}
     with entry.placing():
-        return Component(_found(entry.required("fmu")), **options)
+        return Component(**{**own, "fmu": _found(fmu)})
 
 
 def _found(entry: Entry) -> Path:
@@ -163,27 +125,6 @@ def _version(component: Component) -> tuple[str, int, int]:
     path = Path(component.fmu)  # type: ignore[arg-type]  # they are paths here
     status = path.stat()
     return str(path), status.st_mtime_ns, status.st_size
-
-
-def _connections(section: Entry) -> list[Connection]:
-    entry = section.child("connections")
-    return [] if entry.value is None else [_connection(one) for one in entry.elements()]
-
-
-def _connection(entry: Entry) -> Connection:
-    if isinstance(entry.value, str):
-        with entry.placing():
-            return Connection.of(entry.value)
-    table = entry.table(_CONNECTION_KEYS)
-    source, target = (entry.required(end).text() for end in ("source", "target"))
-    options = {name: _value(table[name]) for name in table if name not in {"source", "target"}}
-    with entry.placing():
-        return Connection(source, target, **options)
-
-
-def _value(entry: Entry) -> Any:
-    check = _CHECKS.get(entry.name)
-    return entry.text() if check is None else entry.check(check)
 
 
 def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:

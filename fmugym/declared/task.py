@@ -3,39 +3,31 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_mapping, check_path, integer_of, require_regular
+from fmugym.checks import check_mapping, check_path, require_regular
+from fmugym.config import FOREIGN
 from fmugym.declared.entries import Entry, Source
+from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios, scenario_of
-from fmugym.declared.warming import period_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.errors import ConfigError, TaskError, reason, shown, unknown_name
+from fmugym.keys import Entries, checked, found_mistakes, with_paths
+from fmugym.retired import grouped
 from fmugym.signals import ordinary
 
-__all__ = ["KEYS", "VERSION", "Task"]
-
-VERSION: Final = 1
-"""The version of the format; it is raised when a key changes its meaning."""
-
-KEYS: Final = (
-    *("version", "extends", "description", "fmu", "system", "class", "arguments"),
-    *("time_step", "substeps", "episode_length", "warm_up", "start_time", "clock", "scenarios"),
-    *("variables", "parameters", "data", "setpoints", "inputs", "memory", "expressions"),
-    "controllers",
-    "agent",
-    *("reward", "costs", "kpis", "terminated", "truncated", "config"),
-)
-"""The keys of a task."""
+__all__ = ["Task"]
 
 _NOT_INHERITED: Final = ("version", "extends")
 
@@ -63,8 +55,8 @@ class Task:
     def __repr__(self) -> str:
         if "class" in self.document:
             return f"Task({self.name!r}: {shown(self.document['class'])})"
-        agent = self.root.child("agent")
-        seen, done = (shown(agent.child(key).value) for key in ("observations", "actions"))
+        agent = self.document.get("agent", {})
+        seen, done = (shown(agent.get(key)) for key in ("observations", "actions"))
         return f"Task({self.name!r}: {done} -> {seen})"
 
     @classmethod
@@ -114,7 +106,7 @@ class Task:
             ConfigError: For an unknown key, or as ``read`` for a file that it extends.
         """
         start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
-        plain: dict[str, Any] = _plain(check_mapping("config", document))
+        plain: dict[str, Any] = _grouped(_plain(check_mapping("config", document)))
         source = Source(None, start, "", _with_paths(plain, start))
         _check(source)
         if "extends" not in plain:
@@ -128,12 +120,22 @@ class Task:
         for source in reversed(sources):
             own = {k: v for k, v in source.document.items() if k not in _NOT_INHERITED}
             document = _merge(document, own)
-        return cls(document, sources)
+        task = cls(document, sources)
+        task.root  # noqa: B018  # which finds mistakes
+        return task
 
-    @property
+    @cached_property
     def root(self) -> Entry:
-        """The table of all keys, with the places in the files."""
-        return Entry(self.document, (), self.sources)
+        """The table of all keys, whose values are checked, with the places in the files.
+
+        Raises:
+            TaskError: If values are wrong; it names all of them.
+        """
+        values, mistakes = found_mistakes(TASK, self.document)
+        places = [Entry(None, one.keys, self.sources).error(one.text) for one in mistakes]
+        if places:
+            raise TaskError("\n".join(map(str, places)))
+        return Entry(values, (), self.sources)
 
     def physical(self) -> Task:
         """Return the task as controllers play it: they read and write values in its units.
@@ -158,7 +160,9 @@ class Task:
             scenario = scenario_of(read_scenarios(section), name)
         times = {"clock": scenario.start, "episode_length": scenario.length}
         if "start_time" in self.document and "clock" not in self.document:
-            times["start_time"] = scenario.start_after(period_of(self.root.child("warm_up")))
+            times["start_time"] = scenario.start_after(
+                self.root.child("warm_up").child("period").value or 0.0
+            )
             del times["clock"]
         return replace(self, document={**self.document, **times})
 
@@ -175,7 +179,7 @@ class Task:
             path_of: Takes the absolute path of the FMU or of a file of data, and returns the new
                 one.
         """
-        return _mapped_paths(dict(self.document), path_of)
+        return dict(with_paths(TASK, self.document, path_of))
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write the task to a new TOML file. Reading the file gives an equal task.
@@ -196,6 +200,8 @@ class Task:
         if "version" not in document and (own.path is None or "version" in own.document):
             document = {"version": VERSION, **document}
         text = None if own.path is None else revised(own.text, document)
+        if text is not None and file.parent != own.folder:
+            text = re.sub(r"\A#:schema \./.*\n", "", text)  # the schema lies beside the other file
         if text is None:
             text = as_toml(document)
         with file.open("x", encoding="utf-8", newline="\n") as stream:
@@ -223,7 +229,7 @@ def _read(path: Path) -> Source:
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         hint = "; texts and expressions stand in quotes" if _lacks_quotes(error) else ""
         raise ConfigError(f"{path.name} is no TOML file: {reason(error)}{hint}") from None
-    source = Source(path, path.parent, text, _with_paths(_plain(document), path.parent))
+    source = Source(path, path.parent, text, _with_paths(_grouped(_plain(document)), path.parent))
     _check(source)
     return source
 
@@ -239,15 +245,12 @@ def _advice(path: Path) -> str:
 
 
 def _check(source: Source) -> None:
-    root = _root(source)
-    root.table(KEYS)
-    if root.child("description").value is not None:
-        root.child("description").text()
-    version = root.child("version")
-    if version.value is not None and integer_of(version.value) != VERSION:
-        raise version.error(
-            f"this fmugym reads version {VERSION} of the format, got {shown(version.value)}"
-        )
+    """Check what is not merged: the version, and what is extended."""
+    for name in _NOT_INHERITED:
+        entry = _root(source).child(name)
+        if entry.value is not None:
+            with entry.placing():
+                checked(Entries(TASK.keys[name].kind), {name: entry.value})
 
 
 def _merge(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -282,6 +285,17 @@ def _plain(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
+def _grouped(document: dict[str, Any]) -> dict[str, Any]:
+    """Move keys for experts from where they stood in earlier versions."""
+    config = document.get("config")
+    if not isinstance(config, dict):
+        return document
+    own, foreign = grouped(config, FOREIGN.keys, "[foreign]")
+    if not foreign:
+        return document
+    return _merge({"foreign": foreign}, {**document, "config": own})
+
+
 def _named(value: type) -> Any:
     """``"module:Class"`` where it leads to the class, the class itself otherwise."""
     with suppress(KeyError, AttributeError):
@@ -292,11 +306,13 @@ def _named(value: type) -> Any:
 
 def _with_paths(document: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Make the paths in a document absolute."""
-    return _mapped_paths(document, lambda path: os.path.normpath(folder / Path(path).expanduser()))
+    return dict(
+        with_paths(TASK, document, lambda path: os.path.normpath(folder / Path(path).expanduser()))
+    )
 
 
 def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
-    return _mapped_paths(document, lambda path: _relative_path(path, folder))
+    return dict(with_paths(TASK, document, lambda path: _relative_path(path, folder)))
 
 
 def _relative_path(path: str, folder: Path) -> str:
@@ -304,50 +320,3 @@ def _relative_path(path: str, folder: Path) -> str:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive
         return path
-
-
-def _mapped_paths(document: dict[str, Any], function: Any) -> dict[str, Any]:
-    fmu, data, system = document.get("fmu"), document.get("data"), document.get("system")
-    config = document.get("config")
-    if isinstance(config, dict) and "preload" in config:
-        preload = _mapped_libraries(config["preload"], function)
-        document = document | {"config": config | {"preload": preload}}
-    if isinstance(system, dict):
-        document = document | {"system": _mapped_system(system, function)}
-    if isinstance(fmu, str):
-        document = document | {"fmu": function(fmu)}
-    if isinstance(data, dict):
-        document = document | {
-            "data": {name: _mapped_path(d, function) for name, d in data.items()}
-        }
-    return document
-
-
-def _mapped_libraries(preload: Any, function: Any) -> Any:
-    """Map the paths of libraries. A bare name is for the loader of the system to find."""
-    if isinstance(preload, list):
-        return [_mapped_libraries(one, function) for one in preload]
-    if not isinstance(preload, str) or not os.path.dirname(preload):
-        return preload
-    path = function(preload)
-    return path if os.path.dirname(path) else f"./{path}"
-
-
-def _mapped_system(system: dict[str, Any], function: Any) -> dict[str, Any]:
-    """Map the paths of the FMUs of components: texts, or texts in tables."""
-    components = system.get("components")
-    if not isinstance(components, dict):
-        return system
-    return system | {"components": {n: _mapped_fmu(c, function) for n, c in components.items()}}
-
-
-def _mapped_fmu(component: Any, function: Any) -> Any:
-    if isinstance(component, str):
-        return function(component)
-    fmu = component.get("fmu") if isinstance(component, dict) else None
-    return component | {"fmu": function(fmu)} if isinstance(fmu, str) else component
-
-
-def _mapped_path(column: Any, function: Any) -> Any:
-    file = column.get("file") if isinstance(column, dict) else None
-    return column | {"file": function(file)} if isinstance(file, str) else column

@@ -1,46 +1,49 @@
-"""Numbers and distributions in the entries of a task."""
+"""Numbers and distributions of a task."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from fmugym.checks import check_mapping, number_of
-from fmugym.declared.entries import Entry
+from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.declared.expressions import Expression
 from fmugym.distributions import as_distribution, is_distribution
 
-__all__ = ["number", "number_or_distribution"]
+__all__ = ["finite", "number", "number_or_distribution"]
 
 
-def number(entry: Entry) -> float:
+def number(what: str, value: Any) -> float:
     """A number of a task: a number, or a text with an expression of constants, such as ``pi / 2``.
 
     Raises:
         ConfigError: If it is neither.
     """
-    with entry.placing():
-        if isinstance(entry.value, str):
-            return Expression.parse(entry.value).constant()
-        return number_of(entry.name, entry.value, may_be_boolean=True)
+    if isinstance(value, str):
+        return Expression.parse(value).constant()
+    return number_of(what, value, may_be_boolean=True)
 
 
-def number_or_distribution(entry: Entry) -> Any:
+def finite(what: str, value: Any) -> float:
+    """A finite number of a task, as ``number``."""
+    return check_number(what, number(what, value), may_be_boolean=True)
+
+
+def number_or_distribution(what: str, value: Any, read: Callable[[str, Any], Any] = finite) -> Any:
     """A number, or a distribution, whose numbers may be texts with expressions of constants.
+
+    Args:
+        what: Its name, for the error.
+        value: As the user gave it.
+        read: Reads what is no distribution.
 
     Raises:
         ConfigError: If it is neither.
     """
-    if is_distribution(entry.value):
-        return entry.value
-    if not isinstance(entry.value, Mapping):
-        value = number(entry)
-        if not math.isfinite(value):
-            raise entry.error(f"expected a finite number, got {value}")
+    if is_distribution(value):
         return value
-    with entry.placing():
-        items = check_mapping(entry.name, entry.value)
-        for name in items.keys() - {"distribution", "values", "probabilities"}:
-            items[name] = number(entry.child(name))
-        return as_distribution(entry.name, items)
+    if not isinstance(value, Mapping):
+        return read(what, value)
+    items = check_mapping(what, value)
+    for name in items.keys() - {"distribution", "values", "probabilities"}:
+        items[name] = number(name, items[name])
+    return as_distribution(what, items)

@@ -10,20 +10,16 @@ from typing import Any, Final
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_option
-from fmugym.declared.devices import DEVICE_KEYS, IDEAL, Device, read_device
-from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import duration
-from fmugym.declared.values import number, number_or_distribution
+from fmugym.declared.devices import IDEAL, Device, read_device
+from fmugym.declared.entries import Entry, gathered
+from fmugym.declared.values import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.pool.spec import SAMPLINGS
 from fmugym.task.ranges import within
 from fmugym.task.roles import input_variable, output_variable
 from fmugym.task.starting import checked, spread
 
 __all__ = [
-    "VARIABLE_KEYS",
     "Record",
     "Records",
     "converted",
@@ -32,16 +28,8 @@ __all__ = [
     "start_value",
 ]
 
-VARIABLE_KEYS: Final = (
-    *("name", "unit", "min", "max", "nominal", "levels", "delta", "min_on", "min_off", "sample"),
-    *DEVICE_KEYS,
-    "description",
-)
-"""The keys of a variable."""
-
-
-_OF_ACTUATOR: Final = ("delta", "min_on", "min_off")
-_DURATIONS: Final = ("min_on", "min_off")
+_PLAIN: Final = ("levels", "sample", "delta", "min_on", "min_off")
+"""Keys of a variable that are attributes of its record as they are."""
 
 
 @dataclass(frozen=True)
@@ -133,9 +121,9 @@ class Records:
 
     def __init__(self, root: Entry, description: ModelDescription) -> None:
         self._root, self._description = root, description
-        section = root.child("variables")
-        declared = {} if section.value is None else section.items()
-        self._records = {alias: self._declared(entry) for alias, entry in declared.items()}
+        declared = root.child("variables").items()
+        read = gathered(self._declared, declared.values())
+        self._records = dict(zip(declared, read, strict=True))
 
     def declared(self) -> list[Record]:
         """The variables that the task declares or has used."""
@@ -196,7 +184,7 @@ class Records:
         Raises:
             ConfigError: If there is no such input, or the unit does not fit it.
         """
-        record = self.find(entry, entry.text(), "input")
+        record = self.find(entry, entry.value, "input")
         self.check_input(entry, record)
         if unit is None or record.variable is None:
             return record
@@ -228,40 +216,38 @@ class Records:
             output_variable(self._description, self[name].fmu_name)
 
     def _declared(self, entry: Entry) -> Record:
-        table, alias = entry.table(VARIABLE_KEYS), entry.name
-        if "name" not in table:
-            return self._record(alias, entry, self._description.find(alias))
-        with table["name"].placing():
-            return self._record(alias, entry, self._description.variable(table["name"].text()))
+        name = entry.child("name")
+        if name.value is None:
+            return self._record(entry.name, entry, self._description.find(entry.name))
+        with name.placing():
+            return self._record(entry.name, entry, self._description.variable(name.value))
 
     def _record(self, alias: str, entry: Entry, variable: Variable | None) -> Record:
-        sample = _sample(entry)
+        given = entry.value or {}
+        sample = given.get("sample", "last")
         own = None if variable is None else variable.unit
         if sample == "integral" and own is not None:
             own = f"({own}).s"
-        unit = entry.child("unit")
-        wanted = own if unit.value is None else unit.text()
-        with unit.placing():
-            conversion = conversion_between(own, wanted, self._description.units)
+        unit = given.get("unit", own)
+        with entry.child("unit").placing():
+            conversion = conversion_between(own, unit, self._description.units)
         limited = None if sample == "integral" else variable
-        low, high = _limits(entry, limited, conversion)
-        levels, limits = _levels(entry), _of_actuator(entry)
-        device = read_device(entry)
+        if "delta" in given and "levels" in given:
+            raise entry.error("an action has either 'levels' or 'delta'")
         return Record(
-            *(alias, entry, variable, wanted, conversion, low, high, levels, sample),
-            nominal=_nominal(entry, limited, conversion),
-            device=device,
-            **limits,
+            *(alias, entry, variable, unit, conversion),
+            *_limits(entry, limited, conversion),
+            nominal=given.get("nominal", _own_nominal(limited, conversion)),
+            device=read_device(entry),
+            **{key: given[key] for key in _PLAIN if key in given},
         )
 
 
 def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> tuple[float, float]:
     """The limits of the task, or else those of the FMU."""
-    minimum, maximum = entry.child("min"), entry.child("max")
-    low, high = _own_limits(variable, conversion)
-    low = low if minimum.value is None else number(minimum)
-    high = high if maximum.value is None else number(maximum)
-    if not low < high and not (minimum.value is None and maximum.value is None):
+    given, (low, high) = entry.value or {}, _own_limits(variable, conversion)
+    low, high = given.get("min", low), given.get("max", high)
+    if not low < high and given.keys() & {"min", "max"}:
         raise entry.error(f"min must be below max, got {low} and {high}")
     return low, high
 
@@ -277,49 +263,10 @@ def _own_limits(variable: Variable | None, conversion: Conversion) -> tuple[floa
     return low, high
 
 
-def _nominal(entry: Entry, variable: Variable | None, conversion: Conversion) -> float | None:
-    """The nominal value of the task, or that of the FMU unless its unit has another zero."""
-    nominal = entry.child("nominal")
-    if nominal.value is not None:
-        value = number(nominal)
-        if not 0 < value < math.inf:
-            raise nominal.error(f"nominal must be positive, got {value:g}")
-        return value
+def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | None:
+    """The nominal value of the FMU, unless its unit has another zero."""
     own = None if variable is None else variable.nominal
     return None if not own or conversion.offset else abs(own * conversion.factor)
-
-
-def _of_actuator(entry: Entry) -> dict[str, Any]:
-    """How much and how often an action may change."""
-    given = {key: entry.child(key) for key in _OF_ACTUATOR}
-    limits: dict[str, Any] = {}
-    for key, one in given.items():
-        if one.value is None:
-            continue
-        limits[key] = one.check(duration) if key in _DURATIONS else number(one)
-        if not limits[key] > 0:
-            raise one.error(f"{key} must be positive, got {limits[key]:g}")
-    if "delta" in limits and "levels" in (entry.value or {}):
-        raise entry.error("an action has either 'levels' or 'delta'")
-    return limits
-
-
-def _sample(entry: Entry) -> str:
-    sample = entry.child("sample")
-    if sample.value is None:
-        return "last"
-    with sample.placing():
-        return check_option("sample", sample.value, SAMPLINGS)
-
-
-def _levels(entry: Entry) -> tuple[float, ...]:
-    levels = entry.child("levels")
-    if levels.value is None:
-        return ()
-    values = tuple(number(level) for level in levels.elements())
-    if len(set(values)) < max(2, len(values)) or not all(map(math.isfinite, values)):
-        raise levels.error(f"expected two or more different numbers, got {shown(levels.value)}")
-    return values
 
 
 def converted(conversion: Conversion, text: str) -> str:
@@ -354,11 +301,10 @@ def start_value(record: Record, entry: Entry) -> Any:
         raise entry.error(f"{name!r} cannot be set at the start of an episode{what}")
     if variable.shape:
         return _array_start(variable, entry, record.own_range)
-    if isinstance(entry.value, str) and (variable.items or variable.kind == "string"):
-        value: Any = entry.value
-    else:
-        value = number_or_distribution(entry)
+    value, is_text = entry.value, bool(variable.items) or variable.kind == "string"
     with entry.placing():
+        if not (isinstance(value, str) and is_text):
+            value = number_or_distribution(entry.name, value)
         value = _in_unit_of_fmu(record.conversion, value)
         if variable.kind == "string":
             return value

@@ -6,18 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from fmugym.checks import check_text
 from fmugym.declared.entries import Entry
-from fmugym.declared.quantities import duration
 from fmugym.declared.variables import Record
 from fmugym.errors import shown, unknown_name
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
 
-__all__ = ["WARM_UP_KEYS", "WarmUpTable", "period_of", "read_warm_up", "signals_of"]
-
-WARM_UP_KEYS: Final = ("period", "controller", "cache")
-"""The keys of a warm-up."""
+__all__ = ["WarmUpTable", "read_warm_up", "signals_of"]
 
 THERMOSTATS: Final = ("thermostat", "hysteresis")
 """The names of a controller whose arguments the task may tell."""
@@ -51,13 +48,6 @@ def signals_of(controller: Controller) -> list[str]:
     return [name for name in given if isinstance(name, str)]
 
 
-def period_of(entry: Entry) -> float:
-    """The length of a warm-up in seconds; 0 if there is none."""
-    if entry.value is None:
-        return 0.0
-    return (entry.required("period") if isinstance(entry.value, Mapping) else entry).check(duration)
-
-
 def read_warm_up(
     root: Entry, actions: Sequence[Record], controlled: Sequence[tuple[str, str]]
 ) -> WarmUpTable:
@@ -75,13 +65,8 @@ def read_warm_up(
     entry = root.child("warm_up")
     if entry.value is None:
         return WarmUpTable(entry)
-    period = period_of(entry)
-    if not isinstance(entry.value, Mapping):
-        return WarmUpTable(entry, period)
-    table = entry.table(WARM_UP_KEYS)
-    caches = "cache" in table and table["cache"].flag()
-    given = table.get("controller")
-    entries = {} if given is None else _by_action(given, actions)
+    given = entry.child("controller")
+    entries = {} if given.value is None else _by_action(given, actions)
     records = {record.alias: record for record in actions}
     controllers = {
         name: _thermostat(one, records[name], controlled)
@@ -89,15 +74,14 @@ def read_warm_up(
         else _controller(one, known)
         for name, one in entries.items()
     }
-    return WarmUpTable(entry, period, controllers, caches)
+    return WarmUpTable(entry, entry.value["period"], controllers, entry.value["cache"])
 
 
 def _named_controllers(root: Entry) -> dict[str, Entry]:
     """The controllers that a task names; each of them is checked, also one with ranges."""
     from fmugym.baselines.parsing import has_range, search_of
 
-    section = root.child("controllers")
-    known = {} if section.value is None else section.items()
+    known = root.child("controllers").items()
     for one in known.values():
         if has_range(one.value):
             with one.placing():
@@ -136,7 +120,10 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
 def _by_action(entry: Entry, actions: Sequence[Record]) -> dict[str, Entry]:
     names = [record.alias for record in actions]
     if isinstance(entry.value, Mapping):
-        return entry.table(names)
+        for name, one in entry.items().items():
+            if name not in names:
+                raise one.error(unknown_name("action", name, names))
+        return entry.items()
     if len(names) == 1:
         return {names[0]: entry}
     raise entry.error(f"name a controller for each action, such as {{ {names[0]} = 0 }}")
@@ -150,8 +137,8 @@ def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:
         return _controller(known[value], {})
     if isinstance(value, int | float) and not isinstance(value, bool):
         return Constant(float(value))
-    text = entry.text()
     with entry.placing():
+        text = check_text("controller", value)
         if known and len(text.split()) == 1:
             raise unknown_name("controller", text, known)
         controller = controller_of(text)

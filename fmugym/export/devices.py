@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from fmugym.declared import TaskEnv
-from fmugym.declared.devices import DEVICE_KEYS
+from fmugym.declared.format import DEVICE
 from fmugym.env import FMUEnv
 
 __all__ = ["without_imperfections"]
@@ -55,7 +55,7 @@ def _ideal(document: Mapping[str, Any]) -> dict[str, Any]:
     actions = [actions] if isinstance(actions, str) else actions
     variables = document.get("variables", {})
     ideal["variables"] = {
-        name: _without(one, _OF_ACTUATORS if name in actions else DEVICE_KEYS)
+        name: _without(one, _OF_ACTUATORS if name in actions else tuple(DEVICE))
         for name, one in variables.items()
     }
     if "forecast" in agent:

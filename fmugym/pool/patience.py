@@ -110,4 +110,4 @@ class Patience:
     def _advice(self) -> str:
         if self._seconds:
             return f"no licence came within {self._seconds:g} s (licence_wait)"
-        return "config key 'licence_wait' gives the seconds to wait for a licence"
+        return "'licence_wait' of the table 'foreign' gives the seconds to wait for a licence"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +14,13 @@ from fmugym.archive.structure import Feedthrough
 from fmugym.archive.variable import Variable, unknown_rest
 from fmugym.checks import (
     KnownArguments,
-    check_count,
     check_flag,
-    check_mapping,
     check_number,
-    check_option,
     check_path,
     parts_of_array,
 )
 from fmugym.errors import ConfigError, FMULoadError, shown, unknown_name
+from fmugym.keys import COUNT, FLAG, Entries, Kind, check_fields, key, option
 from fmugym.systems import plan
 
 __all__ = ["Component", "OpenComponent", "start_number"]
@@ -30,47 +28,62 @@ __all__ = ["Component", "OpenComponent", "start_number"]
 _NO_NAME = set('/\\:*?"<>|')
 
 
+def _fmu(what: str, value: Any) -> Any:
+    if not isinstance(value, FMU):
+        check_path("the path of an FMU", value)
+    return value
+
+
+def _no_feedthrough(what: str, value: Any) -> bool:
+    if check_flag(what, value):
+        raise ConfigError(f"{what} of a component must be False or None, got True")
+    return False
+
+
 @dataclass(frozen=True)
 class Component(KnownArguments):
     """One FMU of an ``FMUSystem``.
 
-    Attributes:
-        fmu: The path of the ``.fmu`` file, or an ``FMU``, whose limits and libraries are used.
-        start_values: Parameters and start values by the names of the FMU's variables, in their
-            units. An array takes nested lists of its shape, a flat list or one value for all
-            elements. Structural parameters give arrays their sizes. The values of an environment,
-            such as ``model_parameters``, win over others.
-        interface: ``"co_simulation"`` or ``"model_exchange"``; by default co-simulation where the
-            FMU offers it.
-        steps: Communication steps of this component in one of the system.
-        feedthrough: False says that no output depends on an input without a step in between, for
-            FMUs that tell nothing of it; None for what the FMU tells.
-        isolate: Whether the whole system runs in worker processes because of it, so that a crash
-            ends single episodes only. ``isolation`` of an environment wins.
+    Its keys are those of a component in a task file, see ``docs/systems.md``. The values of an
+    environment, such as ``model_parameters``, win over ``start_values``. ``isolation`` of an
+    environment wins over ``isolate``.
 
     Raises:
         ConfigError: If a value does not fit.
         ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
     """
 
-    fmu: FMU | str | os.PathLike[str]
-    start_values: Mapping[str, Any] = field(default_factory=dict)
-    interface: str | None = None
-    steps: int = 1
-    feedthrough: bool | None = None
-    isolate: bool = False
+    fmu: FMU | str | os.PathLike[str] = key(
+        Kind(_fmu, {"title": "path"}, "path"),
+        "Path of the FMU, or in Python an `FMU`, whose limits and libraries are used.",
+    )
+    start_values: Mapping[str, Any] = key(
+        Entries(Kind(lambda _, value: value)),
+        "Parameters and start values by the names of the FMU's variables, in their units: numbers, "
+        "texts, for arrays nested lists, a flat list or one value for all elements; structural "
+        "parameters, too. `model_parameters` of an environment win.",
+        {},
+    )
+    interface: str | None = key(
+        option(*INTERFACES), "How the FMU is run.", None, "co-simulation if there is one"
+    )
+    steps: int = key(COUNT, "Communication steps of the component in one of the system.", 1)
+    feedthrough: bool | None = key(
+        Kind(_no_feedthrough, {"const": False}),
+        "`false`: [no output depends on an input](systems.md#order) without a "
+        "step in between.",
+        None,
+        "as the FMU tells",
+    )
+    isolate: bool = key(
+        FLAG,
+        "Whether the whole system runs in [worker processes](systems.md#in-worker-processes) "
+        "because of this component, so that a crash ends single episodes only.",
+        False,
+    )
 
     def __post_init__(self) -> None:
-        values = check_mapping("start_values of a component", self.start_values)
-        object.__setattr__(self, "start_values", values)
-        object.__setattr__(self, "steps", check_count("steps of a component", self.steps))
-        if self.interface is not None:
-            check_option("interface", self.interface, INTERFACES)
-        if self.feedthrough is not None and check_flag("feedthrough", self.feedthrough):
-            raise ConfigError("feedthrough of a component must be False or None, got True")
-        object.__setattr__(self, "isolate", check_flag("isolate", self.isolate))
-        if not isinstance(self.fmu, FMU):
-            check_path("the path of an FMU", self.fmu)
+        check_fields(self)
 
     @classmethod
     def of(cls, value: Any) -> Component:

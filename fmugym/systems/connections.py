@@ -5,12 +5,27 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.checks import KnownArguments, check_flag, check_number, check_text
+from fmugym.checks import KnownArguments, check_number, check_text
 from fmugym.errors import ConfigError, shown
+from fmugym.keys import FLAG, NUMBER, TEXT, Either, Kind, check_fields, key, table_of
 
-__all__ = ["Connection"]
+__all__ = ["CONNECTION", "Connection"]
 
 _ARROW: Final = "->"
+
+
+def _name(end: str, value: Any) -> str:
+    name = check_text(f"the {end} of a connection", value).strip()
+    if not name:
+        raise ConfigError(f"the {end} of a connection is empty")
+    return name
+
+
+def _gain(what: str, value: Any) -> float:
+    gain = check_number(what, value)
+    if not gain:
+        raise ConfigError(f"{what} must not be 0")
+    return gain
 
 
 @dataclass(frozen=True)
@@ -20,35 +35,22 @@ class Connection(KnownArguments):
     The value is converted from the unit of the source to that of the target, then ``gain`` and
     ``offset`` apply to the converted value. Both may be the name of a component, a dot and the
     name of its variable. A name without a component is one of the system itself: as a source it
-    is an input or parameter of the system, as a target an output.
-
-    Attributes:
-        source: Where the value comes from.
-        target: Where it goes.
-        gain, offset: 1 and 0 leave the value as it is.
-        convert_units: Whether the value is converted between units.
+    is an input or parameter of the system, as a target an output. The keys are those of a
+    connection in a task file, see ``docs/systems.md``.
 
     Raises:
         ConfigError: If a value does not fit.
         ArgumentError: If there is no argument of this name; that is a ``TypeError``, too.
     """
 
-    source: str
-    target: str
-    gain: float = 1.0
-    offset: float = 0.0
-    convert_units: bool = True
+    source: str = key(Kind(_name, TEXT.schema), "Where the value comes from.")
+    target: str = key(Kind(_name, TEXT.schema), "Where it goes.")
+    gain: float = key(Kind(_gain, NUMBER.schema), "Factor of the value.", 1.0)
+    offset: float = key(NUMBER, "This is added.", 0.0)
+    convert_units: bool = key(FLAG, "Whether the value is converted between units.", True)
 
     def __post_init__(self) -> None:
-        for end in ("source", "target"):
-            object.__setattr__(self, end, _name(end, getattr(self, end)))
-        for number in ("gain", "offset"):
-            value = check_number(f"{number} of {self}", getattr(self, number))
-            object.__setattr__(self, number, value)
-        if not self.gain:
-            raise ConfigError(f"gain of {self} must not be 0")
-        flag = check_flag(f"convert_units of {self}", self.convert_units)
-        object.__setattr__(self, "convert_units", flag)
+        check_fields(self)
 
     def __str__(self) -> str:
         return f"{self.source} {_ARROW} {self.target}"
@@ -71,8 +73,8 @@ class Connection(KnownArguments):
         )
 
 
-def _name(end: str, value: Any) -> str:
-    name = check_text(f"the {end} of a connection", value).strip()
-    if not name:
-        raise ConfigError(f"the {end} of a connection is empty")
-    return name
+CONNECTION: Final = Either(
+    table_of(Connection, make=Connection),
+    Kind(lambda _, value: Connection.of(value), {"title": '"source -> target"', **TEXT.schema}),
+)
+"""A connection as a text or pair of names, a table or an object."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMUGymError
-from fmugym.systems.components import Component
 from fmugym.systems.drawing import draw
 from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.ssp.reading import arguments_of
@@ -126,14 +126,7 @@ class FMUSystem(WiredSystem):
     def arguments(self) -> dict[str, Any]:
         """The arguments that make this system once more, FMUs as their paths."""
         components = {
-            name: Component(
-                one.fmu.path,
-                one.given.start_values,
-                one.fmu.interface,
-                one.given.steps,
-                one.given.feedthrough,
-                one.given.isolate,
-            )
+            name: replace(one.given, fmu=one.fmu.path, interface=one.fmu.interface)
             for name, one in self.components.items()
         }
         return {

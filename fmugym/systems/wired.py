@@ -9,19 +9,82 @@ from pathlib import Path
 from typing import Any, Final, Never
 
 from fmugym.archive.description import Unit
-from fmugym.checks import check_count, check_mapping, check_number, check_option, check_text
-from fmugym.errors import ConfigError, shown, unknown_argument
+from fmugym.errors import ConfigError, unknown_argument
+from fmugym.keys import (
+    COUNT,
+    NUMBER,
+    POSITIVE,
+    REQUIRED,
+    TEXT,
+    Entries,
+    Key,
+    Listed,
+    Table,
+    checked,
+    option,
+    table_of,
+)
 from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
-from fmugym.systems.connections import Connection
+from fmugym.systems.connections import CONNECTION
 from fmugym.systems.order import Order, order_of
 from fmugym.systems.plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
-__all__ = ["LOOPS", "WiredSystem"]
+__all__ = ["LOOPS", "SYSTEM", "WiredSystem"]
 
 LOOPS: Final = (*LOOP_METHODS, "refuse")
 """What is done about algebraic loops."""
+
+
+SYSTEM: Final = Table(
+    {
+        "components": Key(
+            Entries(table_of(Component, make=Component, short="fmu")),
+            "By name: the path of an FMU, or a [component](systems.md#connect-fmus).",
+            REQUIRED,
+        ),
+        "connections": Key(
+            Listed(CONNECTION),
+            'Texts `"source -> target"`, or [tables](systems.md#connect-fmus).',
+            (),
+        ),
+        "units": Key(
+            Entries(TEXT), "Units of the system's own inputs, outputs and parameters by name.", {}
+        ),
+        "name": Key(TEXT, "Of the system.", "system"),
+        "description": Key(TEXT, "A text for people.", ""),
+        "step_size": Key(
+            POSITIVE,
+            "Default communication step size.",
+            None,
+            "the smallest of a component",
+        ),
+        "start_time": Key(NUMBER, "Of the default experiment, in seconds.", 0.0),
+        "stop_time": Key(NUMBER, "Of the default experiment, in seconds."),
+        "master": Key(
+            option(*MASTERS),
+            "How values are exchanged; see [How systems run](systems.md#how-a-step-runs).",
+            MASTERS[0],
+        ),
+        "loops": Key(
+            option(*LOOPS),
+            "How [algebraic loops](systems.md#algebraic-loops) are solved, or that they are "
+            "refused.",
+            LOOPS[0],
+        ),
+        "loop_tolerance": Key(
+            POSITIVE,
+            "A loop is solved when no value changes by more; relative, and absolute below 1.",
+            Loop.tolerance,
+        ),
+        "loop_iterations": Key(COUNT, "After so many, the step fails.", Loop.max_iterations),
+        "tolerance": Key(POSITIVE, "For the solvers of the components.", None, "the FMUs'"),
+    }
+)
+"""The keys of a system."""
+
+_TIMES: Final = ("step_size", "start_time", "stop_time", "tolerance")
 
 
 class WiredSystem:
@@ -54,21 +117,33 @@ class WiredSystem:
     ) -> None:
         for argument in without_retired(unknown):
             raise unknown_argument(type(self).__name__, argument, _ARGUMENTS)
-        given = check_mapping("components", components)
-        if not given:
-            raise ConfigError("a system needs at least one component")
-        self.name = check_text("the name of a system", name)
-        self.description = check_text("the description of a system", description)
-        self.units = {
-            n: check_text("a unit", u) for n, u in check_mapping("units", units or {}).items()
+        told = {
+            "components": components,
+            "connections": connections,
+            "name": name,
+            "units": units or {},
+            "description": description,
+            "master": master,
+            "loops": loops,
+            "loop_tolerance": loop_tolerance,
+            "loop_iterations": loop_iterations,
+            "step_size": step_size,
+            "start_time": start_time,
+            "stop_time": stop_time,
+            "tolerance": tolerance,
         }
-        self.master = check_option("master", master, MASTERS)
-        self.loops = check_option("way of solving loops", loops, LOOPS)
-        self.loop = _loop(self.loops, loop_tolerance, loop_iterations)
-        self.times = _times(step_size, start_time, stop_time, tolerance)
+        given = checked(SYSTEM, told)
+        if not given["components"]:
+            raise ConfigError("a system needs at least one component")
+        self.name, self.description = given["name"], given["description"]
+        self.units, self.master, self.loops = given["units"], given["master"], given["loops"]
+        method = LOOP_METHODS[0] if self.loops == "refuse" else self.loops
+        self.loop = Loop(method, given["loop_tolerance"], given["loop_iterations"])
+        self.times = {name: given[name] for name in _TIMES}
         self._given_findings, self.file = tuple(findings), file
-        self.connections = tuple(map(Connection.of, _listed(connections)))
-        self.components = {n: OpenComponent(n, Component.of(c)) for n, c in given.items()}
+        self.connections = tuple(given["connections"])
+        made = given["components"].items()
+        self.components = {one: OpenComponent(one, component) for one, component in made}
         self.own_names = tuple(own_names)
         self.unit_definitions = dict(unit_definitions or {})
         self._wiring = Wiring(
@@ -173,29 +248,6 @@ _ARGUMENTS: Final = tuple(
     for name in inspect.signature(WiredSystem.__init__).parameters
     if name not in ("self", "unknown")
 )
-
-
-def _listed(connections: Any) -> Sequence[Any]:
-    if isinstance(connections, list | tuple):
-        return connections
-    raise ConfigError(f"connections must be a list, got {shown(connections)}")
-
-
-def _loop(method: str, tolerance: Any, iterations: Any) -> Loop:
-    return Loop(
-        LOOP_METHODS[0] if method == "refuse" else method,
-        check_number("loop_tolerance", tolerance, positive=True),
-        check_count("loop_iterations", iterations),
-    )
-
-
-def _times(step_size: Any, start_time: Any, stop_time: Any, tolerance: Any) -> dict[str, Any]:
-    given = {"step_size": step_size, "stop_time": stop_time, "tolerance": tolerance}
-    checked = {
-        name: None if value is None else check_number(name, value, positive=name != "stop_time")
-        for name, value in given.items()
-    }
-    return checked | {"start_time": check_number("start_time", start_time)}
 
 
 def _findings_of(order: Order) -> Iterator[str]:

@@ -75,16 +75,18 @@ def open_fmu(
         FMULoadError: If the file is missing or not a valid FMU.
     """
     if isinstance(path, FMUSystem):
-        return _shared((path, config.probe_timeout), lambda: _open_system(path, config))
+        return _shared((path, config.foreign.probe_timeout), lambda: _open_system(path, config))
     file = _find_file(cls, check_path("fmu_path", path))
     if file.suffix.lower() == ".ssp":
-        key = file, repr(config.archive_limits), config.probe_timeout
+        key = file, repr(config.foreign.archive_limits), config.foreign.probe_timeout
         return _shared(key, lambda: _open_system(_read_system(file, config), config))
-    preload = [_find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.preload]
+    preload = [
+        _find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.foreign.preload
+    ]
     arguments: dict[str, Any] = {
-        "limits": config.archive_limits,
+        "limits": config.foreign.archive_limits,
         "preload": preload,
-        "probe_timeout": config.probe_timeout,
+        "probe_timeout": config.foreign.probe_timeout,
         "interface": _interface_of(cls, config.interface, interface),
     }
     fmu = _shared((file, repr(arguments)), lambda: FMU(file, **arguments))
@@ -106,16 +108,17 @@ def _shared(key: Any, open_it: Callable[[], FMU]) -> FMU:
 
 
 def _read_system(file: Path, config: EnvConfig) -> FMUSystem:
-    return FMUSystem.read(file, config.archive_limits)
+    return FMUSystem.read(file, config.foreign.archive_limits)
 
 
 def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
-    for key in ("preload", "interface"):
-        if getattr(config, key):
+    given = {"preload": config.foreign.preload, "interface": config.interface}
+    for key, value in given.items():
+        if value:
             raise ConfigError(
                 f"config key {key!r} is for a single FMU; give it to a component of {system.name!r}"
             )
-    fmu = system.as_fmu(config.probe_timeout)
+    fmu = system.as_fmu(config.foreign.probe_timeout)
     fmu.description.resized(structural_values(fmu.description, config.model_parameters))
     return fmu
 
@@ -171,8 +174,8 @@ class PoolOpening:
         self._check_max_instances(num_instances)
         own: dict[str, Any] = {
             "isolation": self.isolation or self.config.isolation,
-            "call_timeout": self.config.call_timeout,
-            "reset_method": self.config.reset_method,
+            "call_timeout": self.config.foreign.call_timeout,
+            "reset_method": self.config.foreign.reset_method,
             "starts": self.plan.starts(),
             "spare": self._has_spare(num_instances),
         }
@@ -183,16 +186,16 @@ class PoolOpening:
 
     def _has_spare(self, num_instances: int) -> bool:
         """Whether there may be one more instance."""
-        most = self.config.max_instances
+        most = self.config.foreign.max_instances
         return most is None or num_instances < most
 
     def _check_max_instances(self, wanted: int) -> None:
-        most = self.config.max_instances
+        most = self.config.foreign.max_instances
         if most is not None and wanted > most:
             self.fmu.close()
             raise ConfigError(
-                f"{self.fmu.path.name}: {wanted} environments need {wanted} instances, but config "
-                f"key 'max_instances' allows {most}"
+                f"{self.fmu.path.name}: {wanted} environments need {wanted} instances, but "
+                f"'max_instances' of 'foreign' allows {most}"
             )
 
     def apart(self) -> PoolOpening:

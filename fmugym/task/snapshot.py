@@ -36,11 +36,7 @@ __all__ = [
 _VERSION: Final = 4
 """Of pickles; it changes with their content."""
 
-_OPERATION: Final = {
-    *("on_fault", "fault_retries", "fault_reward", "leak_limit", "reset_method"),
-    *("archive_limits", "preload", "probe_timeout", "isolation", "call_timeout", "max_instances"),
-    "licence_wait",
-}
+_OPERATION: Final = {"on_fault", "fault_retries", "fault_reward", "isolation", "foreign"}
 """Config keys on which no state depends."""
 
 _HASH: Final = re.compile(r"\b([0-9a-f]{8})[0-9a-f]{8,}\b")

@@ -3,37 +3,34 @@
 ::
 
     fmugym info model.fmu|system.ssp|task.toml [--all] [--filter GLOB] [--plot system.svg]
+    fmugym info --repair model.fmu [--output PATH]
+    fmugym info minari:NAME [--output FOLDER]
     fmugym new model.fmu [--class] [--output task.toml]
     fmugym validate TASK|model.fmu
-    fmugym simulate TASK [WHO] [--scenario NAME] [EPISODES] [--output run.csv]
+    fmugym simulate TASK [WHO ...] [--scenario NAME] [EPISODES] [--output FILE ...]
+        [--variables GLOB ...] [--every SECONDS]
+    fmugym simulate TASK --output minari:NAME [WHO | --log plant.csv ...] [EPISODES]
     fmugym train TASK --output FOLDER [--algorithm PPO] [--steps N] [--envs N] [--seed N]
         [--episodes N] [--no-normalize] [--resume] [--tune N] [--track mlflow|wandb]
         [--record GLOB ...] [--record-env N ...] [--record-every SECONDS] [--record-format csv]
         [KEY=VALUE ...]
+    fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
     fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
         [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
-    fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
-    fmugym record TASK --output FILE [WHO ...] [--scenario NAME] [EPISODES] [--variables GLOB ...]
-        [--every SECONDS]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]
-    fmugym dataset NAME --task TASK [--log plant.csv ... | --recording FILE ... | WHO] [EPISODES]
-    fmugym dataset NAME --output FOLDER
     fmugym demo [--seed N] [--output picture.png]
-    fmugym skeleton model.fmu [--output my_env.py]
-    fmugym stand-in model.fmu [--folder FOLDER]
-    fmugym compile model.fmu [--output new.fmu]
 
 TASK is a task file, a registered id or ``module:Class``. WHO is ``--action random|NUMBERS``,
 ``--controller TEXT`` or ``--agent FOLDER``. EPISODES are ``--episodes N``, ``--seed N`` and
 ``--steps N``. All commands take ``--json``, ``-q`` and ``-v``; those that write files ``--force``.
 
-``info``, ``new``, ``skeleton``, ``stand-in`` and ``compile`` execute nothing of the FMU, the others
-do. Output is printable text; letters that the console lacks are escaped. The exit code is 0; 1 if
-something cannot be used (one line on the error stream says why), ``validate`` finds an error or
-``demo`` has not learned; 2 if the arguments are wrong; 130 after Ctrl-C, which keeps what was
-written until then. SIGTERM and SIGHUP do as Ctrl-C does; the exit code is then 143 or 129.
+``info`` and ``new`` execute nothing of the FMU, the others do. Output is printable text; letters
+that the console lacks are escaped. The exit code is 0; 1 if something cannot be used (the error
+stream says why), ``validate`` finds an error or ``demo`` has not learned; 2 if the arguments are
+wrong; 130 after Ctrl-C, which keeps what was written until then. SIGTERM and SIGHUP do as Ctrl-C
+does; the exit code is then 143 or 129.
 
 ``info --json`` prints one object. New versions may add keys; ``schema`` is raised when a key goes
 or changes its meaning. What the FMU does not give is null, or ``""`` for a text.
@@ -78,23 +75,18 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any, Final, NoReturn
 
+import argcomplete
+
 from fmugym.errors import FMUGymError, unknown_name
 from fmugym.signals import ordinary
-from fmugym.tools.datasets import add_dataset
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
 from fmugym.tools.gains import add_tune
-from fmugym.tools.inspecting import (
-    add_compile,
-    add_info,
-    add_new,
-    add_skeleton,
-    add_stand_in,
-    add_validate,
-)
+from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import add_common, free_outputs, note, speaking
-from fmugym.tools.playing import add_bench, add_evaluate, add_record, add_simulate
+from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
+from fmugym.tools.renamed import renamed
 from fmugym.tools.showing import add_demo
 from fmugym.tools.streams import (
     drop_output,
@@ -106,9 +98,8 @@ from fmugym.tools.streams import (
 __all__ = ["main"]
 
 _COMMANDS: Final = (
-    *(add_info, add_new, add_validate, add_simulate, add_train, add_export, add_tune),
-    *(add_evaluate, add_record, add_bench, add_dataset, add_demo),
-    *(add_skeleton, add_stand_in, add_compile),
+    *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
+    *(add_export, add_bench, add_demo),
 )
 
 
@@ -205,7 +196,8 @@ def _number(text: str) -> float:
 def _parsed(argv: Sequence[str] | None) -> argparse.Namespace:
     """Parse arguments. Those of ``train`` may stand anywhere, which argparse does not know."""
     parser, commands = _parser()
-    given = sys.argv[1:] if argv is None else argv
+    argcomplete.autocomplete(parser)
+    given = renamed(sys.argv[1:] if argv is None else argv)
     if given and not given[0].startswith("-") and given[0] not in commands:
         parser.error(str(unknown_name("command", given[0], commands)))
     if given and given[0].startswith("-") and given[0] not in parser.options:

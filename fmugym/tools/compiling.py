@@ -1,4 +1,4 @@
-"""``fmugym compile``: FMPy's CMake project builds a library from the source code in an FMU.
+"""A library for this machine: FMPy's CMake project builds it from the source code in an FMU.
 
 FMI 2.0 lists the source files in the model description, FMI 3.0 in
 ``sources/buildDescription.xml``. FMI 1.0 has no list. FMPy's own call of its project accepts valid

@@ -1,4 +1,4 @@
-"""The command that makes datasets of episodes: dataset."""
+"""Datasets of Minari, which ``simulate`` makes and ``info`` reads."""
 
 from __future__ import annotations
 
@@ -7,111 +7,101 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any, Final
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.logs import PlantLog, play_log
 from fmugym.recording import Recorder, Recording
-from fmugym.tools.options import (
-    HELP_OF_TASK,
-    Commands,
-    add_command,
-    add_episodes,
-    add_json,
-    add_master,
-    add_players,
-    check_numbers,
-    only_player,
-    say,
-    say_json,
-)
+from fmugym.tools.options import MINARI, only_player, say, say_json
 from fmugym.tools.progress import progress
 from fmugym.tools.simulation import Player, simulate
 from fmugym.tools.targets import maker_of
 
-__all__ = ["add_dataset"]
+__all__ = ["add_of_datasets", "dataset_of", "make_dataset", "show_dataset"]
 
-MakeEnv = Callable[[], FMUEnv]
+_OPTIONS: Final = ("log", "column", "tolerance", "author", "description")
 
 
-def add_dataset(commands: Commands) -> None:
-    """Add ``dataset``."""
-    text = "make a dataset of Minari from episodes, recordings or logs of a plant; or read one"
-    command = add_command(commands, "dataset", _dataset, text)
-    command.add_argument("name", metavar="NAME", help="of the dataset, such as house/pi-v0")
-    command.add_argument("--task", metavar="TASK", help=HELP_OF_TASK)
-    add_master(command)
-    sources = command.add_mutually_exclusive_group()
-    sources.add_argument(
-        "--log", action="append", metavar="FILE", help="a CSV file of a plant; more than once"
+def add_of_datasets(command: argparse.ArgumentParser) -> None:
+    """Add the options for ``--output minari:NAME``."""
+    group = command.add_argument_group("with --output minari:NAME (needs the extra minari)")
+    group.add_argument(
+        "--log",
+        action="append",
+        metavar="FILE",
+        help="instead of who acts: a log of a plant (.csv) or a recording (.npz); more than once",
     )
-    sources.add_argument(
-        "--recording", action="append", metavar="FILE", help="a recording (.npz); more than once"
-    )
-    sources.add_argument(
-        "--output", type=Path, metavar="FOLDER", help="write the dataset as recordings (.npz) here"
-    )
-    command.add_argument(
+    group.add_argument(
         "--column",
         action="append",
-        default=[],
         metavar="COLUMN=VARIABLE",
         help="a column of the log whose name is not that of the variable; more than once",
     )
-    command.add_argument(
+    group.add_argument(
         "--tolerance",
         type=float,
-        default=1e-3,
-        help="how far an input may be from that of the log, as a part of its range",
+        help="how far an input may be from that of the log, as a part of its range; default 0.001",
     )
-    command.add_argument("--author", help="for the dataset's metadata")
-    command.add_argument("--description", help="for the dataset's metadata")
-    add_players(command)
-    command.add_argument("--scenario", help="a scenario of the task file")
-    add_episodes(command, 10, 0)
-    add_json(command)
+    group.add_argument("--author", help="for the dataset's metadata")
+    group.add_argument("--description", help="for the dataset's metadata")
 
 
-def _dataset(arguments: argparse.Namespace) -> None:
+def dataset_of(arguments: argparse.Namespace) -> str | None:
+    """The name of the dataset to be made; None if files are written.
+
+    Raises:
+        ConfigError: If it is written beside files, or options are for datasets only.
+    """
+    names = [str(one) for one in arguments.output if not isinstance(one, Path)]
+    given = [name for name in _OPTIONS if getattr(arguments, name) is not None]
+    if not names and given:
+        raise ConfigError(f"--{given[0]} is for datasets: --output {MINARI}NAME")
+    if names and len(arguments.output) > 1:
+        raise ConfigError(f"a dataset is written alone, got {len(arguments.output)} outputs")
+    return names[0].removeprefix(MINARI) if names else None
+
+
+def make_dataset(arguments: argparse.Namespace) -> None:
+    """Make a dataset of episodes, recordings or logs of a plant."""
     datasets = imported("fmugym.minari", "minari")
-    if arguments.output is not None:
-        recordings = datasets.read_dataset(arguments.name)
-        files = _write(recordings, arguments.output)
-        _show(arguments, recordings, f"{len(files)} recordings in {arguments.output}")
-        return
-    if arguments.task is None:
-        raise ConfigError("a new dataset needs --task; --output FOLDER reads an existing one")
-    is_played = not (arguments.recording or arguments.log)
-    player = only_player(arguments) if is_played else None
-    make_env: MakeEnv = maker_of(arguments.task, arguments.scenario, arguments.master)
-    if player is not None:
+    name = dataset_of(arguments)
+    make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
+    if arguments.log:
+        recordings = _logged(arguments, make_env)
+    else:
+        player = only_player(arguments)
         make_env = partial(player.make_env, make_env)
-    recordings = _recordings(arguments, make_env, player)
+        recordings = _played(arguments, make_env, player)
     about = {"author": arguments.author, "description": arguments.description}
     with closing(make_env()) as env:
-        datasets.write_dataset(arguments.name, recordings, env, **about)
-    _show(arguments, recordings, f"dataset {arguments.name}")
+        datasets.write_dataset(name, recordings, env, replaces=arguments.force, **about)
+    _show(arguments, str(name), recordings, f"dataset {name}")
 
 
-def _recordings(
-    arguments: argparse.Namespace, make_env: MakeEnv, player: Player | None
-) -> list[Recording]:
-    """The episodes that the arguments name; those of a player if there is one."""
-    if player is not None:
-        return _played(arguments, make_env, player)
-    if arguments.log:
-        return _logged(arguments, make_env)
-    return [Recording.load(path) for path in arguments.recording]
+def show_dataset(arguments: argparse.Namespace, name: str) -> None:
+    """Say what is in a dataset, and write its recordings to a folder if one is given."""
+    recordings = imported("fmugym.minari", "minari").read_dataset(name)
+    what, folder = f"dataset {name}", arguments.output
+    if folder is not None:
+        folder.mkdir(parents=True)
+        for number, recording in enumerate(recordings):
+            recording.save(folder / f"episode-{number:04}.npz")
+        what = f"{len(recordings)} recordings in {folder}"
+    _show(arguments, name, recordings, what)
 
 
-def _logged(arguments: argparse.Namespace, make_env: MakeEnv) -> list[Recording]:
-    columns = dict(map(_renaming, arguments.column))
+def _logged(arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]) -> list[Recording]:
+    columns = dict(map(_renaming, arguments.column or []))
+    tolerance = 1e-3 if arguments.tolerance is None else arguments.tolerance
     found: list[Recording] = []
     for path in arguments.log:
-        log = PlantLog.read(path)
-        seed = arguments.seed + len(found)
-        found += play_log(log, make_env, columns=columns, tolerance=arguments.tolerance, seed=seed)
+        if path.endswith(".npz"):
+            found.append(Recording.load(path))
+            continue
+        log, seed = PlantLog.read(path), arguments.seed + len(found)
+        found += play_log(log, make_env, columns=columns, tolerance=tolerance, seed=seed)
     return found
 
 
@@ -122,8 +112,9 @@ def _renaming(text: str) -> tuple[str, str]:
     return column, variable
 
 
-def _played(arguments: argparse.Namespace, make_env: MakeEnv, player: Player) -> list[Recording]:
-    check_numbers(arguments, "episodes", "steps")
+def _played(
+    arguments: argparse.Namespace, make_env: Callable[[], FMUEnv], player: Player
+) -> list[Recording]:
     with closing(make_env()) as env, progress(None, "dataset") as advance:
         recorder, policy = Recorder(env), player.make_policy(env)
         found: list[Recording] = []
@@ -134,25 +125,13 @@ def _played(arguments: argparse.Namespace, make_env: MakeEnv, player: Player) ->
     return found
 
 
-def _write(recordings: Sequence[Recording], folder: Path) -> list[Path]:
-    folder.mkdir(parents=True)
-    files = [folder / f"episode-{number:04}.npz" for number in range(len(recordings))]
-    for recording, file in zip(recordings, files, strict=True):
-        recording.save(file)
-    return files
-
-
-def _show(arguments: argparse.Namespace, recordings: Sequence[Recording], what: str) -> None:
+def _show(
+    arguments: argparse.Namespace, name: str, recordings: Sequence[Recording], what: str
+) -> None:
     steps = sum(map(len, recordings))
-    if arguments.json:
-        rewards = [float(one.rewards.sum()) for one in recordings]
-        say_json(
-            {
-                "dataset": arguments.name,
-                "episodes": len(recordings),
-                "steps": steps,
-                "rewards": rewards,
-            }
-        )
+    if not arguments.json:
+        say(f"{what}: {len(recordings)} episodes, {steps} steps")
         return
-    say(f"{what}: {len(recordings)} episodes, {steps} steps")
+    rewards = [float(one.rewards.sum()) for one in recordings]
+    facts: dict[str, Any] = {"dataset": name, "episodes": len(recordings)}
+    say_json({**facts, "steps": steps, "rewards": rewards})

@@ -1,17 +1,22 @@
-"""The commands for an FMU or a task itself: info, new, skeleton, validate, stand-in, compile."""
+"""The commands for an FMU or a task itself: info, new, validate."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import tomllib
 from pathlib import Path
+from typing import Final
 
 from fmugym.archive.fmu import FMU
+from fmugym.declared.format import SCHEMA
 from fmugym.errors import ConfigError
 from fmugym.systems import FMUSystem
 from fmugym.tools.compiling import compile_fmu
+from fmugym.tools.datasets import show_dataset
 from fmugym.tools.options import (
+    MINARI,
     Commands,
     add_command,
     add_json,
@@ -24,19 +29,26 @@ from fmugym.tools.options import (
 from fmugym.tools.overview import as_text, overview, plain
 from fmugym.tools.proposal import Proposal, preload_line
 from fmugym.tools.skeleton import Skeleton
-from fmugym.tools.stand_in import build_stand_in
+from fmugym.tools.stand_in import build_stand_in, replaceable
 from fmugym.tools.systems import as_text_of_system, find_model, open_model, overview_of_system
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate
 
-__all__ = ["add_compile", "add_info", "add_new", "add_skeleton", "add_stand_in", "add_validate"]
+__all__ = ["add_info", "add_new", "add_validate"]
+
+
+_SCHEMA_NAME: Final = "fmugym.schema.json"
+_SCHEMA_LINE: Final = f"#:schema ./{_SCHEMA_NAME}\n"
+"""It tells editors what keys mean. A file beside the task works offline and elsewhere, too."""
 
 
 def add_info(commands: Commands) -> None:
     """Add ``info``."""
-    text = "say what an FMU or a system is, where it runs, and which variables it has"
+    text = "say what an FMU, a system or a dataset is; or repair an FMU that lacks a library"
     command = add_command(commands, "info", _info, text)
-    _add_fmu(command)
+    command.add_argument(
+        "fmu", metavar="FMU", help=f"or an SSP archive, a task file, or {MINARI}NAME for a dataset"
+    )
     add_master(command)
     add_json(command)
     command.add_argument(
@@ -52,14 +64,32 @@ def add_info(commands: Commands) -> None:
         help="list only variables with a matching name, of any causality; * is any text, "
         "? one character",
     )
-
-
-def _add_fmu(command: argparse.ArgumentParser) -> None:
-    command.add_argument("fmu", type=Path, metavar="FMU")
+    command.add_argument(
+        "--repair",
+        action="store_true",
+        help="build what keeps the FMU from being loaded: a replacement of an old libgfortran, or "
+        "a library for this machine from its source code; takes a C compiler",
+    )
+    command.add_argument(
+        "--output",
+        type=Path,
+        metavar="PATH",
+        help="with --repair: a new FMU (by default beside the old one), or the folder of the "
+        "replacement (by default this one); of a dataset: a folder for its recordings (.npz)",
+    )
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    model = find_model(arguments.fmu, arguments.master)
+    if arguments.fmu.startswith(MINARI):
+        show_dataset(arguments, arguments.fmu.removeprefix(MINARI))
+        return
+    path = Path(arguments.fmu)
+    if arguments.repair:
+        _repair(arguments, FMU(path))
+        return
+    if arguments.output is not None:
+        raise ConfigError("--output is for --repair and for datasets")
+    model = find_model(path, arguments.master)
     wanted = {"everything": arguments.all, "pattern": arguments.filter}
     if isinstance(model, FMUSystem):
         facts, as_lines = overview_of_system(model, **wanted), as_text_of_system
@@ -72,6 +102,36 @@ def _info(arguments: argparse.Namespace) -> None:
     say(json.dumps(facts, indent=2, allow_nan=False) if arguments.json else as_lines(facts))
 
 
+def _repair(arguments: argparse.Namespace, fmu: FMU) -> None:
+    if replaceable(fmu):
+        _replace_libraries(arguments, fmu)
+        return
+    made = compile_fmu(fmu.path, arguments.output)
+    if arguments.json:
+        say_json({"output": made})
+    else:
+        say(plain(f"{made}: compiled for {FMU(made).platform}"))
+
+
+def _replace_libraries(arguments: argparse.Namespace, fmu: FMU) -> None:
+    built = build_stand_in(fmu, arguments.output or Path())
+    if arguments.json:
+        libraries = [
+            {"path": one.path, "functions": list(one.served), "without": list(one.lacking)}
+            for one in built
+        ]
+        say_json({"preload": [one.path for one in built], "libraries": libraries})
+        return
+    for library in built:
+        say(plain(f"{library.path}: {len(library.served)} functions"))
+        for name in library.lacking:
+            say(plain(f"  without {name}: an FMU that calls it ends its process"))
+    line = preload_line([str(library.path) for library in built])
+    say(f"Put it into the task file, below [foreign]: {line}")
+    names = line.removeprefix("preload = ")
+    say(f'or into the config of a class: "foreign": {{"preload": {names}}}')
+
+
 def add_new(commands: Commands) -> None:
     """Add ``new``."""
     text = "write a task file for an FMU, or a Python file with a class, to be filled in"
@@ -79,11 +139,7 @@ def add_new(commands: Commands) -> None:
     command.add_argument(
         "--class", action="store_true", dest="as_class", help="a class instead of a task file"
     )
-    _add_output(command)
-
-
-def _add_output(command: argparse.ArgumentParser) -> None:
-    _add_fmu(command)
+    command.add_argument("fmu", type=Path, metavar="FMU")
     command.add_argument(
         "--output", type=Path, metavar="FILE", help="a new file, instead of standard output"
     )
@@ -91,35 +147,21 @@ def _add_output(command: argparse.ArgumentParser) -> None:
 
 
 def _new(arguments: argparse.Namespace) -> None:
-    if arguments.as_class:
-        _skeleton(arguments)
-        return
-    output: Path | None = arguments.output
-    proposal = Proposal(open_model(arguments.fmu), None if output is None else output.parent)
-    text, notes = proposal.text(), list(proposal.notes())
-    if not arguments.json:
-        write_text(text, output, notes)
-        return
-    if output is not None:
-        write_text(text, output, [])
-    say_json({"output": output, "task": tomllib.loads(text), "notes": notes})
-
-
-def add_skeleton(commands: Commands) -> None:
-    """Add ``skeleton``, another name of ``new --class``."""
-    text = "write a Python file with an environment for an FMU, as new --class does"
-    _add_output(add_command(commands, "skeleton", _skeleton, text))
-
-
-def _skeleton(arguments: argparse.Namespace) -> None:
-    skeleton = Skeleton(open_model(arguments.fmu))
-    text, notes = skeleton.text(), list(skeleton.notes())
-    if not arguments.json:
-        write_text(text, arguments.output, notes)
-        return
-    if arguments.output is not None:
-        write_text(text, arguments.output, [])
-    say_json({"output": arguments.output, "program": text, "notes": notes})
+    model, output = open_model(arguments.fmu), arguments.output
+    made: Skeleton | Proposal = (
+        Skeleton(model)
+        if arguments.as_class
+        else Proposal(model, None if output is None else output.parent)
+    )
+    text, notes, has_schema = made.text(), list(made.notes()), output and not arguments.as_class
+    if has_schema:
+        text = f"{_SCHEMA_LINE}{text}"
+        shutil.copyfile(SCHEMA, output.parent / _SCHEMA_NAME)
+    if output is not None or not arguments.json:
+        write_text(text, output, [] if arguments.json else notes)
+    if arguments.json:
+        content = {"program": text} if arguments.as_class else {"task": tomllib.loads(text)}
+        say_json({"output": output, **content, "notes": notes})
 
 
 def add_validate(commands: Commands) -> None:
@@ -137,51 +179,3 @@ def _validate(arguments: argparse.Namespace) -> int:
     else:
         say(report.as_text())
     return int(report.verdict == "error")
-
-
-def add_compile(commands: Commands) -> None:
-    """Add ``compile``."""
-    text = "compile the source code in an FMU for this machine, into a new FMU"
-    command = add_command(commands, "compile", _compile, text)
-    _add_fmu(command)
-    command.add_argument(
-        "--output", type=Path, metavar="FILE", help="by default beside the FMU, with the platform"
-    )
-    add_json(command)
-
-
-def _compile(arguments: argparse.Namespace) -> None:
-    made = compile_fmu(arguments.fmu, arguments.output)
-    if arguments.json:
-        say_json({"output": made})
-    else:
-        say(plain(f"{made}: compiled for {FMU(made).platform}"))
-
-
-def add_stand_in(commands: Commands) -> None:
-    """Add ``stand-in``."""
-    text = "build a replacement for an old libgfortran that an FMU needs; takes a C compiler"
-    command = add_command(commands, "stand-in", _stand_in, text)
-    _add_fmu(command)
-    command.add_argument(
-        "--folder", type=Path, default=Path(), help="where to write it; by default this folder"
-    )
-    add_json(command)
-
-
-def _stand_in(arguments: argparse.Namespace) -> None:
-    built = build_stand_in(FMU(arguments.fmu), arguments.folder)
-    if arguments.json:
-        libraries = [
-            {"path": one.path, "functions": list(one.served), "without": list(one.lacking)}
-            for one in built
-        ]
-        say_json({"preload": [one.path for one in built], "libraries": libraries})
-        return
-    for library in built:
-        say(plain(f"{library.path}: {len(library.served)} functions"))
-        for name in library.lacking:
-            say(plain(f"  without {name}: an FMU that calls it ends its process"))
-    line = preload_line([str(library.path) for library in built])
-    say(f"Put it into the task file, below [config]: {line}")
-    say(f'or into the config of a class: "preload": {line.removeprefix("preload = ")}')

@@ -7,6 +7,7 @@ import codecs
 import json
 import logging
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from fmugym.tools.simulation import Player, action_of, policy_of
 
 __all__ = [
     "HELP_OF_TASK",
+    "MINARI",
     "Commands",
     "add_command",
     "add_common",
@@ -36,6 +38,7 @@ __all__ = [
     "free_outputs",
     "note",
     "only_player",
+    "output_of",
     "players_of",
     "require_folder",
     "say",
@@ -52,14 +55,22 @@ Commands = Any
 HELP_OF_TASK: Final = "a task file, a registered id or module:Class"
 _CONTROLLER: Final = "a controller and its arguments: 'pid of=T setpoint=21 kp=0.5 ti=14400'"
 _ACTION: Final = "random, or the numbers of one action: 0.5,-1"
+MINARI: Final = "minari:"
+"""What the name of a dataset of Minari begins with, where files or FMUs may be named, too."""
+
 _FILES: Final = ("output", "plot")
-"""Options that name files to write."""
+"""Options that name files or folders to write."""
+
+_OF_TRAININGS: Final = ("agent.json", "evaluations.csv", "search.pkl", "training.json")
+"""Files by which a folder is known to be that of a training, so that ``--force`` replaces it."""
 
 EXAMPLES: Final = {
     "info": (
         "fmugym info model.fmu",
         "fmugym info --filter 'theta*' model.fmu",
         "fmugym info system.ssp --plot system.svg",
+        "fmugym info --repair model.fmu",
+        "fmugym info minari:swing/random-v0 --output episodes",
     ),
     "new": (
         "fmugym new model.fmu --output task.toml",
@@ -67,10 +78,12 @@ EXAMPLES: Final = {
     ),
     "validate": ("fmugym validate task.toml", "fmugym validate fmugym/Pendulum-v0 --json"),
     "simulate": (
-        "fmugym simulate task.toml",
-        "fmugym simulate task.toml --action 0.01 --episodes 2 --seed 3 --output run.csv",
+        "fmugym simulate task.toml --action 0.01 --episodes 2 --seed 3",
+        "fmugym simulate task.toml --output run.csv --variables 'q*' --variables tau --every 0.1",
         "fmugym simulate fmugym/House-v0 --scenario frost "
-        "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96",
+        "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96 --output frost.html",
+        "fmugym simulate house.toml --output minari:house/measured-v0 --log week.csv "
+        "--column pump_speed=u",
     ),
     "train": (
         "fmugym train examples/cart_pole.toml --output agent --minutes 0.1",
@@ -82,18 +95,8 @@ EXAMPLES: Final = {
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
-    "record": (
-        "fmugym record task.toml --output run.csv --variables 'q*' --variables tau --every 0.1",
-    ),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
-    "dataset": (
-        "fmugym dataset house/measured-v0 --task house.toml --log week.csv --column pump_speed=u",
-        "fmugym dataset swing/random-v0 --output episodes",
-    ),
     "demo": ("fmugym demo --output demo.png",),
-    "skeleton": ("fmugym skeleton model.fmu --output my_env.py",),
-    "stand-in": ("fmugym stand-in model.fmu --folder lib",),
-    "compile": ("fmugym compile model.fmu", "fmugym compile model.fmu --output here.fmu"),
 }
 """What ``--help`` shows of each command; a test finds these lines in the documents."""
 
@@ -126,10 +129,10 @@ def add_common(command: argparse.ArgumentParser) -> None:
     group.add_argument(
         "-v", "--verbose", action="store_true", help="show the log, and what FMUs print"
     )
-    files = [one.dest for one in command._actions if one.dest in _FILES and one.metavar == "FILE"]
+    files = [one.dest for one in command._actions if one.dest in _FILES]
     command.set_defaults(files=files)
     if files:
-        command.add_argument("--force", action="store_true", help="replace a file that exists")
+        command.add_argument("--force", action="store_true", help="replace what exists")
 
 
 def add_json(command: argparse.ArgumentParser) -> None:
@@ -227,6 +230,11 @@ def only_player(arguments: argparse.Namespace) -> Player:
     return next(iter(players.values()))
 
 
+def output_of(text: str) -> Path | str:
+    """A file to write; a text for a dataset of Minari."""
+    return text if text.startswith(MINARI) else Path(text)
+
+
 def check_numbers(arguments: argparse.Namespace, *names: str) -> None:
     """Refuse counts below 1 and seeds that are none.
 
@@ -282,28 +290,42 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
         ConfigError: If a file exists, or its folder does not.
     """
     old: dict[Path, Path] = {}
-    paths = list(_outputs_of(arguments))
+    paths = [] if getattr(arguments, "resume", False) else list(_outputs_of(arguments))
     for path in paths:
-        require_folder(path)
-        if path.is_file() and not arguments.force:
-            raise ConfigError(f"{path} exists; name a new file, or replace it with --force")
+        _require_free(path, arguments.force)
     try:
-        for path in filter(Path.is_file, paths):
+        for path in filter(_is_replaceable, paths):
             old[path] = path.rename(path.with_name(f".{path.name}.{os.getpid()}"))
         yield
     finally:
         for path, aside in old.items():
-            if path.exists():
-                aside.unlink()
-            else:
+            if not path.exists():
                 aside.rename(path)
+            elif aside.is_dir():
+                shutil.rmtree(aside)
+            else:
+                aside.unlink()
+
+
+def _require_free(path: Path, is_forced: bool) -> None:
+    if path.suffix:
+        require_folder(path)
+    if _is_replaceable(path) and not is_forced:
+        raise ConfigError(f"{path} exists; name a new one, or replace it with --force")
+
+
+def _is_replaceable(path: Path) -> bool:
+    """Whether it is a file, or the folder of a training; no other folder is ever removed."""
+    return path.is_file() or any((path / name).exists() for name in _OF_TRAININGS)
 
 
 def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
     """The files that a command will write."""
     for name in arguments.files:
         given = getattr(arguments, name)
-        for path in given if isinstance(given, list) else filter(None, [given]):
+        for path in given if isinstance(given, list) else [given]:
+            if not isinstance(path, Path):
+                continue
             yield path
             if path.suffix == ".c":
                 yield path.with_suffix(".h")

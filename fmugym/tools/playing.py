@@ -1,15 +1,15 @@
-"""The commands that play episodes: simulate, record, evaluate, bench."""
+"""The commands that play episodes: simulate, evaluate, bench."""
 
 from __future__ import annotations
 
 import argparse
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
-from fmugym.series import RecordSeries
+from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.evaluation import Score, each_score, plot_scores, table
 from fmugym.tools.options import (
     Commands,
@@ -19,7 +19,7 @@ from fmugym.tools.options import (
     add_players,
     add_task,
     check_numbers,
-    only_player,
+    output_of,
     players_of,
     say,
     say_json,
@@ -32,120 +32,89 @@ from fmugym.tools.simulation import Player, Summary, simulate
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
-__all__ = ["add_bench", "add_evaluate", "add_record", "add_simulate"]
+__all__ = ["add_bench", "add_evaluate", "add_simulate"]
 
 
 def add_simulate(commands: Commands) -> None:
     """Add ``simulate``."""
-    text = "play episodes with random or constant actions, a controller or an agent"
+    text = "play episodes, and write them to tables, pictures, reports or datasets"
     command = add_command(commands, "simulate", _simulate, text)
-    add_task(command)
-    add_players(command)
-    command.add_argument("--scenario", help="a scenario of the task file")
-    add_episodes(command, 1, 0)
-    command.add_argument("--output", type=Path, metavar="FILE", help="a new CSV file of all steps")
-    add_json(command)
-
-
-def _simulate(arguments: argparse.Namespace) -> None:
-    check_numbers(arguments, "episodes", "steps")
-    player, make_env = (
-        only_player(arguments),
-        maker_of(arguments.task, arguments.scenario, arguments.master),
-    )
-    seeds = range(arguments.seed, arguments.seed + arguments.episodes)
-    summaries: list[Summary] = []
-
-    def show() -> None:
-        if arguments.json:
-            say_json({"task": arguments.task, "episodes": [one.as_dict() for one in summaries]})
-
-    with shown_in_any_case(show), ExitStack() as stack:
-        env: Any = stack.enter_context(closing(player.make_env(make_env)))
-        policy = player.make_policy(env)
-        if arguments.output is not None:
-            env = stack.enter_context(closing(RecordSeries(env, path=arguments.output)))
-        total = _steps_of(env.unwrapped, arguments)
-        advance = stack.enter_context(progress(total, "simulate"))
-        for seed in seeds:
-            summaries.append(simulate(env, policy, seed, arguments.steps, advance))
-            if not arguments.json:
-                say(plain(summaries[-1].as_text()))
-
-
-def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
-    """How many steps the episodes take at most; None if only ``--steps`` limits them."""
-    limit = env.config.max_episode_steps
-    return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
-
-
-def add_record(commands: Commands) -> None:
-    """Add ``record``."""
-    text = "play episodes and write them to a table, a picture or a report"
-    command = add_command(commands, "record", _record, text)
     add_task(command)
     add_players(command)
     command.add_argument("--scenario", help="a scenario of the task file")
     add_episodes(command, 1, 0)
     command.add_argument(
         "--output",
-        type=Path,
+        type=output_of,
         action="append",
-        required=True,
+        default=[],
         metavar="FILE",
-        help="a new file: .csv, .parquet, .html (a report), .png, .svg or .pdf; more than once "
-        "for several",
+        help="a new file: .csv, .parquet, .html (a report), .png, .svg or .pdf, more than once "
+        "for several; or minari:NAME for a dataset",
     )
     command.add_argument(
         "--variables", action="append", metavar="GLOB", help="by default all names of the task"
     )
     command.add_argument("--every", type=float, metavar="SECONDS", help="between rows")
+    add_of_datasets(command)
     add_json(command)
 
 
-def _record(arguments: argparse.Namespace) -> None:
+def _simulate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
+    if dataset_of(arguments) is not None:
+        make_dataset(arguments)
+        return
     players = players_of(arguments)
     for path in arguments.output:
         require_format(path, len(players))
     recording = Recording(arguments.task, arguments.scenario, arguments.output)
-    summaries: dict[str, list[Summary]] = {name: [] for name in players}
+    runs: dict[str, list[Summary]] = {name: [] for name in players}
 
     def show() -> None:
         recording.finish(arguments.seed)
         if arguments.json:
-            runs = {name: [one.as_dict() for one in found] for name, found in summaries.items()}
-            say_json({"task": arguments.task, "output": arguments.output, "runs": runs})
+            told = {name: [one.as_dict() for one in found] for name, found in runs.items()}
+            only = {"episodes": next(iter(told.values()))} if len(told) == 1 else {}
+            say_json({"task": arguments.task, "output": arguments.output, "runs": told, **only})
 
     try:
         with shown_in_any_case(show):
             for name, player in players.items():
-                _record_one(arguments, recording, name, player, summaries[name])
+                _play(arguments, recording, name, player, runs)
     except FMUGymError:
         recording.finish(arguments.seed)
         raise
 
 
-def _record_one(
+def _play(
     arguments: argparse.Namespace,
     recording: Recording,
     name: str,
     player: Player,
-    summaries: list[Summary],
+    runs: dict[str, list[Summary]],
 ) -> None:
-    """Record the episodes of one who acts."""
+    """Play the episodes of one who acts."""
+    make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
+    label = f"{name}: " if len(runs) > 1 else ""
     with (
-        closing(
-            player.make_env(maker_of(arguments.task, arguments.scenario, arguments.master))
-        ) as env,
+        closing(player.make_env(make_env)) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
         policy = player.make_policy(env)
-        recorder = recording.begin(name, env, arguments.variables, arguments.every)
+        played: Any = env
+        if arguments.output:
+            played = recording.begin(name, env, arguments.variables, arguments.every)
         for seed in range(arguments.seed, arguments.seed + arguments.episodes):
-            summaries.append(simulate(recorder, policy, seed, arguments.steps, advance))
+            runs[name].append(simulate(played, policy, seed, arguments.steps, advance))
             if not arguments.json:
-                say(plain(f"{name}: {summaries[-1].as_text()}"))
+                say(plain(f"{label}{runs[name][-1].as_text()}"))
+
+
+def _steps_of(env: FMUEnv, arguments: argparse.Namespace) -> int | None:
+    """How many steps the episodes take at most; None if only ``--steps`` limits them."""
+    limit = env.config.max_episode_steps
+    return None if limit is None else min(limit, arguments.steps) * int(arguments.episodes)
 
 
 def add_evaluate(commands: Commands) -> None:

@@ -257,13 +257,13 @@ class Proposal:
         if not names:
             return
         are_there = all(((self._folder or Path()) / name).exists() for name in names)
-        yield "\n[config]"
-        yield f"# The FMU needs this: fmugym stand-in {plain(self._fmu.path.name)} builds it"
+        yield "\n[foreign]"
+        yield f"# The FMU needs this: fmugym info --repair {plain(self._fmu.path.name)} builds it"
         yield ("" if are_there else "# ") + preload_line([f"./{name}" for name in names])
 
 
 def preload_line(paths: Sequence[str]) -> str:
-    """The line that names libraries, for the table ``[config]`` of a task file."""
+    """The line that names libraries, for the table ``[foreign]`` of a task file."""
     return f"preload = [{', '.join(map(_quoted, paths))}]"
 
 

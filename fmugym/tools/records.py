@@ -1,4 +1,4 @@
-"""What ``fmugym record`` writes: tables, pictures, reports."""
+"""What ``fmugym simulate`` writes: tables, pictures, reports."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ from typing import Any
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
-from fmugym.declared.configuring import own_config
 from fmugym.declared.systems import fmu_of
 from fmugym.errors import ConfigError
 from fmugym.systems import FMUSystem
@@ -43,8 +42,8 @@ def _model_of(task: Task, master: str | None) -> FMU | FMUSystem:
     source = fmu_of(task, master)
     if isinstance(source, FMUSystem):
         return source
-    preload = own_config(task.root).get("preload", ())
-    return FMU(source, preload=[preload] if isinstance(preload, str) else preload)
+    preload = task.root.child("foreign").child("preload").value
+    return FMU(source, preload=preload or ())
 
 
 def open_model(path: Path) -> FMU:

@@ -19,7 +19,7 @@ from typing import Any, Final
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, reason, shown
+from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.scaling import can_be_scaled
 from fmugym.signals import ordinary
 from fmugym.tools.agents import (
@@ -173,7 +173,7 @@ def train(
         FileExistsError: If the folder exists, unless a training is resumed.
     """
     sb3 = imported_for_training("fmugym.sb3")
-    algorithm_of(plan.algorithm)
+    _check_arguments(plan)
     if resume:
         _require_same(plan)
     else:
@@ -209,6 +209,19 @@ def _recorder(plan: Plan, resume: bool) -> Callable[[FMUVectorEnv], Any]:
         return lambda envs: envs
     begin = latest_checkpoint(plan.folder)[1] if resume else 0
     return plan.diary.of_training(plan.folder, begin)
+
+
+def _check_arguments(plan: Plan) -> None:
+    """Refuse arguments that the algorithm does not have.
+
+    Raises:
+        ConfigError: With the nearest one.
+    """
+    known = inspect.signature(algorithm_of(plan.algorithm)).parameters
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in known.values())
+    for name in () if takes_any else plan.arguments or ():
+        if name not in known:
+            raise unknown_name(f"argument of {plan.algorithm}", name, known)
 
 
 def require_new(folder: Path, *unfinished: str) -> None:

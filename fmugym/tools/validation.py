@@ -254,7 +254,7 @@ def _of_repetition(env: FMUEnv, first: _Episode) -> Finding:
         "repetition",
         "the same seed gives another episode",
         "the FMU is not deterministic, or keeps something over a reset: try isolation = "
-        '"process" and reset_method = "process" under [config]',
+        '"process" under [config] and reset_method = "process" under [foreign]',
     )
 
 

@@ -82,7 +82,7 @@ def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim])
     told = ", ".join(sorted(map(str, taken))) or "none"
     advice = "; close environments that you no longer use" if taken else ""
     return (
-        f"{name} needs {count} more instance(s) for {purpose}, but config key 'max_instances' "
+        f"{name} needs {count} more instance(s) for {purpose}, but 'max_instances' of 'foreign' "
         f"allows {most} at once in this process, and of these are in use: {told}{advice}"
     )
 

@@ -1,0 +1,718 @@
+"""The keys of task files."""
+
+from __future__ import annotations
+
+import datetime
+import math
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.checks import check_flag, check_number, check_option, check_text, integer_of
+from fmugym.config import CONFIG, FOREIGN
+from fmugym.declared.expressions import Expression
+from fmugym.declared.quantities import duration
+from fmugym.declared.values import finite, number, number_or_distribution
+from fmugym.distributions import Choice, Normal, Uniform, is_distribution
+from fmugym.errors import ConfigError, shown
+from fmugym.keys import (
+    COUNT,
+    FLAG,
+    REQUIRED,
+    TEXT,
+    Either,
+    Entries,
+    Key,
+    Kind,
+    Listed,
+    Table,
+    option,
+    table_of,
+)
+from fmugym.pool.spec import SAMPLINGS
+from fmugym.systems.components import Component
+from fmugym.systems.wired import SYSTEM
+
+__all__ = ["AGENT", "DEVICE", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
+
+SCHEMA: Final = Path(__file__).parent / "task.schema.json"
+"""What the keys are, for editors; ``docs/_site/keys.py`` writes it."""
+
+VERSION: Final = 1
+"""The version of the format; it is raised when a key changes its meaning."""
+
+_DATE: Final = re.compile(r"(?:\d{4}-)?(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2}))?")
+_ANY_YEAR: Final = 2001  # without a leap day
+_DAY: Final = 86400.0
+_NORMALIZATIONS: Final = ("limits", "nominal")
+
+
+# What single values may be.
+
+
+def _within(read: Callable[[str, Any], float], **limits: Any) -> Callable[[str, Any], float]:
+    """A check of what another one reads, as in ``check_number``."""
+    return lambda what, value: check_number(what, read(what, value), **limits)
+
+
+def _probability(what: str, value: Any) -> float:
+    found = number(what, value)
+    if not 0 < found < 1:
+        raise ConfigError(f"{what}: expected a probability between 0 and 1, got {shown(value)}")
+    return found
+
+
+def _levels(what: str, value: Any) -> tuple[float, ...]:
+    values = tuple(_numbers(what, value).tolist())
+    if len(set(values)) < max(2, len(values)) or not all(map(math.isfinite, values)):
+        raise ConfigError(f"expected two or more different numbers, got {shown(value)}")
+    return values
+
+
+def _saturation(what: str, value: Any) -> tuple[float, float]:
+    limits = tuple(_numbers(what, value).tolist())
+    if len(limits) != 2 or not limits[0] < limits[1]:
+        raise ConfigError(
+            f"expected the lowest and the highest value, such as [0, 40], got {shown(value)}"
+        )
+    return limits
+
+
+def _bias(what: str, value: Any) -> Any:
+    found = number_or_distribution(what, value)
+    is_limited = isinstance(found, Normal) and math.isfinite(found.high - found.low)
+    if is_distribution(found) and (is_limited or not isinstance(found, Uniform | Normal)):
+        raise ConfigError(
+            "a bias is a number, or drawn from a uniform or normal distribution without limits, "
+            f"got {shown(found)}"
+        )
+    return found
+
+
+def _numbers(what: str, value: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if not isinstance(value, list | tuple):
+        raise ConfigError(f"{what} must be a list of numbers, got {shown(value)}")
+    if value and all(type(one) is float for one in value):
+        return np.array(value)  # long arrays take a while element by element
+    return np.array([number(what, one) for one in value], np.float64)
+
+
+def _moment(what: str, value: Any) -> float:
+    """Seconds since the beginning of a year of 365 days, of a duration or of a date."""
+    given = value
+    if isinstance(value, datetime.date):  # TOML has dates of its own
+        value = value.isoformat()[:16]
+    if not isinstance(value, str) or "-" not in value:
+        return duration(what, value)
+    match = _DATE.fullmatch(value)
+    month, day, hour, minute = map(int, match.groups(default="0")) if match else (0, 0, 0, 0)
+    try:
+        date = datetime.datetime(_ANY_YEAR, month, day, hour, minute)
+    except ValueError:
+        raise ConfigError(
+            f"expected a date such as '01-15' or '01-15 06:00', got {shown(given)}"
+        ) from None
+    return (date - datetime.datetime(_ANY_YEAR, 1, 1)).total_seconds()
+
+
+def _moments(what: str, value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return Choice([_moment(what, one) for one in value])
+    return _moment(what, value)
+
+
+def _normalization(what: str, value: Any) -> Any:
+    return (
+        check_option(what, value, _NORMALIZATIONS)
+        if isinstance(value, str)
+        else check_flag(what, value)
+    )
+
+
+def _version(what: str, value: Any) -> int:
+    if integer_of(value) != VERSION:
+        raise ConfigError(f"this fmugym reads version {VERSION} of the format, got {shown(value)}")
+    return VERSION
+
+
+def _column(what: str, value: Any) -> Any:
+    if isinstance(value, str) or integer_of(value) is not None:
+        return value
+    raise ConfigError(f"{what} must be a name or a number, got {shown(value)}")
+
+
+_NUMERIC: Final = {"title": "number", "type": ["number", "string", "boolean"]}
+_TIME: Final = {"title": "time", "type": ["number", "string"]}
+_DISTRIBUTION: Final = {
+    "type": "object",
+    "required": ["distribution"],
+    "properties": {"distribution": {"enum": ["uniform", "log_uniform", "normal", "choice"]}},
+}
+_DRAWN: Final = {"title": "number, distribution", "anyOf": [_NUMERIC, _DISTRIBUTION]}
+_NUMBERS: Final = {"title": "list of numbers", "type": "array", "items": _NUMERIC}
+_MOMENT: Final = {**_TIME, "title": "time, date"}
+
+ANYTHING: Final = Kind(lambda _, value: value, {"title": "anything"})
+NUMBER: Final = Kind(number, _NUMERIC)
+FINITE: Final = Kind(finite, _NUMERIC)
+POSITIVE: Final = Kind(_within(number, positive=True), {**_NUMERIC, "title": "positive number"})
+TIME: Final = Kind(duration, _TIME)
+POSITIVE_TIME: Final = Kind(_within(duration, positive=True), {**_TIME, "title": "positive time"})
+DEVIATION: Final = Kind(_within(number, minimum=0), {**_NUMERIC, "title": "number from 0 on"})
+EXPRESSION: Final = Kind(
+    lambda _, value: Expression.parse(value), {**_NUMERIC, "title": "expression"}
+)
+DRAWN: Final = Kind(number_or_distribution, _DRAWN)
+TIME_OR_DRAWN: Final = Kind(
+    partial(number_or_distribution, read=duration), {**_DRAWN, "title": "time, distribution"}
+)
+NUMBERS: Final = Kind(_numbers, _NUMBERS)
+NAMES: Final = Listed(TEXT, or_one=True)
+PATH: Final = Kind(check_text, {"title": "path", **TEXT.schema}, "path")
+CONTROLLER: Final = Kind(
+    lambda _, value: value, {"title": "text, number", "type": ["string", "number"]}
+)
+MOMENT: Final = Kind(_moment, _MOMENT)
+
+_LIMITS: Final = {
+    "min": Key(NUMBER, "Lower limit for the observation space.", None, "no limit"),
+    "max": Key(NUMBER, "Upper limit for the observation space.", None, "no limit"),
+}
+_DESCRIPTION: Final = {"description": Key(TEXT, "A text for people.")}
+
+
+# Variables.
+
+DEVICE: Final = {
+    "delay": Key(POSITIVE_TIME, "The value comes this late; a multiple of the time step."),
+    "bias": Key(
+        Kind(_bias, _DRAWN),
+        "This is added: a number, or one that is drawn in each episode from a uniform or normal "
+        "distribution.",
+    ),
+    "noise": Key(POSITIVE, "The standard deviation of normally distributed noise that is added."),
+    "saturation": Key(
+        Kind(_saturation, {**_NUMBERS, "title": "list of two numbers"}),
+        "The lowest and the highest value, such as `[0, 40]`.",
+    ),
+    "quantum": Key(POSITIVE, "The value is a multiple of this, as of a converter with few digits."),
+    "rate": Key(POSITIVE, "The value changes by at most this much in a second."),
+    "drop_out": Key(
+        Table(
+            {
+                "probability": Key(
+                    Kind(_probability, {**_NUMERIC, "title": "number between 0 and 1"}),
+                    "That there is no new value in a step.",
+                    REQUIRED,
+                ),
+                "value": Key(FINITE, "What comes instead.", None, "the value before"),
+            },
+            short="probability",
+        ),
+        "The probability that there is no new value in a step, and the one before holds. With "
+        "`{ probability = 0.1, value = -40 }`, this number comes instead.",
+    ),
+}
+"""The keys of sensors and actuators, in the order in which they take effect."""
+
+VARIABLE: Final = Table(
+    {
+        "name": Key(TEXT, 'Name in the FMU, such as `"zone[1].TAir"`.', None, "the alias"),
+        "unit": Key(
+            TEXT,
+            "Unit in the task. Observations, expressions, actions, `min`, `max` and parameters are "
+            "in this unit.",
+            None,
+            "the FMU's",
+        ),
+        "min": Key(
+            NUMBER,
+            "Lower limit for the spaces, and for the [range](config.md#ranges) of parameters and "
+            "start values. It clips nothing.",
+            None,
+            "the FMU's",
+        ),
+        "max": Key(NUMBER, "Upper limit, as `min`.", None, "the FMU's"),
+        "nominal": Key(
+            POSITIVE,
+            "The usual size of the values, for observations that are "
+            "[normalized](task-file.md#agent) by it.",
+            None,
+            "the FMU's",
+        ),
+        "levels": Key(
+            Kind(_levels, _NUMBERS),
+            "The values that an action chooses from. The agent's action space is then `Discrete` "
+            "or `MultiDiscrete`; [controllers](task-file.md#what-controllers-see-and-write) write "
+            "values.",
+        ),
+        "delta": Key(
+            POSITIVE,
+            "An action changes by at most this much in each step. The agent chooses the change "
+            "instead of the value.",
+        ),
+        "min_on": Key(
+            POSITIVE_TIME,
+            "The time that an action stays on (other than 0) at least. Until then the old value "
+            "stays.",
+        ),
+        "min_off": Key(POSITIVE_TIME, "The time that an action stays off at least."),
+        "sample": Key(
+            option(*SAMPLINGS),
+            "What a step gives of the values after each substep. The unit of an integral is that "
+            'of the variable times seconds: `"kWh"` for W.',
+            "last",
+        ),
+        **DEVICE,
+        **_DESCRIPTION,
+    }
+)
+
+
+# The agent.
+
+FORECAST: Final = Table(
+    {
+        "of": Key(NAMES, "Data, set points and expressions of `time`.", REQUIRED),
+        "horizon": Key(POSITIVE_TIME, "How far ahead the last value is.", REQUIRED),
+        "step": Key(POSITIVE_TIME, "Time from one value to the next.", None, "the time step"),
+        "error": Key(
+            Table(
+                {
+                    "std": Key(DEVIATION, "The standard deviation at the horizon.", 0.0),
+                    "bias": Key(
+                        DEVIATION,
+                        "The standard deviation, at the horizon, of an error that stays the same "
+                        "in an episode.",
+                        0.0,
+                    ),
+                    "growth": Key(
+                        option("sqrt", "linear", "none"),
+                        "How errors grow with the time ahead.",
+                        "sqrt",
+                    ),
+                    "relative": Key(
+                        FLAG, "Whether errors are parts of the value instead of differences.", False
+                    ),
+                },
+                short="std",
+            ),
+            "[Errors](task-file.md#errors-of-forecasts): the standard deviation at the horizon, or "
+            "a table.",
+        ),
+    }
+)
+
+HISTORY: Final = Table(
+    {
+        "of": Key(NAMES, "Variables, actions, data and schedules.", REQUIRED),
+        "length": Key(POSITIVE_TIME, "How far back the last value is.", REQUIRED),
+    }
+)
+
+AGENT: Final = Table(
+    {
+        "actions": Key(NAMES, "Variables that the agent writes.", REQUIRED),
+        "observations": Key(NAMES, "Variables, expressions, memory, data, set points.", REQUIRED),
+        "forecast": Key(
+            Listed(FORECAST, or_one=True),
+            '`{ of = ["price"], horizon = "24h", step = "1h", error = 0.1 }`: the values at later '
+            "times, of data, set points and expressions of `time`.",
+        ),
+        "history": Key(
+            HISTORY,
+            '`{ of = ["T", "u"], length = "2h" }`: the values before the present one, the latest '
+            "first. That of an action begins with the last action.",
+        ),
+        "rescale": Key(FLAG, "Whether actions go from -1 to 1 for `min` to `max`.", False),
+        "normalize": Key(
+            Kind(_normalization, {"enum": [False, True, "limits", "nominal"]}),
+            '`true` or `"limits"`: observations are mapped to -1 to 1 by `min` and `max`. '
+            '`"nominal"`: they are divided by their nominal value, or by the larger one of their '
+            "limits if there is none.",
+            False,
+        ),
+    }
+)
+
+
+# Data and set points.
+
+DATA: Final = Table(
+    {
+        "file": Key(
+            PATH,
+            "The file. Commas or semicolons separate cells of a CSV file. A file whose name ends "
+            "with `.parquet` needs the extra `parquet`. [Weather](task-file.md#weather) of "
+            "EnergyPlus and [tables of Modelica](task-file.md#tables-of-modelica) are known by "
+            "their first line.",
+        ),
+        "column": Key(
+            Kind(_column, {"title": "text, positive integer", "type": ["string", "integer"]}),
+            "The name of its column, or the number from 1 on.",
+        ),
+        "table": Key(
+            TEXT,
+            "The name of the table, in a file of Modelica with several.",
+            None,
+            "the only one",
+        ),
+        "time": Key(
+            TEXT,
+            "The column with the times: seconds, or dates such as `2023-12-31 15:00`, which count "
+            "from the beginning of the year.",
+            None,
+            "a column called time, datetime, timestamp or date",
+        ),
+        "values": Key(NUMBERS, "Values, instead of a file; in a dict, an array will do."),
+        "times": Key(NUMBERS, "Their times in seconds, unless there is a `step`."),
+        "step": Key(POSITIVE_TIME, "Time between rows, instead of a column with times."),
+        "period": Key(
+            TIME,
+            "Time after which the rows repeat.",
+            None,
+            "one more row than there are; [weather](task-file.md#weather): whole days; "
+            "[Modelica](task-file.md#tables-of-modelica): from the first to the last row",
+        ),
+        "interpolation": Key(
+            option("linear", "previous"),
+            'How values between rows are found; `"previous"`: a value holds until the next row.',
+            "linear",
+        ),
+        "unit": Key(TEXT, "Unit of the values."),
+        "input": Key(
+            TEXT,
+            "An input of the FMU that is set to the value at the beginning of each step, in its "
+            "own unit.",
+        ),
+        "min": Key(NUMBER, _LIMITS["min"].text, None, "that of the values"),
+        "max": Key(NUMBER, _LIMITS["max"].text, None, "that of the values"),
+    }
+)
+
+RAMP: Final = Table(
+    {
+        "from": Key(DRAWN, "The value before it.", REQUIRED),
+        "to": Key(DRAWN, "The value after it.", REQUIRED),
+        "begin": Key(TIME_OR_DRAWN, "When it begins, after the reset.", 0.0),
+        "duration": Key(TIME_OR_DRAWN, "How long it takes.", REQUIRED),
+    }
+)
+
+SINE: Final = Table(
+    {
+        "mean": Key(DRAWN, "The value in the middle.", 0.0),
+        "amplitude": Key(DRAWN, "The largest distance from it.", REQUIRED),
+        "period": Key(TIME_OR_DRAWN, "The time of an oscillation.", REQUIRED),
+        "phase": Key(DRAWN, "Where it begins, in radians.", 0.0),
+    }
+)
+
+STEPS: Final = Table(
+    {
+        "low": Key(NUMBER, "The lowest value.", REQUIRED),
+        "high": Key(NUMBER, "The highest value.", REQUIRED),
+        "every": Key(POSITIVE_TIME, "Time from one value to the next.", REQUIRED),
+    }
+)
+
+SETPOINT: Final = Table(
+    {
+        "value": Key(DRAWN, "Constant, or drawn if it is a distribution. `21` is short for this."),
+        "schedule": Key(
+            Entries(NUMBER),
+            '`{ "06:00" = 21, "22:00" = 17 }`: the values from these times of a day on.',
+        ),
+        "steps": Key(
+            STEPS, '`{ low = 18, high = 22, every = "2h" }`: a new random value now and then.'
+        ),
+        "ramp": Key(
+            RAMP,
+            '`{ from = 0, to = 1, begin = "1s", duration = "5s" }`: from one value to another, '
+            "over the time since the reset.",
+        ),
+        "sine": Key(
+            SINE,
+            '`{ mean = 0, amplitude = 1, period = "10s", phase = 0 }`: a sine over the time since '
+            "the reset.",
+        ),
+        "data": Key(TEXT, '`"profile"`: the values of data with this name, or of an expression.'),
+        "of": Key(TEXT, "What the set point is for; this makes the name of its deviation."),
+        **_LIMITS,
+    },
+    short="value",
+    one_of=("value", "schedule", "steps", "ramp", "sine", "data"),
+)
+
+
+# When episodes begin, and what acts before.
+
+
+SEASON: Final = Table(
+    {
+        "from": Key(MOMENT, "The first possible beginning.", REQUIRED),
+        "to": Key(MOMENT, "The last one.", REQUIRED),
+        "step": Key(POSITIVE_TIME, "Time from one to the next.", _DAY, '`"1d"`'),
+        "exclude": Key(
+            NAMES,
+            'Scenarios with which an episode shares no time; `"scenarios"` stands for all.',
+            (),
+            "none",
+        ),
+    }
+)
+
+_BEGIN: Final = Either(
+    SEASON,
+    Kind(
+        partial(number_or_distribution, read=_moments),
+        {
+            "title": "time, date, list of them, distribution",
+            "anyOf": [_MOMENT, _DISTRIBUTION, {"type": "array", "items": _MOMENT}],
+        },
+    ),
+)
+
+SCENARIO: Final = Table(
+    {
+        "start": Key(MOMENT, "When it begins.", REQUIRED),
+        "length": Key(TIME, "How long it is.", REQUIRED),
+        **_DESCRIPTION,
+    }
+)
+
+WARM_UP: Final = Table(
+    {
+        "period": Key(TIME, "The time, a multiple of the time step.", REQUIRED),
+        "controller": Key(
+            Either(Entries(CONTROLLER), CONTROLLER),
+            "A text as [on the command line](baselines.md#on-the-command-line), a name from "
+            '`controllers`, or a number. `"thermostat"` alone gives the highest action below the '
+            "set point and the lowest above it, if the task has one set point `of` something, or "
+            "one set point and one observed variable. With several actions, a table: "
+            '`{ u = "pid of=T setpoint=21 kp=0.5", v = 0 }`.',
+        ),
+        "cache": Key(
+            FLAG,
+            "Whether to keep the FMU's state after the warm-up, for later episodes that begin in "
+            "the same way. It is kept in memory, and on disk for later runs, where the FMU's "
+            "[states](planning.md#which-way-is-used) can be serialized.",
+            False,
+        ),
+    },
+    short="period",
+)
+
+
+# What is computed.
+
+
+def _named(**more: Key) -> Table:
+    """The table of a named expression, which an expression alone may stand for."""
+    expression = {"expr": Key(EXPRESSION, "The expression.", REQUIRED)}
+    return Table({**expression, **more}, short="expr")
+
+
+NAMED: Final = _named(**_LIMITS)
+
+REWARD: Final = _named(weight=Key(FINITE, "Factor of the reward.", 1.0))
+
+COST: Final = _named(limit=Key(NUMBER, "What the costs of an episode may add up to."))
+
+MEMORY: Final = Table(
+    {
+        "start": Key(DRAWN, "Set, or drawn, at each reset.", REQUIRED),
+        "update": Key(EXPRESSION, "The value after each step.", None, "it stays"),
+        **_LIMITS,
+    },
+    short="start",
+)
+
+KPI: Final = Table(
+    {
+        "sum": Key(EXPRESSION, "The sum of an expression over the steps."),
+        "mean": Key(EXPRESSION, "Its mean over the steps."),
+        "min": Key(EXPRESSION, "Its smallest value."),
+        "max": Key(EXPRESSION, "Its largest value."),
+        "last": Key(EXPRESSION, "Its value in the last step."),
+        "expr": Key(EXPRESSION, "An expression of other figures; it alone is short for this."),
+        **_DESCRIPTION,
+    },
+    short="expr",
+    one_of=("sum", "mean", "min", "max", "last", "expr"),
+)
+
+
+# Systems, the config, and all of a task.
+
+_VERSION_OF_FMI: Final = {"fmi_version": Key(TEXT, "Version of FMI of a bundled FMU.", "2.0")}
+
+BUNDLED: Final = Table(
+    {
+        "bundled": Key(TEXT, 'Name of an FMU of fmugym, such as `"Pendulum"`.', REQUIRED),
+        **_VERSION_OF_FMI,
+    }
+)
+_FMU: Final = Either(BUNDLED, PATH)
+
+COMPONENT: Final = Table(
+    {
+        **table_of(Component).keys,
+        "fmu": Key(_FMU, "Path of the FMU; it alone is short for this."),
+        "bundled": Key(TEXT, 'Or the name of an FMU of fmugym, such as `"House"`.'),
+        **_VERSION_OF_FMI,
+    },
+    short="fmu",
+    one_of=("fmu", "bundled"),
+)
+
+SYSTEM_OF_TASK: Final = Table(
+    {
+        **{n: one for n, one in SYSTEM.keys.items() if n not in {"start_time", "stop_time"}},
+        "components": Key(
+            Entries(COMPONENT),
+            'By name: the path of an FMU, `{ bundled = "House" }`, or a '
+            "[component](systems.md#connect-fmus).",
+            REQUIRED,
+        ),
+        "step_size": SYSTEM.keys["step_size"]._replace(kind=POSITIVE_TIME),
+    }
+)
+
+_OF_SECTIONS: Final = {
+    **dict.fromkeys(("time_step", "substeps", "warm_up", "start_time"), "it stands above [config]"),
+    "foreign": "give its keys in [foreign]",
+    "model_input_names": "name the inputs in 'actions' of [agent]",
+    "model_output_names": "name the outputs in 'observations' of [agent]",
+    "model_parameters": "give them in [parameters]",
+    "monitor_names": "a name in an expression is read from the FMU",
+    "samplings": "give variables the key 'sample' in [variables]",
+    "episode_variables": "give them in [memory] or [setpoints]",
+    "bounds": "give variables 'min' and 'max' in [variables]",
+    "max_episode_steps": "it follows from 'episode_length', which stands above [config]",
+    "positive_reward": "give an expression for 'reward'",
+    "negative_reward": "give an expression for 'reward'",
+}
+"""Keys of a config that other sections of a task determine, and how."""
+
+CONFIG_OF_TASK: Final = Table(
+    {n: one._replace(default=None) for n, one in CONFIG.keys.items() if n not in _OF_SECTIONS},
+    what="key of [config]",
+    elsewhere={name: f": {text}" for name, text in _OF_SECTIONS.items()},
+)
+
+TASK: Final = Table(
+    {
+        "version": Key(Kind(_version, {"const": VERSION}), "Version of this format.", VERSION),
+        "extends": Key(
+            PATH,
+            "Another task file. Its values hold where this file gives none; tables are merged.",
+        ),
+        **_DESCRIPTION,
+        "fmu": Key(
+            _FMU,
+            "Path of the FMU or of an [SSP archive](systems.md#ssp-archives), or "
+            '`{ bundled = "Pendulum", fmi_version = "2.0" }`. Required unless there is a `system`.',
+        ),
+        "system": Key(
+            SYSTEM_OF_TASK,
+            "In place of `fmu`: [a system of several FMUs](systems.md#in-a-task-file).",
+        ),
+        "class": Key(
+            Kind(ANYTHING.check, TEXT.schema),
+            "[A class](task-file.md#add-hooks-in-python) with hooks in Python, as "
+            '`"module:Class"`.',
+        ),
+        "arguments": Key(Entries(ANYTHING), "Arguments of that class."),
+        "time_step": Key(POSITIVE_TIME, "Length of a step.", None, "the FMU's"),
+        "substeps": Key(COUNT, "Number of communication steps in one step.", None, "`1`"),
+        "episode_length": Key(
+            TIME,
+            "Time after which an episode is truncated; a multiple of the time step.",
+            None,
+            "no limit",
+        ),
+        "warm_up": Key(
+            WARM_UP,
+            "Time simulated before the first observation, or a table that says [what acts in "
+            "it](task-file.md#warm-up).",
+            None,
+            "`0`",
+        ),
+        "start_time": Key(
+            _BEGIN,
+            "First communication point, [drawn or not](task-file.md#clock-and-scenarios).",
+            None,
+            "the FMU's",
+        ),
+        "clock": Key(
+            _BEGIN,
+            "The [time of data](task-file.md#clock-and-scenarios) at the beginning of an episode.",
+            None,
+            "the FMU's time",
+        ),
+        "scenarios": Key(
+            Entries(SCENARIO), "[Scenarios](task-file.md#clock-and-scenarios) by name."
+        ),
+        "variables": Key(Entries(VARIABLE), "[Variables](task-file.md#variables) by name."),
+        "parameters": Key(
+            Entries(ANYTHING),
+            "Start values and parameters: numbers, [distributions](config.md#distributions), items "
+            "of an Enumeration, texts.",
+        ),
+        "data": Key(
+            Entries(DATA),
+            "[Columns](task-file.md#data-and-set-points) of CSV and Parquet files, of "
+            "[weather](task-file.md#weather), of Modelica's tables, or lists of values, by name.",
+        ),
+        "setpoints": Key(Entries(SETPOINT), "[Set points](task-file.md#set-points) by name."),
+        "controllers": Key(
+            Entries(CONTROLLER),
+            "[Controllers](task-file.md#controllers) by name: what agents are compared with, for "
+            "the warm-up, and for `--controller` on the command line.",
+        ),
+        "inputs": Key(
+            Entries(EXPRESSION),
+            "Expressions that write other inputs of the FMU before each step, by input.",
+        ),
+        "memory": Key(
+            Entries(MEMORY), "Values that the [task remembers](task-file.md#memory), by name."
+        ),
+        "expressions": Key(
+            Entries(NAMED),
+            '[Expressions](task-file.md#expressions) by name: `error = "T - T_set"`, or '
+            '`{ expr = "...", min = ..., max = ... }`.',
+        ),
+        "agent": Key(
+            AGENT,
+            "What the [agent](task-file.md#agent) does and sees. Required unless there is a class.",
+        ),
+        "reward": Key(
+            Either(Entries(REWARD), EXPRESSION),
+            "An expression, or named ones that are [added up](task-file.md#rewards-and-costs). "
+            "Required unless a class has a reward of its own.",
+        ),
+        "costs": Key(Entries(COST), 'Expressions for `info["cost"]`, by name.'),
+        "kpis": Key(
+            Entries(KPI), "[Figures of an episode](task-file.md#figures-of-an-episode) by name."
+        ),
+        "terminated": Key(EXPRESSION, "A condition: the task has ended.", None, "never"),
+        "truncated": Key(
+            EXPRESSION,
+            "A condition: cut the episode short, in addition to `episode_length`.",
+            None,
+            "never",
+        ),
+        "foreign": Key(
+            Table(FOREIGN.keys), "[Keys for experts](foreign.md), about FMUs of unknown quality."
+        ),
+        "config": Key(
+            CONFIG_OF_TASK, "More keys of the [config](config.md#config-keys), such as `on_fault`."
+        ),
+    }
+)
+"""The keys of a task file."""
