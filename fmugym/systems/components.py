@@ -70,8 +70,7 @@ class Component(KnownArguments):
     steps: int = key(COUNT, "Communication steps of the component in one of the system.", 1)
     feedthrough: bool | None = key(
         Kind(_no_feedthrough, {"const": False}),
-        "`false`: [no output depends on an input](systems.md#order) without a "
-        "step in between.",
+        "`false`: [no output depends on an input](systems.md#order) without a step in between.",
         None,
         "as the FMU tells",
     )
