@@ -17,9 +17,11 @@ if sysconfig.get_config_var("Py_GIL_DISABLED"):
 
 native = Extension(
     "fmugym._native",
-    # native/worker is a program of its own, which fmugym.wine builds where it is needed
     sources=sorted(
-        str(path) for folder in (".", "python") for path in Path("native", folder).glob("*.c")
+        str(path)
+        for folder in (".", "python", "worker")
+        for path in Path("native", folder).glob("*.c")
+        if path.name != "main.c"  # of the worker program, which fmugym.wine builds
     ),
     depends=sorted(str(path) for path in Path("native").glob("**/*.h")),
     include_dirs=["native", np.get_include()],

@@ -19,8 +19,11 @@ MOST_REGISTERS: Final[int]
 def operations() -> tuple[str, ...]:
     """The operations of programs, in the order of their numbers."""
 
+Program = tuple[bytes, tuple[Array, ...]]
+"""The form of a program, and its rows; see ``Program.with_rows`` of ``fmugym.vector.hooks``."""
+
 def evaluate(
-    program: tuple[Any, ...],
+    program: Program,
     count: int,
     elements: int,
     actions: Array,
@@ -32,7 +35,7 @@ def evaluate(
     """Run a program on count environments outside of a step.
 
     Args:
-        program: See ``Program.with_rows``.
+        program: The program.
         count: The number of environments.
         elements: The number of elements of an action.
         actions: The actions, flat, environments first.
@@ -87,41 +90,40 @@ def echo_to(memory: Array, /) -> None:
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 
+def serve(channel: int, memory: int, /) -> None:
+    """Be a worker until the other end of the channel is closed; see ``native/worker``.
+
+    Args:
+        channel: The descriptor of a socket; on Windows its handle.
+        memory: The descriptor of the shared memory; not used on Windows.
+    """
+
+def end_with(parent: int, /) -> bool:
+    """Let the system end this process with its parent; returns whether the parent still lives.
+
+    Args:
+        parent: The parent's process number.
+    """
+
 @final
 class Access:
     """A list of variables of one FMI version.
 
     Args:
-        version: 1, 2 or 3.
-        types: One byte for each variable, the number of its C type; see ``fmi.h``.
-        elements: Of each the value reference, the place in its array and the size of this, as
-            bytes of native 32-bit integers.
-        rest: The values of the last of them, which are no part of the list but needed to set whole
-            arrays, as bytes of float64.
-        texts: The texts that Strings may get, each with its number, a float64, before and a zero
-            after it, by ascending numbers.
-        manner: How the FMU is run; see ``fmi.h``.
+        form: See ``fmugym.pool.form.form_of_listing``.
+
+    Raises:
+        ValueError: If the form is damaged.
     """
 
-    def __new__(
-        cls,
-        version: int,
-        types: bytes,
-        elements: bytes,
-        rest: bytes,
-        texts: bytes,
-        manner: int = 0,
-        /,
-    ) -> Access: ...
+    def __new__(cls, form: bytes, /) -> Access: ...
 
 @final
 class Draws:
     """The draws of an episode.
 
     Args:
-        table: For each, as int64, its kind, the row of the start value that it sets or -1, and the
-            place and the number of its numbers.
-        numbers: The numbers of all, as float64.
+        form: See ``fmugym.pool.form.form_of_draws``.
         standard_normal: The address of numpy's ``random_standard_normal``, or 0.
         exponential: The address of the function ``exp`` behind ``math.exp``, or 0.
 
@@ -129,9 +131,7 @@ class Draws:
         ValueError: If a kind is unknown or does not have the numbers that it needs.
     """
 
-    def __new__(
-        cls, table: bytes, numbers: bytes, standard_normal: int, exponential: int = ..., /
-    ) -> Draws: ...
+    def __new__(cls, form: bytes, standard_normal: int, exponential: int = ..., /) -> Draws: ...
     def take(self, states: Array, indices: Array, values: Array, /) -> None:
         """Draw an episode from each of M streams; ``given`` values stay.
 
@@ -144,58 +144,6 @@ class Draws:
 @final
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
-
-class Library(TypedDict):
-    """What the FMU is and how its instances are made."""
-
-    version: int
-    manner: int
-    model: bytes
-    token: bytes
-    resources: bytes
-    paths: tuple[bytes, ...]
-    private: bool
-    logging: bool
-    states: bool
-    categories: tuple[bytes, ...]
-    solving: tuple[Any, ...] | None
-    system: tuple[Any, ...] | None
-    structural_references: bytes
-    structural_values: bytes
-
-class Experiment(TypedDict):
-    """The times of an episode."""
-
-    start_time: float
-    stop_time: float | None
-    tolerance: float | None
-    time_step: float
-    substeps: int
-    warm_up_steps: int
-    retries: int
-    restores: bool
-    rebuilds: bool
-    reloads: bool
-    one_initialization: bool
-    records: bool
-    start_outputs: bytes | None
-
-class Variables(TypedDict):
-    """What is set and read in each step."""
-
-    inputs: Access
-    outputs: Access
-    num_observed: int
-    sampling: bytes
-
-class Arrays(TypedDict):
-    """The pool's own arrays; ``health`` is int64, see ``fmugym.pool.health``."""
-
-    inputs: Array
-    outputs: Array
-    statuses: Array
-    observations: Array
-    health: Array
 
 class Episodes(TypedDict):
     """See ``NativePool.prepare_play``."""
@@ -213,7 +161,15 @@ class Pool:
     Afterwards the messages of the FMU go to ``callback``. What that raises comes out of the method,
     whose work is done by then. The next call reports the other messages.
 
+    Args:
+        form: See ``fmugym.pool.form.form_of_pool``.
+        arrays: The pool's own: inputs, outputs, statuses, observations, and the counts of
+            ``fmugym.pool.health``, int64.
+        callback: Receives the number of an instance, the status, the category and the text of each
+            message.
+
     Raises:
+        ValueError: If the form is damaged.
         OSError: If the FMU cannot be loaded or instantiated.
         SimulationError: From all methods but ``close``, if the pool is closed.
         RuntimeError: If an FMU calls the pool that it is in.
@@ -221,14 +177,10 @@ class Pool:
 
     def __new__(
         cls,
-        *,
-        library: Library,
-        experiment: Experiment,
-        variables: Variables,
-        arrays: Arrays,
-        count: int,
-        threads: int,
+        form: bytes,
+        arrays: tuple[Array, Array, Array, Array, Array],
         callback: Callable[[int, int, str, str], object],
+        /,
     ) -> Pool: ...
     def step_own(self) -> int:
         """Step all with the pool's own inputs; writes the pool's own observations.
@@ -261,8 +213,8 @@ class Pool:
         *,
         start: Access,
         start_values: Array,
-        inputs: tuple[Any, ...],
-        judgement: tuple[Any, ...],
+        inputs: Program,
+        judgement: Program,
         actions: dict[str, Any],
         draws: Draws,
         states: Array,

@@ -8,13 +8,17 @@
 #include "floats.h"
 #include "platform.h"
 
+enum { LARGEST_GROUP = 1 << 28 }; /* values */
+
 static Atomic next_id;
 
-static bool are_sound(const char *types, const char *elements, size_t count) {
+/* Only what is listed may be the start time. */
+static bool are_sound(const char *types, const char *elements, size_t count, size_t listed) {
     for (size_t i = 0; i < count; i++) {
         Element element;
         memcpy(&element, elements + i * sizeof element, sizeof element);
-        if (!is_type((uint8_t)types[i]) || element.place >= element.size) {
+        if (!is_type((uint8_t)types[i]) || element.place >= element.size ||
+            (i >= listed && (uint8_t)types[i] == START_TIME)) {
             return false;
         }
     }
@@ -58,7 +62,7 @@ const char *listing_take(Listing *listing, Block types, Block elements, Block re
     if (!texts_are_sound(texts)) {
         return "the texts of a list of variables have no order, or do not end";
     }
-    return are_sound(types.bytes, elements.bytes, count)
+    return are_sound(types.bytes, elements.bytes, count, listing->count)
                ? NULL
                : "unknown C type, or a place outside an array";
 }
@@ -198,6 +202,26 @@ bool access_open(Access *access, const Fmi *fmi, const Listing *listing) {
     }
     access->direct = is_direct(access);
     access->width = width_of(access);
+    return true;
+}
+
+static bool are_within(const Part *part, size_t size) {
+    for (size_t i = 0; i < part->count; i++) {
+        if (part->places[i] >= size) {
+            return false;
+        }
+    }
+    return true;
+}
+
+bool access_is_sound(const Access *access) {
+    for (size_t i = 0; i < access->number_of_groups; i++) {
+        const Group *group = &access->groups[i];
+        if (group->size > LARGEST_GROUP || !are_within(&group->listed, group->size) ||
+            !are_within(&group->rest, group->size)) {
+            return false;
+        }
+    }
     return true;
 }
 

@@ -80,6 +80,8 @@ const char *listing_take(Listing *listing, Block types, Block elements, Block re
 /* Groups the variables by type, in the order in which the types first appear. The start time belongs
  * to no group. Returns whether there was enough memory. */
 bool access_open(Access *access, const Fmi *fmi, const Listing *listing);
+/* Whether all places are in the memory of their groups, which is of a sensible size. */
+bool access_is_sound(const Access *access);
 void access_close(Access *access);
 
 /* Whether the variables are scalars of type double, each in its place. */

@@ -41,7 +41,7 @@ def play(path, outputs, rows, step_size, start_values=None, **times):
 
 
 def played(fmu, spec, rows, start_values):
-    instance = FMPyInstance(fmu, spec, LOG, fmu.prepare_library())
+    instance = FMPyInstance(fmu, spec, LOG, fmu.prepare_libraries()[0])
     try:
         results = [as_floats(instance.reset(start_values))]
         for row in rows:

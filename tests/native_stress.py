@@ -30,6 +30,7 @@ from exchange_tools import exchange_fmu
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
+from fmugym.pool.form import form_of_draws, form_of_program
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.task.values import UNFILLED, LateDict
@@ -73,10 +74,11 @@ def programs(pool, variables):
         ("store_row", 1, 0, 4),
     )
     rows = pool.outputs[0], variables[0]
-    return (
-        (push, constants((0, 3.0)), b"", (pool.inputs[0],), (), 4, 0, ()),
-        (judge, constants((0, 0.2), (1, 0.0)), b"", rows, (), 7, 0, (5, 1, 4)),
+    pushing = form_of_program(push, constants((0, 3.0)), b"", (0,), (), 4, 0, ())
+    judging = form_of_program(
+        judge, constants((0, 0.2), (1, 0.0)), b"", (0, 1), (), 7, 0, (5, 1, 4)
     )
+    return (pushing, (pool.inputs[0],)), (judging, rows)
 
 
 DISCRETE = {
@@ -94,7 +96,7 @@ def draws(*rows):
     """Uniform numbers from [0, 1), one for each row of the start values."""
     kind = _native.distributions().index("uniform")
     table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
-    return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
+    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
 
 
 DRAWS = draws(0)

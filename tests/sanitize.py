@@ -3,8 +3,9 @@
     python tests/sanitize.py [--seconds 30] [--systems 100] [--only address thread]
 
 Builds the C extension with gcc's address and undefined-behaviour sanitizers, and with its thread
-sanitizer, each into a copy of the package, and runs ``native_stress.py`` and ``fuzz_systems.py`` on
-it. Needs gcc on Linux. Prints each finding; the exit status is 0 if there is none.
+sanitizer, each into a copy of the package, and runs ``native_stress.py``, ``fuzz_systems.py`` and
+``fuzz_forms.py`` on it. Needs gcc on Linux. Prints each finding; the exit status is 0 if there is
+none.
 """
 
 import argparse
@@ -73,8 +74,8 @@ def build(sanitizer, folder):
     command += ["-ffp-contract=off", "-fvisibility=hidden", "-DPy_LIMITED_API=0x030B0000"]
     folders = TOP / "native", sysconfig.get_path("include"), np.get_include()
     command += [f"-I{folder}" for folder in folders]
-    native = TOP / "native"  # its folder worker is a program of its own
-    command += [*map(str, sorted([*native.glob("*.c"), *native.glob("python/*.c")]))]
+    sources = (path for path in (TOP / "native").glob("**/*.c") if path.name != "main.c")
+    command += map(str, sorted(sources))
     command += ["-o", str(package / "_native.abi3.so"), "-lm", "-lpthread", "-ldl"]
     subprocess.run(command, check=True)
 
@@ -106,7 +107,8 @@ def runs(seconds, seeds, systems):
     for seed in range(seeds):
         stress = str(HERE / "native_stress.py"), str(seconds), str(seed)
         yield f"seed {seed}", (*stress, *(["python"] if seed % 2 else []))
-    yield "systems", (str(HERE / "fuzz_systems.py"), "--count", str(systems))
+    for what, count in (("systems", systems), ("forms", 10 * systems)):
+        yield what, (str(HERE / f"fuzz_{what}.py"), "--count", str(count))
 
 
 def check(name, seconds, seeds, systems):

@@ -18,8 +18,9 @@ from vector_tools import (
 )
 
 import fmugym
-from fmugym import ConfigError, FMUVectorEnv, SimulationError
-from fmugym.pool.around import PlayAround, _access
+from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
+from fmugym.pool.around import PlayAround
+from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 
 each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
@@ -228,7 +229,7 @@ def test_a_pool_without_a_library_steps_nothing(make):
         around._pool.step_one(0, {})
     before = envs.inside.pool.outputs.copy()
     assert around._pool.step_own() == 3
-    nothing = _access(())
+    nothing = _native.Access(form_of_listing(()))
     assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
     assert around._pool.read(nothing, np.zeros((0, 3))) == 0
     np.testing.assert_array_equal(envs.inside.pool.outputs, before)

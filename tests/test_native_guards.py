@@ -12,13 +12,14 @@ from process_tools import run_python
 from test_native_pool import LOG, make, on_linux
 
 import fmugym
-from fmugym import FMU, _native, bundled_fmu
+from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
+from fmugym.pool.form import form_of_draws, form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
-from fmugym.pool.settings import record_in
+from fmugym.pool.records import record_in
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
 
 
@@ -39,6 +40,13 @@ def misaligned(shape, dtype):
     return np.frombuffer(bytearray(size + 1), dtype, offset=1).reshape(shape)
 
 
+def counting_in(counts):
+    """A pool of one instance, which is elsewhere."""
+    form = form_of_programs(PoolSpec((), (), 0.1), 1, 1)
+    arrays = np.zeros((0, 1)), np.zeros((0, 1)), np.zeros(1, np.int8), np.zeros((1, 0), np.float32)
+    return _native.Pool(form, (*arrays, counts), print)
+
+
 class TestArrays:
     def test_inputs_at_any_address(self, cart_poles):
         cart_poles.step_into(misaligned((1, 6), np.float64))
@@ -49,24 +57,22 @@ class TestArrays:
             cart_poles.step_into(None, None, misaligned((6, 2), np.float32))
 
     def test_health_that_is_not_aligned(self):
-        fmu = FMU(bundled_fmu("CartPole"))
         counts = misaligned(no_counts(1).shape, np.int64)
         with pytest.raises(ValueError, match="health must begin at a multiple of 8 bytes"):
-            NativePool(fmu, PoolSpec((), (), 0.1), 1, LOG, counts=counts)
+            counting_in(counts)
 
     def test_an_item_size_that_its_format_does_not_have_everywhere(self):
         """A long has 4 bytes on Windows, and in the standard sizes of struct."""
         testbuffer = pytest.importorskip(
             "_testbuffer", reason="this Python was built without its test modules"
         )
-        fmu = FMU(bundled_fmu("CartPole"))
         names = no_counts(1).size
         flags = testbuffer.ND_WRITABLE
         counts = testbuffer.ndarray([0] * names, shape=[1, names], format="=l", flags=flags)
         with pytest.raises(
             TypeError, match="health must be an array of int64, not of type '=l' with 4 bytes"
         ):
-            NativePool(fmu, PoolSpec((), (), 0.1), 1, LOG, counts=counts)
+            counting_in(counts)
 
     def test_actions_that_are_not_aligned(self):
         with_these, with_others = (
@@ -126,6 +132,19 @@ class TestRecords:
             assert record_in(*many._form, state).inputs[:, 0].tolist() == own
         many.close()
 
+    def test_that_are_damaged_are_none(self, pool):
+        """In every byte: it is another record then, or none."""
+        (state,) = pool.save_states(np.zeros(1, np.int64), True)
+        told = 0
+        for place in range(len(state)):
+            damaged = bytearray(state)
+            damaged[place] ^= 0xFF
+            try:
+                record_in(*pool._form, bytes(damaged))
+            except SimulationError as error:
+                told += "damaged" in str(error)
+        assert told > 16
+
 
 class TestStates:
     @pytest.mark.parametrize("index", [2, -1, 2**40])
@@ -173,19 +192,19 @@ class TestStates:
 # Programs
 
 
-def program(*rows, results=(), registers=4, seen=0, slots=(), tables=(), **changes):
+def program(*code, rows=(), results=(), registers=4, seen=0, slots=(), tables=(), **changes):
     """A program with rows of operation, extra, register to write, and three operands."""
     parts = {
-        "code": np.array(rows, np.uint16).tobytes(),
+        "code": np.array(code, np.uint16).tobytes(),
         "constants": b"",
         "slots": np.array(list(slots), SLOT).tobytes(),
-        "rows": (),
+        "rows": range(len(rows)),
         "tables": tables,
         "registers": registers,
         "seen": seen,
         "results": results,
     }
-    return tuple((parts | changes).values())
+    return form_of_program(**(parts | changes)), tuple(rows)
 
 
 def operation(name, *rest):
@@ -223,7 +242,7 @@ def uniform_draws(*rows):
     """Uniform numbers from [0, 1), one for each row of the start values."""
     kind = _native.distributions().index("uniform")
     table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
-    return _native.Draws(table.tobytes(), np.array([0.0, 1.0]).tobytes(), 0)
+    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
 
 
 def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from fmugym.pool.form import form_of_program
 from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
@@ -20,16 +21,17 @@ def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), t
 
     lines = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in code]
     filled = [(np.float64(value).view("u8"), i, 8, 0) for i, value in enumerate(constants)]
-    parts = (
+    form = form_of_program(
         np.array(lines, np.uint16).tobytes(),
         np.array(filled, CONSTANT).tobytes(),
         np.array(list(slots), SLOT).tobytes(),
-        tuple(rows),
-        tuple(tables),
+        range(len(rows)),
+        tables,
         16,
         len(seen),
-        tuple(range(len(constants), len(constants) + len(results))),
+        range(len(constants), len(constants) + len(results)),
     )
+    parts = form, tuple(rows)
     return _native.evaluate(parts, len(actions), 1, actions, actions, tuple(results), tuple(seen))
 
 

@@ -111,12 +111,12 @@ class TestForks:
 PROGRAM = """
 import os, signal, sys, time
 import process_tools
-from fmugym.pool.process.launcher import _fork_server
+from fmugym.pool.process.launcher import _guard
 
 env = process_tools.FaultyEnv(sys.argv[1])
 env.reset()
 env.step([1.0])
-print(*env.inside.pool.processes(), _fork_server().pid, flush=True)
+print(*env.inside.pool.processes(), _guard().pid, flush=True)
 """
 
 
@@ -127,7 +127,7 @@ def program_that_ends(end):
 class TestEndOfParent:
     @pytest.fixture(name="start")
     def fixture_start(self, faulty, temp_root):
-        """Start a program; returns it and the numbers of its worker and of its fork server."""
+        """Start a program; returns it and the numbers of its worker and of its guard."""
         programs = []
 
         def start(end):
@@ -177,7 +177,7 @@ class TestEndOfParent:
         wait_until(lambda: not list(temp_root.iterdir()))
 
     @linux_only
-    def test_together_with_its_fork_server(self, start, temp_root):
+    def test_together_with_its_guard(self, start, temp_root):
         """Only the folder remains, until the next process that needs one."""
         program, pids = start("time.sleep(60)")
         os.kill(pids[-1], signal.SIGKILL)

@@ -9,9 +9,7 @@ import logging
 import os
 import pickle
 import signal
-import socket
 import subprocess
-import threading
 from pathlib import Path
 
 import gymnasium
@@ -37,11 +35,8 @@ from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
-from fmugym.pool.process.channel import Channel
-from fmugym.pool.process.launcher import _fork_server, _SpawnedProcess
+from fmugym.pool.process.launcher import _guard
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.process.shared_memory import Memory
-from fmugym.pool.process.worker import BlockWorker
 from fmugym.trial import opening
 
 LOG = logging.getLogger("fmugym.test")
@@ -282,19 +277,20 @@ class TestShortages:
 
     @pytest.mark.parametrize("left", range(5))
     def test_a_pool_without_descriptors(self, make_pool, left):
-        make_pool().close()  # the fork server is there
+        make_pool().close()  # the guard is there
         with no_descriptors_left(left), pytest.raises(FMULoadError, match="Too many open files"):
             make_pool(3, workers=3)
 
-    def test_no_process_can_be_forked(self, make_pool, faulty, monkeypatch):
-        """The fork server lives on, and so do its other workers."""
-        popen = subprocess.Popen
+    def test_no_process_can_be_forked(self, make_pool, faulty, monkeypatch, tmp_path):
+        """The guard lives on, and so do its other workers."""
+        popen, forking = subprocess.Popen, tmp_path / "forking.py"
+        forking.write_text(FORKS_BUT_THE_THIRD)
         monkeypatch.setattr(
             subprocess,
             "Popen",
-            lambda args, **options: popen([*args[:2], FORKS_BUT_THE_THIRD + args[2]], **options),
+            lambda args, **options: popen([*args[:3], str(forking), *args[3:]], **options),
         )
-        launcher._cached_fork_server.cache_clear()
+        launcher._cached_guard.cache_clear()
         pool = make_pool(2)
         set_up(pool, faulty, ["crash", "none"], at=1)
         assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
@@ -305,7 +301,7 @@ class TestShortages:
         assert statuses.tolist() == [Status.OK] * 2
         assert outputs[0].tolist() == [0.5, 1.5]
         pool.close()
-        launcher._cached_fork_server.cache_clear()
+        launcher._cached_guard.cache_clear()
 
     def test_no_temporary_folder(self, make_pool, monkeypatch, tmp_path):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
@@ -354,6 +350,9 @@ def limited(fork=os.fork, count=itertools.count(1)):
         raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
     return fork()
 os.fork = limited
+import runpy, sys
+sys.argv[:] = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
@@ -468,25 +467,12 @@ class TestPool:
         set_up(second, faulty, ["none"] * 3)
         assert step(second)[0][0].tolist() == [0.5] * 3
 
-    def test_without_its_fork_server(self, make_pool, faulty):
+    def test_without_its_guard(self, make_pool, faulty):
         pool = make_pool()
         set_up(pool, faulty, ["none"])
-        os.kill(_fork_server().pid, signal.SIGKILL)
+        os.kill(_guard().pid, signal.SIGKILL)
         wait_until(lambda: not any(map(is_alive, pool.processes())))
         assert step(pool)[1].tolist() == [Status.FATAL]
-        set_up(pool, faulty, ["none"])
-        assert step(pool)[1].tolist() == [Status.OK]
-
-    def test_spawned_where_there_is_no_fork(self, make_pool, faulty, monkeypatch):
-        monkeypatch.setattr(
-            "fmugym.pool.process.transport.launch",
-            lambda end, memory, *_: _SpawnedProcess(end, memory),
-        )
-        pool = make_pool()
-        set_up(pool, faulty, ["crash"], at=2)
-        assert step(pool)[0][0].tolist() == [0.5]
-        assert step(pool)[1].tolist() == [Status.FATAL]
-        assert "SIGSEGV in a step" in pool.failure(0)
         set_up(pool, faulty, ["none"])
         assert step(pool)[1].tolist() == [Status.OK]
 
@@ -504,35 +490,9 @@ class TestPool:
         assert [die() for _ in range(10)] == [first] * 10
 
 
-class WorkerThread:
-    """A worker in this process, which shows what it does to those who look at this process only."""
-
-    pid, sentinel = 0, None
-
-    def __init__(self, end, memory, folder, pipes):
-        self._end, self._memory = end.dup(), Memory(memory.size, os.dup(memory.descriptor))
-        worker = BlockWorker(Channel(self._end), self._memory)
-        self._thread = threading.Thread(target=worker.serve, daemon=True)
-        self._thread.start()
-
-    def kill(self):
-        with contextlib.suppress(OSError):
-            self._end.shutdown(socket.SHUT_RDWR)
-
-    def exit_status(self, patience):
-        self._thread.join()
-        self._end.close()
-        self._memory.close()
-        return 0
-
-    def forget(self):
-        pass
-
-
 @posix_only
-def test_a_worker_does_as_the_pool_that_it_has(make_pool, faulty, monkeypatch):
+def test_a_worker_does_as_a_pool_in_this_process(make_pool, faulty):
     here = make_pool(3, isolation="none")
-    monkeypatch.setattr("fmugym.pool.process.transport.launch", WorkerThread)
     pool = make_pool(3)
     with pytest.raises(SimulationError):
         pool.save()  # before the first reset

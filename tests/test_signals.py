@@ -129,7 +129,11 @@ def test_no_module_catches_what_handlers_raise_in_another_way():
     catch = r"(except (?!ordinary\()|suppress\()"
     wrong = re.compile(catch + r"[^:\n]*\b(Exception|OSError|TimeoutError)\b|except:")
     found = [path for path in package.rglob("*.py") if wrong.search(path.read_text("utf-8"))]
-    assert found == [package / "archive" / "loader.py"]  # which is run without the package, too
+    without_the_package = (
+        package / "archive" / "loader.py",
+        package / "pool" / "process" / "guard.py",
+    )
+    assert sorted(found) == sorted(without_the_package)
 
 
 # As users meet it

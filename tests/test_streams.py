@@ -9,6 +9,7 @@ from vector_tools import Drawing, each_way
 
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
+from fmugym.pool.form import form_of_draws
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.generators import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
@@ -280,13 +281,13 @@ class TestGuards:
         kind = row[0] if isinstance(row[0], int) else _native.distributions().index(row[0])
         table = np.array([kind, *row[1:]], np.int64)
         with pytest.raises(ValueError, match="numbers do not fit"):
-            _native.Draws(table.tobytes(), np.array(numbers).tobytes(), module._standard_normal())
+            _native.Draws(form_of_draws(table, numbers), module._standard_normal())
 
     def test_a_table_of_odd_length(self):
         from fmugym import _native
 
-        with pytest.raises(ValueError, match="numbers do not fit"):
-            _native.Draws(bytes(33), b"", 0)
+        with pytest.raises(ValueError, match="ends too early"):
+            _native.Draws(bytes(33), 0)
 
     def test_streams_that_do_not_exist(self):
         from fmugym import _native

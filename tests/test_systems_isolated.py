@@ -461,7 +461,7 @@ class TestChoice:
 
 @pytest.mark.skipif(not can_run_windows(), reason="Wine runs on Linux on x86_64 only")
 class TestLibrariesForWindows:
-    """A system with one is refused: Wine runs single FMUs."""
+    """A system runs in one process, in Wine or outside."""
 
     @pytest.fixture(name="windows")
     def for_windows(self, tmp_path):
@@ -472,12 +472,17 @@ class TestLibrariesForWindows:
         with pytest.raises(FMULoadError, match=r"Windows only are 'a', .*'b'.*'a' for Linux"):
             Chain(chain(windows))
 
-    def test_so_is_a_system_of_them_alone(self, windows):
-        both = FMUSystem({"a": windows, "b": windows})
-        with pytest.raises(FMULoadError, match="Windows only are 'a', 'b'"):
-            both.as_fmu().extract()
-        with pytest.raises(FMULoadError, match="Windows only are 'a', 'b'"):
-            fmugym.linearize(both)
+    def test_a_system_of_them_alone_runs_in_wine(self, windows, monkeypatch):
+        monkeypatch.setattr("fmugym.archive.fmu.obstacle_to_wine", lambda: "")
+        fmu = FMUSystem({"a": windows, "b": windows}).as_fmu()
+        assert fmu.in_wine
+        assert not fmu.obstacles
+
+    def test_what_wine_lacks_is_told_for_each(self, windows, monkeypatch):
+        monkeypatch.setattr("fmugym.archive.fmu.obstacle_to_wine", lambda: "install Wine")
+        obstacles = FMUSystem({"a": windows, "b": windows}).as_fmu().obstacles
+        assert ["'a'" in obstacles[0], "'b'" in obstacles[1]] == [True, True]
+        assert all("install Wine" in text for text in obstacles)
 
     def test_info_says_so(self, windows, tmp_path, capsys):
         archive = ssp_tools.write(chain(windows), tmp_path / "chain.ssp")
@@ -490,5 +495,6 @@ class TestLibrariesForWindows:
     def test_source_code_is_a_cure(self, tmp_path):
         library = {"binaries/win64/Model.dll": b"MZ"}
         source = source_tools.write_source_fmu(tmp_path / "of code.fmu", 2, library)
-        (obstacle,) = FMUSystem({"a": source}).as_fmu().obstacles
+        mixed = FMUSystem({"a": source, "b": bundled_fmu("Pendulum")})
+        (obstacle,) = mixed.as_fmu().obstacles
         assert "fmugym info --repair 'of code.fmu'" in obstacle

@@ -16,6 +16,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import exchange_tools
 import numpy as np
 import pytest
 from fmu_tools import PlainEnv, edited_fmu, probe_config, read_fmu, write_fmu
@@ -26,14 +27,15 @@ from wine_tools import exchange_fmu, for_windows
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, FMUSystem, SimulationError, bundled_fmu
-from fmugym.pool.process.channel import Channel, Code
+from fmugym.pool.process.channel import Channel
+from fmugym.pool.process.output import Output
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.requests import Request
 from fmugym.pool.process.shared_memory import Memory, make_bell, size_for
-from fmugym.pool.process.windows import REQUESTS
-from fmugym.pool.process.worker import BlockWorker
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools import cli
 from fmugym.trial import opening
+from fmugym.vector import episodes
 from fmugym.wine import program
 from fmugym.wine.loader import can_run_windows, windows_path, windows_uri
 
@@ -117,7 +119,7 @@ class TestChoice:
     def test_this_process_cannot_load_it(self, cart_pole):
         fmu = FMU(cart_pole)
         with pytest.raises(FMULoadError, match="Wine"):
-            fmu.prepare_library()
+            fmu.prepare_libraries()
         fmu.close()
 
 
@@ -130,10 +132,6 @@ class TestPaths:
 
 
 class TestProgram:
-    def test_it_answers_what_a_worker_of_python_answers(self):
-        methods = {name for name in vars(BlockWorker) if not name.startswith("_")}
-        assert set(REQUESTS) == methods - {"open", "serve", "roll_out"}
-
     def test_its_sources_fit_the_native_pool(self, tmp_path):
         """Without Wine, too: what they use of the native pool is there."""
         for path in program.sources():
@@ -211,10 +209,10 @@ class TestBell:
 
     def test_it_rings_once_after_each_message(self, opened):
         ends = opened(self.Ends())
-        channel = Channel(ends, bell=ends.rung)
-        channel.send_code(Code.STEP)
-        channel.send_object(Code.REQUEST, ("read", ()))
-        channel.send_code(Code.STEP)
+        channel = Channel(ends, None, Output(), ends.rung)
+        channel.send(Request.STEP)
+        channel.send(Request.READ, bytes(8))
+        channel.send(Request.STEP)
         assert ends.rung_before == [0, 1, 2]
         assert ends.rung[0] == 3
 
@@ -451,6 +449,38 @@ class TestInWine:
             outputs, statuses = pool.step()
             assert not statuses.any()
         np.testing.assert_allclose(outputs[0], np.exp([-1.0, -2.0]), rtol=1e-6)
+
+    def test_a_system(self, tmp_path, opened):
+        """Its components run in one process, as they do outside of Wine."""
+        files = [exchange_fmu(tmp_path / "Model.fmu", "dahlquist", 2), bundled_fmu("Pendulum")]
+        windows = [files[0], for_windows(files[1], tmp_path)]
+        rows = []
+        for decay, pendulum in (
+            windows,
+            [exchange_tools.exchange_fmu(tmp_path / "Here.fmu", "dahlquist"), files[1]],
+        ):
+            both = FMUSystem({"decay": decay, "pendulum": pendulum}, ["decay.x -> pendulum.tau"])
+            fmu = both.as_fmu()
+            spec = PoolSpec((), (fmu.variable("decay.x"), fmu.variable("pendulum.theta")), 0.05)
+            pool = opened(opening.make_pool(fmu, spec, 3, LOG))
+            pool.reset((fmu.variable("decay.k"),), np.array([[0.5, 1.0, 2.0]]))
+            for _ in range(20):
+                outputs, statuses = pool.step()
+                assert not statuses.any(), pool.failure(0)
+            rows.append(outputs.copy())
+        np.testing.assert_allclose(rows[0], rows[1], rtol=1e-6, atol=1e-9)
+        assert abs(rows[0][0, 1] - np.exp(-1.0)) < 1e-5
+
+    def test_rollouts_are_steps_in_the_worker(self, cart_pole, opened, monkeypatch):
+        """To the last bit, and nothing goes step by step through this process."""
+        envs = opened(fmugym.FMUVectorEnv(partial(ForcedCartPole, cart_pole), 3, workers=2))
+        envs.reset(seed=4)
+        monkeypatch.setattr(episodes, "roll_out_by_steps", None)
+        actions = np.full((3, 5, 1), 2.0, np.float32)
+        rolled = envs.rollout(None, actions)
+        for step in range(5):
+            rows = envs.step(actions[:, step])[0]
+            np.testing.assert_array_equal(rolled.observations[:, step], rows)
 
     def test_a_worker_whose_fmu_leaks_is_replaced(self, faulty, opened):
         fmu = FMU(faulty)

@@ -31,6 +31,7 @@ SLOW_MODULES = {
     "test_export_search",
     "test_fuzz",
     "test_fuzz_face",
+    "test_fuzz_forms",
     "test_fuzz_hooks",
     "test_fuzz_signals",
     "test_fuzz_systems",

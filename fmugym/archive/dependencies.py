@@ -99,13 +99,13 @@ def stray_libraries(library: Path) -> list[Path]:
         library: The FMU's library, extracted.
 
     Returns:
-        Their paths, in the order in which they are to be loaded before the FMU's library. Empty on
-        systems other than Linux.
+        Their paths, in the order in which they are to be loaded before the FMU's library, unless
+        the loader finds others of the same name. Empty on systems other than Linux.
     """
     if sys.platform != "linux":
         return []
-    stray = [needed for needed in _needed(library) if needed.path and not needed.found]
-    return [needed.path for needed in reversed(stray) if needed.path and loader.ask([needed.name])]
+    stray = [needed.path for needed in _needed(library) if needed.path and not needed.found]
+    return stray[::-1]
 
 
 def libraries_of(library: Path) -> list[Path]:

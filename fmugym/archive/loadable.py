@@ -7,12 +7,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import fmpy
 
+from fmugym.archive import loader
 from fmugym.archive.bundled import is_bundled
-from fmugym.archive.dependencies import load_globally, missing_libraries, stray_libraries
+from fmugym.archive.dependencies import (
+    ask_in_a_child,
+    load_globally,
+    missing_libraries,
+    stray_libraries,
+)
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.missing import describe_missing
 from fmugym.errors import FMULoadError
@@ -60,15 +67,76 @@ class LoadableFMU(ABC):
         """Whether it comes with the package."""
         return all(part.bundled for part in self.parts) if self.parts else is_bundled(self.path)
 
-    def prepare_libraries(self) -> list[Path]:
-        """Make the libraries of all parts ready; see ``prepare_library``.
+    def libraries_in(self, folder: Path) -> list[tuple[LoadableFMU, Path]]:
+        """The FMUs of a system, or this one, and their libraries in a folder like ``extract``'s."""
+        if not self.parts:
+            return [(self, folder / self.library)]
+        return [
+            (part, folder / str(number) / part.library) for number, part in enumerate(self.parts)
+        ]
+
+    def libraries_before(self, folder: Path) -> list[tuple[str, str]]:
+        """The libraries to load before those of the FMUs.
+
+        Args:
+            folder: As for ``libraries_in``.
 
         Returns:
-            Their paths; one where there are no parts.
+            Names and paths, in the order in which they are to be loaded: those of ``preload``
+            without a name, and those that an FMU brings along where the loader does not look. Such
+            a one is loaded only if the loader finds none of its name.
         """
-        if not self.parts:
-            return [self.prepare_library()]
-        return [part.prepare_library() for part in self.parts]
+        return [
+            before
+            for fmu, library in self.libraries_in(folder)
+            for before in (
+                *(("", path) for path in fmu.preload),
+                *((path.name, str(path)) for path in stray_libraries(library)),
+            )
+        ]
+
+    def require_libraries(
+        self, folder: Path, ask: Callable[[Sequence[str]], list[str]] = ask_in_a_child
+    ) -> None:
+        """Require that the loader finds all libraries that those of the FMUs need.
+
+        Args:
+            folder: As for ``libraries_in``.
+            ask: See ``missing_libraries``.
+
+        Raises:
+            FMULoadError: If others are missing, or one that the FMU brings along is cut short.
+        """
+        for fmu, library in self.libraries_in(folder):
+            missing = missing_libraries(library, fmu.preload, ask)
+            if missing:
+                raise FMULoadError(describe_missing(fmu.path.name, missing))
+
+    def prepare_libraries(self) -> list[Path]:
+        """Make the libraries of all FMUs ready to be loaded into this process.
+
+        Loads those that are to be loaded before, and finds out which others are missing.
+
+        Returns:
+            Their paths, in the folder of ``extract``; one where there are no parts.
+
+        Raises:
+            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
+                are missing; or if it is a library for Windows, which needs a process in Wine.
+        """
+        if self.in_wine:
+            raise FMULoadError(
+                f"{self.path.name} has no library for this platform. Environments run its library "
+                "for Windows in worker processes in Wine, but this process cannot load it"
+            )
+        folder = self.extract()
+        for path in {path: None for fmu, _ in self.libraries_in(folder) for path in fmu.preload}:
+            load_globally(path)
+        self.require_libraries(folder, loader.ask)
+        for name, path in self.libraries_before(folder):
+            if name and loader.ask([name]):
+                load_globally(path)
+        return [library for _, library in self.libraries_in(folder)]
 
     @property
     def platform(self) -> str:
@@ -91,34 +159,6 @@ class LoadableFMU(ABC):
     def close(self) -> None:
         """Remove what ``extract`` has made; more than one call is fine."""
 
-    def prepare_library(self) -> Path:
-        """Make the FMU's library ready to be loaded into this process.
-
-        Loads the libraries of ``preload`` and those that the FMU brings along where the loader
-        does not look, and finds out which others are missing.
-
-        Returns:
-            The path of the library, in the folder of ``extract``.
-
-        Raises:
-            FMULoadError: As ``extract``; or if one of these libraries cannot be loaded, or others
-                are missing; or if it is a library for Windows, which needs a process in Wine.
-        """
-        if self.in_wine:
-            raise FMULoadError(
-                f"{self.path.name} has no library for this platform. Environments run its library "
-                "for Windows in worker processes in Wine, but this process cannot load it"
-            )
-        library = self.extract() / self.library
-        for path in self.preload:
-            load_globally(path)
-        missing = missing_libraries(library, self.preload)
-        if missing:
-            raise FMULoadError(describe_missing(self.path.name, missing))
-        for stray in stray_libraries(library):
-            load_globally(str(stray))
-        return library
-
 
 class ExtractedFMU(LoadableFMU):
     """An FMU in a folder that somebody else owns, and that stays when this object is closed.
@@ -128,13 +168,20 @@ class ExtractedFMU(LoadableFMU):
         description: The model description.
         preload: See ``LoadableFMU``.
         folder: The folder.
+        in_wine: See ``LoadableFMU``.
     """
 
     def __init__(
-        self, path: Path, description: ModelDescription, preload: tuple[str, ...], folder: Path
+        self,
+        path: Path,
+        description: ModelDescription,
+        preload: tuple[str, ...],
+        folder: Path,
+        *,
+        in_wine: bool = False,
     ) -> None:
         super().__init__(path, description, preload)
-        self._folder = folder
+        self._folder, self.in_wine = folder, in_wine
 
     def extract(self) -> Path:
         """Return the folder."""

@@ -7,36 +7,16 @@ with others. A native pool runs them that has no FMU of its own.
 from __future__ import annotations
 
 import logging
-from typing import Any, cast
+from typing import Any
 
 from fmugym import _native
 from fmugym.archive.variable import Variable
 from fmugym.pool.base import Play, Pool, PoolSpec, available_processors
+from fmugym.pool.form import form_of_listing, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import prepare
-from fmugym.pool.settings import experiment_settings, listing, variable_settings
 
 __all__ = ["PlayAround"]
-
-_VERSION, _MANNER = 2, 0
-"""Of functions that are never called."""
-
-_NO_LIBRARY: _native.Library = {
-    "version": _VERSION,
-    "manner": _MANNER,
-    "model": b"",
-    "token": b"",
-    "resources": b"",
-    "paths": (),
-    "private": False,
-    "logging": False,
-    "states": False,
-    "categories": (),
-    "solving": None,
-    "system": None,
-    "structural_references": b"",
-    "structural_values": b"",
-}
 
 
 class PlayAround:
@@ -48,31 +28,15 @@ class PlayAround:
     """
 
     def __init__(self, pool: Pool, spec: PoolSpec) -> None:
-        accesses = {"inputs": _access(spec.inputs), "outputs": _access(spec.outputs)}
-        self._pool = _native.Pool(
-            library=_NO_LIBRARY,
-            experiment=cast("_native.Experiment", experiment_settings(spec)),
-            variables=cast("_native.Variables", variable_settings(spec) | accesses),
-            arrays={
-                "inputs": pool.inputs,
-                "outputs": pool.outputs,
-                "statuses": pool.statuses,
-                "observations": pool.observations,
-                "health": no_counts(pool.num_instances),
-            },
-            count=pool.num_instances,
-            threads=available_processors(),
-            callback=_ignore,
-        )
+        count = pool.num_instances
+        form = form_of_programs(spec, count, available_processors())
+        own = pool.inputs, pool.outputs, pool.statuses, pool.observations, no_counts(count)
+        self._pool = _native.Pool(form, own, _ignore)
 
     def prepare(self, variables: tuple[Variable, ...], *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
-        prepare(self._pool, _access(variables), *parts)
+        prepare(self._pool, _native.Access(form_of_listing(variables)), *parts)
         return Play(self._pool.play_before, self._pool.play_after)
-
-
-def _access(variables: tuple[Variable, ...]) -> _native.Access:
-    return _native.Access(_VERSION, *listing(variables, _VERSION), _MANNER)
 
 
 def _ignore(index: int, status: int, category: str, message: str) -> None:

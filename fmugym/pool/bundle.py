@@ -12,12 +12,22 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Bundle", "Copies", "Head", "SaveMethod", "ended_state", "head_of", "outputs_of"]
+__all__ = [
+    "SIZE_OF_HEAD",
+    "Bundle",
+    "Copies",
+    "Head",
+    "SaveMethod",
+    "ended_state",
+    "head_of",
+    "outputs_of",
+]
 
 FloatArray = npt.NDArray[np.float64]
 IndexArray = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<qqdqq")
+SIZE_OF_HEAD: Final = _HEAD.size
 _ENDED: Final = 0
 _RECORD: Final = 2
 """Kinds of states. The C extension makes these; see ``native/states.h``."""

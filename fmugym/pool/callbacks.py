@@ -23,7 +23,7 @@ class Receiver:
         first: The number of the first instance.
     """
 
-    def __init__(self, log: logging.Logger, description: ModelDescription, first: int) -> None:
+    def __init__(self, log: logging.Logger, description: ModelDescription, first: int = 0) -> None:
         self._log, self._model, self._first_index = log, description.model_identifier, first
         self._parts = [""]
         if isinstance(description, SystemDescription):
@@ -31,7 +31,19 @@ class Receiver:
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         """Log a message of an instance, or of a component of one."""
+        level, text = self._record(index, status, category, message)
+        self._log.log(level, "%s", text)
+
+    def text_of(self, index: int, status: int, category: str, message: str) -> str:
+        """The text that is logged for a message."""
+        return self._record(index, status, category, message)[1]
+
+    @property
+    def sources(self) -> int:
+        """How many sources of messages an instance has: its components, or itself."""
+        return len(self._parts)
+
+    def _record(self, index: int, status: int, category: str, message: str) -> tuple[int, str]:
         instance, part = divmod(index, len(self._parts))
         name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
-        level, text = as_record(name, status, category, message)
-        self._log.log(level, "%s", text)
+        return as_record(name, status, category, message)

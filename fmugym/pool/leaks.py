@@ -22,7 +22,7 @@ from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray
 from fmugym.pool.memory import grown_bytes, heap_bytes, memory_is_known
 
-__all__ = ["LeakWatch", "ProcessGrowth", "watch_leaks"]
+__all__ = ["LeakWatch", "watch_leaks"]
 
 _FIRST_RESETS: Final = 4
 """Of each instance; what they take is no leak: FMUs allocate, and initial states are kept."""
@@ -132,27 +132,6 @@ class LeakWatch:
                 self._name,
                 lost / 2**20,
             )
-
-
-class ProcessGrowth:
-    """By how much a process has grown that does nothing but run FMUs.
-
-    Args:
-        num_instances: How many.
-    """
-
-    def __init__(self, num_instances: int) -> None:
-        self._first = _FIRST_RESETS * num_instances
-        self._base: int | None = None
-
-    def after(self, resets: int) -> int:
-        """Take notice of so many more resets; returns the growth in bytes."""
-        if not memory_is_known():
-            return 0
-        self._first -= resets
-        if self._base is None and self._first <= 0:
-            self._base = grown_bytes()
-        return 0 if self._base is None else grown_bytes() - self._base
 
 
 def watch_leaks(

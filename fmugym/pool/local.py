@@ -6,7 +6,6 @@ import logging
 
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.attendant import Attendant
-from fmugym.pool.health import HealthArray
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.saving import SavingPool
@@ -24,9 +23,6 @@ def local_pool(
     *,
     threads: int | None = None,
     private_libraries: bool | None = False,
-    first_index: int = 0,
-    counts: HealthArray | None = None,
-    attended: bool = True,
 ) -> SavingPool:
     """Make a pool that loads the FMU into this process.
 
@@ -37,9 +33,6 @@ def local_pool(
         log: The logger that gets the FMU's messages.
         threads: See ``NativePool``.
         private_libraries: See ``NativePool``.
-        first_index: See ``NativePool``.
-        counts: See ``NativePool``.
-        attended: Whether an ``Attendant`` goes with resets where one is needed.
 
     Raises:
         LicenceError: If the FMU gets no licence.
@@ -55,9 +48,7 @@ def local_pool(
         log,
         threads=threads,
         private_libraries=private_libraries,
-        first_index=first_index,
-        counts=counts,
     )
-    pool.attend(Attendant.of(fmu.path.name, spec, log) if attended else None)
+    pool.attend(Attendant.of(fmu.path.name, spec, log))
     announce(STEP)
     return pool

@@ -15,18 +15,16 @@ from __future__ import annotations
 import logging
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, ParamSpec, TypeVar, cast
+from typing import Any, Final, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.description import ModelDescription
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
-from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -38,26 +36,15 @@ from fmugym.pool.base import (
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.callbacks import Receiver
+from fmugym.pool.derivatives import Question, Variables, differentiated
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.health import HealthArray, no_counts
+from fmugym.pool.form import Files, form_of_listing, form_of_pool, manner_of, table_of
+from fmugym.pool.health import no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
 from fmugym.pool.saving import SavingPool, keeps_records
-from fmugym.pool.settings import (
-    PlaceOfFMU,
-    experiment_settings,
-    library_settings,
-    listing,
-    manner_of,
-    solving_settings,
-    table_of,
-    variable_settings,
-)
-from fmugym.pool.systems import system_settings
 from fmugym.signals import ordinary
-from fmugym.systems.description import SystemDescription
-from fmugym.systems.layout import Layout
 
 __all__ = ["NativePool", "prepare"]
 
@@ -66,7 +53,6 @@ _MOST_CACHED: Final = 64
 ask_for_texts(_native.text_with)
 
 FloatArray32 = npt.NDArray[np.float32]
-Variables = tuple[Variable, ...]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -85,8 +71,6 @@ class NativePool(SavingPool):
         private_libraries: Whether each instance gets a private copy of the FMU's library, and so
             of its global variables. By default only if the FMU says that it can be
             instantiated only once per process. See ``fmugym.trial.neighbours``.
-        first_index: The number of the first instance in messages.
-        counts: The memory for the counters of ``health``, shape (N, HEALTH_COUNTS), C-contiguous.
 
     Attributes:
         inputs: The inputs of ``step_own``, shape (k_in, N), float64.
@@ -108,8 +92,6 @@ class NativePool(SavingPool):
         *,
         threads: int | None = None,
         private_libraries: bool | None = None,
-        first_index: int = 0,
-        counts: HealthArray | None = None,
     ) -> None:
         capabilities = fmu.description.capabilities
         spec = spec.fitting(fmu.description)
@@ -122,9 +104,9 @@ class NativePool(SavingPool):
         self.outputs: FloatArray = np.zeros((len(spec.outputs), num_instances))
         self.statuses: StatusArray = np.zeros(num_instances, np.int8)
         self.observations: FloatArray32 = np.zeros((num_instances, spec.num_observed), np.float32)
-        self._counts = no_counts(num_instances) if counts is None else counts
+        self._counts = no_counts(num_instances)
         self._result = self.outputs, self.statuses
-        self._fmu, self._spec, self._first_index = fmu, spec, first_index
+        self._fmu, self._spec = fmu, spec
         self._accesses: dict[tuple[Variable, ...], _native.Access] = {}
         try:
             self._pool = self._open(log, private_libraries)
@@ -145,42 +127,19 @@ class NativePool(SavingPool):
         folder = fmu.extract()
         if private_libraries:
             paths = copy_libraries(fmu, folder, self.num_instances)
-        place = PlaceOfFMU.here(folder, paths, description.fmi_major_version)
+        form = form_of_pool(
+            description,
+            spec,
+            Files.here(fmu, folder, paths),
+            self.num_instances,
+            self.threads,
+            private_libraries=private_libraries,
+            logging=log.isEnabledFor(logging.INFO),
+            records=keeps_records(description, spec),
+        )
+        arrays = self.inputs, self.outputs, self.statuses, self.observations, self._counts
         try:
-            return _native.Pool(
-                library=cast(
-                    "_native.Library",
-                    library_settings(description, spec, place)
-                    | {
-                        "private": private_libraries,
-                        "logging": log.isEnabledFor(logging.INFO),
-                        "solving": solving_settings(description, spec),
-                        "system": system_settings(fmu, spec, folder),
-                    },
-                ),
-                experiment=cast(
-                    "_native.Experiment",
-                    experiment_settings(spec, records=keeps_records(description, spec)),
-                ),
-                variables=cast(
-                    "_native.Variables",
-                    variable_settings(spec)
-                    | {
-                        "inputs": self._access(spec.inputs),
-                        "outputs": self._access(spec.outputs),
-                    },
-                ),
-                arrays={
-                    "inputs": self.inputs,
-                    "outputs": self.outputs,
-                    "statuses": self.statuses,
-                    "observations": self.observations,
-                    "health": self._counts,
-                },
-                count=self.num_instances,
-                threads=self.threads,
-                callback=Receiver(log, description, self._first_index),
-            )
+            return _native.Pool(form, arrays, Receiver(log, description))
         except ordinary(OSError) as error:
             raise FMULoadError(loading_failed(fmu.path.name, str(error))) from None
 
@@ -191,8 +150,8 @@ class NativePool(SavingPool):
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
             version = table_of(self._fmu.description)
-            manner = manner_of(self._fmu.description, self._spec)
-            access = _native.Access(version, *listing(variables, version), manner)
+            manner = manner_of(self._fmu.description)
+            access = _native.Access(form_of_listing(variables, version, manner))
             self._accesses[variables] = access
         return access
 
@@ -249,7 +208,7 @@ class NativePool(SavingPool):
         failure = self._open_pool().failure(index)
         if failure is None:
             return ""
-        name = f"{self._fmu.description.model_identifier}_{self._first_index + index}"
+        name = f"{self._fmu.description.model_identifier}_{index}"
         return describe_failure(Failure(*failure), self._fmu.description, self._spec, name)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
@@ -262,37 +221,19 @@ class NativePool(SavingPool):
         return values
 
     def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
-        """See ``Pool.differentiate``; of systems by the chain rule."""
-        description, spec = self._fmu.description, self._spec
-        if not isinstance(description, SystemDescription):
-            return self._differentiate(0, description, unknowns, knowns)
-        layout = Layout(description, spec.inputs, spec.outputs)
+        """See ``Pool.differentiate``."""
+        about = self._fmu.description, self._spec, self.num_instances
+        return differentiated(*about, self._differentiate, unknowns, knowns)
 
-        def differentiate(part: int, of: Variables, by: Variables) -> FloatArray:
-            found = self._differentiate(part, layout.parts[part].description, of, by)
-            return np.moveaxis(found, -1, 0)
-
-        ends = [[layout.ends_of(variable) for variable in some] for some in (unknowns, knowns)]
-        found = chained_jacobian(layout, differentiate, self.num_instances, *ends)
-        return np.moveaxis(found, 0, -1)
-
-    def _differentiate(
-        self, part: int, description: ModelDescription, unknowns: Variables, knowns: Variables
-    ) -> FloatArray:
-        """Differentiate variables of an FMU, which may be a part of a system."""
-        capabilities = description.capabilities
-        if not capabilities.provides_derivatives:
-            raise SimulationError(f"{description.model_name} provides no derivatives")
-        is_adjoint = not capabilities.provides_directional_derivatives
-        seeded, others = (unknowns, knowns) if is_adjoint else (knowns, unknowns)
-        version = table_of(description)
-        some, rest = (_native.Access(version, *listing(v, version)) for v in (seeded, others))
-        rows = np.zeros((len(seeded) * len(others), self.num_instances))
-        failed = self._open_pool().differentiate(is_adjoint, part, some, rest, rows)
+    def _differentiate(self, question: Question) -> FloatArray:
+        adjoint, part, version, *lists = question
+        some, rest = (_native.Access(form_of_listing(v, version)) for v in lists)
+        shape = len(question.seeded), len(question.others), self.num_instances
+        rows = np.zeros((shape[0] * shape[1], shape[2]))
+        failed = self._open_pool().differentiate(adjoint, part, some, rest, rows)
         if failed >= 0:
             raise SimulationError(self.failure(failed))
-        found = rows.reshape(len(seeded), len(others), self.num_instances)
-        return found if is_adjoint else found.swapaxes(0, 1)
+        return rows.reshape(shape)
 
     def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
         """See ``Pool.write``."""

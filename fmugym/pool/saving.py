@@ -18,7 +18,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
-from fmugym.pool.settings import Record, record_in
+from fmugym.pool.records import Record, record_in
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = ["SavingPool", "keeps_records", "offered_method"]

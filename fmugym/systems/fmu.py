@@ -42,10 +42,12 @@ class ExtractedSystem(ExtractedFMU):
         return self._parts
 
 
-def _parts_in(folder: Path, description: SystemDescription) -> tuple[LoadableFMU, ...]:
+def _parts_in(
+    folder: Path, description: SystemDescription, *, in_wine: bool = False
+) -> tuple[LoadableFMU, ...]:
     pairs = zip(description.plan.components, description.parts, strict=True)
     return tuple(
-        ExtractedFMU(component.path, part, component.preload, folder / str(number))
+        ExtractedFMU(component.path, part, component.preload, folder / str(number), in_wine=in_wine)
         for number, (component, part) in enumerate(pairs)
     )
 
@@ -82,6 +84,7 @@ class SystemFMU(FMU):
         self.probe_timeout = probe_timeout
         self.findings = plan.findings
         self.isolated = any(component.isolate for component in plan.components)
+        self.in_wine = all(fmu.in_wine for fmu in self._opened)
         self._folder: Path | None = None
         self._remove_folder = None
 
@@ -98,7 +101,7 @@ class SystemFMU(FMU):
     def parts(self) -> tuple[LoadableFMU, ...]:
         """The FMUs of the components, extracted."""
         assert isinstance(self.description, SystemDescription)
-        return _parts_in(self.extract(), self.description)
+        return _parts_in(self.extract(), self.description, in_wine=self.in_wine)
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:
@@ -111,17 +114,19 @@ class SystemFMU(FMU):
         of_components = (
             f"component {component.name!r}: {text}"
             for component, fmu in self._pairs()
-            if not fmu.in_wine
+            if self.in_wine or not fmu.in_wine
             for text in fmu.obstacles
         )
-        return (*of_components, *filter(None, [self._for_windows]))
+        return (*of_components, *filter(None, [self._mixed]))
 
     @property
-    def _for_windows(self) -> str:
-        """Name the components that could run in Wine only, and the cure; "" if there are none.
+    def _mixed(self) -> str:
+        """Name the components that run in Wine only beside others, and the cure; "" if none do.
 
-        A system runs in one process, and the worker program of Wine runs no systems.
+        A system runs in one process.
         """
+        if self.in_wine:
+            return ""
         names, others = (
             ", ".join(repr(one.name) for one, fmu in self._pairs() if fmu.in_wine is in_wine)
             for in_wine in (True, False)
@@ -131,8 +136,8 @@ class SystemFMU(FMU):
         ways = [fmu._how_to_compile for fmu in dict.fromkeys(self._opened) if fmu.in_wine]
         return (
             f"{self.plan.name} cannot run here: its components with libraries for Windows only are "
-            f"{names}, the others are {others or 'none'}. A system runs in one process, and Wine "
-            f"runs single FMUs only. Export {names} for Linux, too{''.join(ways)}"
+            f"{names}, the others are {others}. A system runs in one process: export {names} for "
+            f"Linux, too{''.join(ways)}"
         )
 
     @cached_property
@@ -152,8 +157,8 @@ class SystemFMU(FMU):
         """
         if self._folder is not None:
             return self._folder
-        if self._for_windows:
-            raise FMULoadError(self._for_windows)
+        if self._mixed:
+            raise FMULoadError(self._mixed)
         for component, fmu in self._pairs():
             with _naming(component):
                 fmu._check_library()

@@ -1,6 +1,6 @@
 """Where the values of a system are: slots of inputs and outputs, and the routes between them.
 
-``fmugym.pool.systems`` tells it to ``native/system_steps.c``.
+``fmugym.pool.form`` tells it to ``native/system_steps.c``.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ from fmugym.pool.base import Pool
 from fmugym.pool.patience import require_licence
 from fmugym.pool.process.output import print_line_by_line
 from fmugym.pool.process.shared_memory import ECHO_SIZE
-from fmugym.pool.process.windows import ProgramCoding
+from fmugym.pool.process.supervisor import Supervisor
 from fmugym.pool.progress import INITIALIZATION, listen
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.attempt import ECHO, Request, Stage, patience
@@ -143,7 +143,7 @@ def _try(request: Request, notes: Notes) -> None:
 
 def _initializations() -> int:
     """How many initializations this process has begun."""
-    return ProgramCoding.initializations + _native.initializations()
+    return Supervisor.initializations + _native.initializations()
 
 
 def _end_after(seconds: float) -> None:

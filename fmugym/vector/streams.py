@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fmugym.distributions import Recipe
 from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
+from fmugym.pool.form import form_of_draws
 from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.generators import row_of, state_of
@@ -172,7 +173,7 @@ def _draws(recipes: Sequence[Recipe], rows: Sequence[int]) -> Draws:
     columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts
     table = np.array(columns, np.int64).reshape(4, -1).T
     numbers = np.array([number for recipe in recipes for number in recipe.numbers])
-    return _native.Draws(table.tobytes(), numbers.tobytes(), _standard_normal(), _exponential())
+    return _native.Draws(form_of_draws(table, numbers), _standard_normal(), _exponential())
 
 
 @functools.cache

@@ -1,17 +1,11 @@
 /* The type Access: a list of variables. */
 
+#include <stdlib.h>
+#include <string.h>
+
 #include "python.h"
 
 PyTypeObject *access_type;
-
-const Fmi *fmi_of(int version, int manner) {
-    const Fmi *fmi = fmi_table(version, manner);
-
-    if (fmi == NULL) {
-        PyErr_Format(PyExc_ValueError, "there is no FMI %d", version);
-    }
-    return fmi;
-}
 
 bool is_access(const PyPool *self, PyObject *object) {
     if (!PyObject_TypeCheck(object, access_type) ||
@@ -22,36 +16,36 @@ bool is_access(const PyPool *self, PyObject *object) {
     return true;
 }
 
+/* The form may lie at any address. */
+static const char *take_form(const char *form, Py_ssize_t size, Access *access) {
+    char *copy = malloc((size_t)size + 1);
+
+    if (copy == NULL) {
+        return "out of memory";
+    }
+    memcpy(copy, form, (size_t)size);
+    Reader reader = {copy, copy + size, NULL};
+    const Fmi *fmi = read_fmi(&reader);
+    read_access(&reader, fmi, access);
+    free(copy);
+    return reader.fault;
+}
+
 static PyObject *access_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
-    const char *bytes[4];
-    Py_ssize_t sizes[4];
-    Block blocks[4];
-    int version, manner = CO_SIMULATION_ALONE;
-    Listing listing;
+    allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
+    const char *form;
+    Py_ssize_t size;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "iy#y#y#y#|i", &version, &bytes[0], &sizes[0], &bytes[1],
-                          &sizes[1], &bytes[2], &sizes[2], &bytes[3], &sizes[3], &manner)) {
+    if (!PyArg_ParseTuple(args, "y#", &form, &size)) {
         return NULL;
     }
-    for (int i = 0; i < 4; i++) {
-        blocks[i] = (Block){bytes[i], (size_t)sizes[i]};
-    }
-    const Fmi *fmi = fmi_of(version, manner);
-    if (fmi == NULL) {
-        return NULL;
-    }
-    const char *fault = listing_take(&listing, blocks[0], blocks[1], blocks[2], blocks[3]);
+    PyAccess *self = (PyAccess *)allocate(type, 0);
+    const char *fault = self == NULL ? NULL : take_form(form, size, &self->access);
     if (fault != NULL) {
+        Py_DECREF(self);
         PyErr_SetString(PyExc_ValueError, fault);
         return NULL;
-    }
-    allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
-    PyAccess *self = (PyAccess *)allocate(type, 0);
-    if (self != NULL &&
-        !access_open(&self->access, fmi, &listing)) {
-        Py_DECREF(self);
-        return PyErr_NoMemory();
     }
     return (PyObject *)self;
 }

@@ -4,28 +4,24 @@
 
 PyTypeObject *draws_type;
 
-static bool take_memory(PyDraws *self, PyObject *table, PyObject *numbers) {
-    const Py_ssize_t size = PyBytes_Size(table), length = PyBytes_Size(numbers);
+/* The memory of bytes is aligned. */
+static bool take_form(PyDraws *self, PyObject *form) {
+    const char *bytes = PyBytes_AsString(form);
+    Reader reader = {bytes, bytes + PyBytes_Size(form), NULL};
 
-    self->table = Py_NewRef(table);
-    self->numbers = Py_NewRef(numbers);
-    self->draws.draws = (const Draw *)PyBytes_AsString(table);
-    self->draws.numbers = (const double *)PyBytes_AsString(numbers);
-    self->draws.count = (size_t)size / sizeof(Draw);
-    if ((size_t)size % sizeof(Draw) != 0 || (size_t)length % sizeof(double) != 0 ||
-        !draws_are_sound(&self->draws, (size_t)length / sizeof(double))) {
-        PyErr_SetString(PyExc_ValueError, "the numbers do not fit the kinds of distributions");
-        return false;
+    self->form = Py_NewRef(form);
+    if (!read_draws(&reader, &self->draws)) {
+        PyErr_SetString(PyExc_ValueError, reader.fault);
     }
-    return true;
+    return reader.fault == NULL;
 }
 
 static PyObject *draws_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) {
-    PyObject *table, *numbers;
+    PyObject *form;
     unsigned long long normal, exponential = 0;
 
     (void)kwargs;
-    if (!PyArg_ParseTuple(args, "SSK|K", &table, &numbers, &normal, &exponential)) {
+    if (!PyArg_ParseTuple(args, "SK|K", &form, &normal, &exponential)) {
         return NULL;
     }
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
@@ -35,7 +31,7 @@ static PyObject *draws_new(PyTypeObject *type, PyObject *args, PyObject *kwargs)
     }
     self->draws.standard_normal = (StandardNormal *)(uintptr_t)normal;
     self->draws.exponential = (Exponential *)(uintptr_t)exponential;
-    if (!take_memory(self, table, numbers)) {
+    if (!take_form(self, form)) {
         Py_DECREF(self);
         return NULL;
     }
@@ -46,8 +42,7 @@ static void draws_dealloc(PyObject *object) {
     PyTypeObject *type = Py_TYPE(object);
     freefunc release_memory = (freefunc)PyType_GetSlot(type, Py_tp_free);
 
-    Py_XDECREF(((PyDraws *)object)->table);
-    Py_XDECREF(((PyDraws *)object)->numbers);
+    Py_XDECREF(((PyDraws *)object)->form);
     release_memory(object);
     Py_DECREF(type);
 }

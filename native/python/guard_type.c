@@ -28,10 +28,9 @@ bool guard_take(PyObject *guard, const char *name) {
     const bool taken = take((PyGuard *)guard);
 
     if (!taken) {
-        PyErr_Format(simulation_error,
-                     "%s is not possible while another thread is in a method of this environment, "
-                     "which is for one thread at a time",
-                     name);
+        raise_simulation_error("%s is not possible while another thread is in a method of this "
+                               "environment, which is for one thread at a time",
+                               name);
     }
     return taken;
 }

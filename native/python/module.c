@@ -87,6 +87,8 @@ static PyMethodDef functions[] = {
     {"initializations", initializations, METH_NOARGS, NULL},
     {"echo_to", echo_to, METH_O, NULL},
     {"text_with", py_text_with, METH_O, NULL},
+    {"serve", py_serve, METH_VARARGS, NULL},
+    {"end_with", py_end_with, METH_O, NULL},
     {NULL, NULL, 0, NULL},
 };
 
@@ -103,20 +105,6 @@ static bool add_type(PyObject *module, PyTypeObject **type, PyType_Spec *spec) {
     return *type != NULL && PyModule_AddType(module, *type) == 0;
 }
 
-static PyObject *find(const char *module_name, const char *name) {
-    PyObject *module = PyImport_ImportModule(module_name);
-    PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
-
-    Py_XDECREF(module);
-    return found;
-}
-
-static bool find_objects(void) {
-    simulation_error = find("fmugym.errors", "SimulationError");
-    sleep_function = find("time", "sleep");
-    return simulation_error != NULL && sleep_function != NULL;
-}
-
 PyMODINIT_FUNC PyInit__native(void) {
     static PyTypeObject *pool_type;
     PyObject *module = PyModule_Create(&definition);
@@ -125,7 +113,8 @@ PyMODINIT_FUNC PyInit__native(void) {
         return NULL;
     }
     pool_prepare_process();
-    if (!find_objects() || !add_type(module, &access_type, &access_spec) ||
+    sleep_function = find_object("time", "sleep");
+    if (sleep_function == NULL || !add_type(module, &access_type, &access_spec) ||
         !add_type(module, &draws_type, &draws_spec) ||
         !add_type(module, &guard_type, &guard_spec) ||
         !add_type(module, &pool_type, &pool_spec) ||

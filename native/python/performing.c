@@ -4,7 +4,25 @@
 
 #include "python.h"
 
-PyObject *simulation_error, *sleep_function;
+PyObject *sleep_function;
+
+PyObject *find_object(const char *module_name, const char *name) {
+    PyObject *module = PyImport_ImportModule(module_name);
+    PyObject *found = module == NULL ? NULL : PyObject_GetAttrString(module, name);
+
+    Py_XDECREF(module);
+    return found;
+}
+
+/* The package is not imported before: workers do without it. */
+void raise_simulation_error(const char *format, const char *name) {
+    PyObject *type = find_object("fmugym.errors", "SimulationError");
+
+    if (type != NULL) {
+        PyErr_Format(type, format, name);
+        Py_DECREF(type);
+    }
+}
 
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected) {
     if (given != expected) {
@@ -72,7 +90,7 @@ static bool is_short(const PyPool *self, int length) {
 
 bool explain_entry(Entry entry) {
     if (entry == ENTRY_CLOSED) {
-        PyErr_SetString(simulation_error, "the pool is closed");
+        raise_simulation_error("the %s is closed", "pool");
     } else if (entry == ENTRY_INSIDE) {
         PyErr_SetString(PyExc_RuntimeError, "an FMU has called the pool that it is in");
     }

@@ -45,6 +45,19 @@ static void replace_reference(PyObject **place, PyObject *object) {
 
 /* Preparing */
 
+/* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
+static bool parse_group(PyObject *group, const char *format, char **names, ...) {
+    PyObject *nothing = PyTuple_New(0);
+    va_list places;
+
+    va_start(places, names);
+    const bool parsed =
+        nothing != NULL && PyArg_VaParseTupleAndKeywords(nothing, group, format, names, places);
+    va_end(places);
+    Py_XDECREF(nothing);
+    return parsed;
+}
+
 static bool take_starts(PyPool *self, Playing *playing, PyObject *start, PyObject *values) {
     if (!is_access(self, start)) {
         return false;
@@ -288,27 +301,15 @@ static bool take_input_starts(PyPool *self, Playing *playing, PyObject *starts) 
     return true;
 }
 
-/* Notes which rows are those of the outputs, as long as the program only reads them. */
-static void note_outputs(const Settings *s, PyProgram *p) {
-    for (size_t i = 0; i < p->program.number_of_rows; i++) {
-        Row *row = &p->rows[i];
-        for (uint32_t k = 0; k < s->outputs->count && !row->changes; k++) {
-            if (row->data == (char *)(s->output_values + k * s->count)) {
-                row->output = k + 1;
-            }
-        }
-    }
-}
-
 static void settle_play(PyPool *self, Playing *playing) {
     const Py_buffer *b = playing->buffers;
     const Settings *s = &self->pool.settings;
     Play *play = &playing->play;
 
-    note_outputs(s, &playing->judgement);
+    program_note_outputs(&playing->judgement.form, s->output_values, s->outputs->count, s->count);
     play->count = s->count;
-    play->inputs = playing->inputs.program;
-    play->judgement = playing->judgement.program;
+    play->inputs = playing->inputs.form.program;
+    play->judgement = playing->judgement.form.program;
     play->input_rows = self->buffers[INPUTS].buf;
     play->output_rows = s->output_values;
     play->kept_rows = b[KEPT].buf;
@@ -365,14 +366,14 @@ static bool take_programs(PyPool *self, Playing *playing, const Parts *p) {
 }
 
 bool pool_observes(const Playing *playing) {
-    return playing->judgement.program.number_of_seen == 0 && playing->results != NULL &&
+    return playing->judgement.form.program.number_of_seen == 0 && playing->results != NULL &&
            results_number_of_seen(playing->results) == 1;
 }
 
 static bool results_fit(const PyPool *self, const Playing *playing) {
     const Settings *s = &self->pool.settings;
     const Results *r = playing->results;
-    const size_t seen = playing->judgement.program.number_of_seen;
+    const size_t seen = playing->judgement.form.program.number_of_seen;
     bool fit = results_size(r, REWARDS_ARRAY) == s->count * sizeof(double) &&
                results_size(r, TERMINATED_ARRAY) == s->count &&
                results_size(r, TRUNCATED_ARRAY) == s->count &&

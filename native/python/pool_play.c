@@ -20,7 +20,7 @@ bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
 bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
     const Settings *s = &self->pool.settings;
 
-    if (playing->judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
+    if (playing->judgement.form.program.number_of_seen > 0 || PyTuple_Check(seen)) {
         return take_seen(&playing->judgement, seen, t->seen_buffers, t->seen);
     }
     return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
@@ -139,7 +139,7 @@ static void settle_starts_at_ends(const Playing *playing, const ResultArrays *ar
         t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
     }
     t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
-    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
+    for (size_t i = 0; i < playing->judgement.form.program.number_of_seen; i++) {
         t->seen_sizes[i] = (size_t)playing->judgement.seen_bytes[i] / count;
     }
 }
@@ -178,7 +178,7 @@ static bool play_turn(PyPool *self, int operation, PyTurn *t) {
 }
 
 void clear_turn(const Playing *playing, PyTurn *t) {
-    const size_t size = playing->judgement.program.number_of_seen * sizeof(Py_buffer);
+    const size_t size = playing->judgement.form.program.number_of_seen * sizeof(Py_buffer);
 
     t->bad_action = false;
     memset(t->buffers, 0, sizeof t->buffers);
@@ -189,7 +189,7 @@ void release_turn(const Playing *playing, PyTurn *t) {
     for (int i = 0; i < TURN_BUFFERS; i++) {
         release_buffer(&t->buffers[i]);
     }
-    for (size_t i = 0; i < playing->judgement.program.number_of_seen; i++) {
+    for (size_t i = 0; i < playing->judgement.form.program.number_of_seen; i++) {
         release_buffer(&t->seen_buffers[i]);
     }
 }

@@ -35,7 +35,7 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
 static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
                                      PyRollout *r) {
     const Settings *s = &self->pool.settings;
-    const size_t count = playing->judgement.program.number_of_seen;
+    const size_t count = playing->judgement.form.program.number_of_seen;
     PyTurn *t = &r->turn;
 
     if (count == 0 && !PyTuple_Check(seen)) {

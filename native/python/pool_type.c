@@ -56,9 +56,7 @@ static void pool_dealloc(PyObject *object) {
     for (int i = 0; i < BUFFERS; i++) {
         release_buffer(&self->buffers[i]);
     }
-    drop_system(self->system);
-    free(self->paths);
-    free(self->categories);
+    opening_drop(&self->opening);
     Py_XDECREF(self->playing);
     Py_XDECREF(self->one);
     Py_XDECREF(self->arguments);
@@ -69,12 +67,12 @@ static void pool_dealloc(PyObject *object) {
 /* Making */
 
 static bool open_pool(PyPool *self) {
-    const Settings settings = self->pool.settings;
     char error[8192];
     bool opened;
 
     self->opened = true;
-    Py_BEGIN_ALLOW_THREADS opened = pool_open(&self->pool, &settings, error, sizeof error);
+    Py_BEGIN_ALLOW_THREADS opened = pool_open(&self->pool, &self->opening.settings, error,
+                                                sizeof error);
     Py_END_ALLOW_THREADS if (!report_messages(self)) {
         return false;
     }
@@ -90,7 +88,8 @@ static PyObject *pool_new(PyTypeObject *type, PyObject *args, PyObject *kwargs) 
     allocfunc allocate = (allocfunc)PyType_GetSlot(type, Py_tp_alloc);
     PyPool *self = (PyPool *)allocate(type, 0);
 
-    if (self != NULL && take_pool_arguments(self, args, kwargs) && open_pool(self)) {
+    (void)kwargs;
+    if (self != NULL && take_pool_arguments(self, args) && open_pool(self)) {
         return (PyObject *)self;
     }
     Py_XDECREF((PyObject *)self);

@@ -17,181 +17,66 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
     return false;
 }
 
-static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count) {
-    for (Py_ssize_t i = 0; i < PyTuple_Size(rows); i++) {
-        Py_buffer *buffer = &p->buffers[p->number_of_buffers++];
-        if (!take_numbers(PyTuple_GetItem(rows, i), buffer, true, "a row of a program", count)) {
-            return false;
-        }
-        if ((uintptr_t)buffer->buf % (uintptr_t)buffer->itemsize != 0) {
-            PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
-            return false;
-        }
-        p->rows[i] = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
+static bool take_row(PyProgram *p, PyObject *object, Py_ssize_t count, Row *row) {
+    Py_buffer *buffer = &p->buffers[p->number_of_buffers++];
+
+    if (!take_numbers(object, buffer, true, "a row of a program", count)) {
+        return false;
     }
+    if ((uintptr_t)buffer->buf % (uintptr_t)buffer->itemsize != 0) {
+        PyErr_SetString(PyExc_ValueError, "a row of a program is not aligned");
+        return false;
+    }
+    *row = (Row){.data = buffer->buf, .size = (size_t)buffer->itemsize};
     return true;
 }
 
-static bool take_tables(PyProgram *p, PyObject *tables) {
-    for (Py_ssize_t i = 0; i < PyTuple_Size(tables); i++) {
-        PyObject *table = PyTuple_GetItem(tables, i);
-        const Py_ssize_t length = PyObject_Length(table);
-        Py_buffer *buffer = &p->buffers[p->number_of_buffers++];
-        if (length < 0 || !take_numbers(table, buffer, false, "a table of a program", length)) {
-            return false;
-        }
-        p->tables[i] = (Table){.data = buffer->buf,
-                               .length = (size_t)length,
-                               .size = (size_t)buffer->itemsize};
+static bool accept(const char *fault) {
+    if (fault != NULL) {
+        PyErr_Format(PyExc_ValueError, "a program is not sound: %s", fault);
     }
-    return true;
+    return fault == NULL;
 }
 
-/* Reads how large the arrays of observations must be. */
-static bool measure_seen(PyProgram *p, Py_ssize_t count) {
-    static const Py_ssize_t sizes[VALUE_TYPES] = {8, 4, 8, 1, 1};
+static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count, size_t action_elements) {
+    const size_t number = (size_t)PyTuple_Size(rows);
+    Row *taken = calloc(number + 1, sizeof *taken);
 
-    for (size_t i = 0; i < p->program.number_of_slots; i++) {
-        const Slot *slot = &p->program.slots[i];
-        if (slot->array >= MOST_SEEN || slot->type >= VALUE_TYPES) {
-            return false;
-        }
-        const Py_ssize_t bytes = count * (Py_ssize_t)slot->elements * sizes[slot->type];
-        Py_ssize_t *known = &p->seen_bytes[slot->array];
-        if (*known != 0 && *known != bytes) {
-            return false;
-        }
-        *known = bytes;
-    }
-    return true;
-}
-
-typedef struct {
-    PyObject *rows, *tables;
-    const char *code, *constants, *slots;
-    Py_ssize_t code_size, constants_size, slots_size, registers, seen;
-    PyObject *results;
-} Parts;
-
-static bool parse(PyObject *parts, Parts *found) {
-    return PyArg_ParseTuple(
-        parts, "y#y#y#O!O!nnO!;a program", &found->code, &found->code_size, &found->constants,
-        &found->constants_size, &found->slots, &found->slots_size, &PyTuple_Type, &found->rows,
-        &PyTuple_Type, &found->tables, &found->registers, &found->seen, &PyTuple_Type,
-        &found->results);
-}
-
-static bool take_results(Program *program, PyObject *results) {
-    const Py_ssize_t count = PyTuple_Size(results);
-
-    for (Py_ssize_t i = 0; i < count && i < PROGRAM_RESULTS; i++) {
-        const long number = PyLong_AsLong(PyTuple_GetItem(results, i));
-        if (number < 0 || number >= PROGRAM_REGISTERS) {
-            return false;
-        }
-        program->results[i] = (uint16_t)number;
-    }
-    program->number_of_results = (size_t)count;
-    return count <= PROGRAM_RESULTS;
-}
-
-static bool allocate(PyProgram *p, const Parts *parts) {
-    const size_t rows = (size_t)PyTuple_Size(parts->rows);
-    const size_t tables = (size_t)PyTuple_Size(parts->tables);
-
-    p->buffers = calloc(rows + tables + 1, sizeof *p->buffers);
-    p->rows = calloc(rows + 1, sizeof *p->rows);
-    p->tables = calloc(tables + 1, sizeof *p->tables);
-    p->filled = malloc(((size_t)parts->constants_size / sizeof(Constant) + 1) * sizeof(Register));
-    p->program = (Program){
-        .code = (const Instruction *)(const void *)parts->code,
-        .constants = (const Constant *)(const void *)parts->constants,
-        .slots = (const Slot *)(const void *)parts->slots,
-        .rows = p->rows,
-        .tables = p->tables,
-        .length = (size_t)parts->code_size / sizeof(Instruction),
-        .number_of_constants = (size_t)parts->constants_size / sizeof(Constant),
-        .number_of_slots = (size_t)parts->slots_size / sizeof(Slot),
-        .number_of_rows = rows,
-        .number_of_tables = tables,
-        .number_of_seen = (size_t)parts->seen,
-        .registers = (size_t)parts->registers,
-    };
-    if (p->buffers == NULL || p->rows == NULL || p->tables == NULL || p->filled == NULL) {
+    p->buffers = calloc(number + 1, sizeof *p->buffers);
+    bool good = taken != NULL && p->buffers != NULL;
+    if (!good) {
         PyErr_NoMemory();
+    }
+    for (size_t i = 0; i < number && good; i++) {
+        good = take_row(p, PyTuple_GetItem(rows, (Py_ssize_t)i), count, &taken[i]);
+    }
+    good = good && accept(program_settle(&p->form, taken, action_elements));
+    free(taken);
+    return good;
+}
+
+bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *p) {
+    const char *form;
+    Py_ssize_t size;
+    PyObject *rows;
+
+    if (!PyArg_ParseTuple(parts, "y#O!;a program", &form, &size, &PyTuple_Type, &rows) ||
+        !accept(program_take(&p->form, form, (size_t)size, (size_t)PyTuple_Size(rows))) ||
+        !take_rows(p, rows, count, action_elements)) {
         return false;
+    }
+    for (size_t i = 0; i < MOST_SEEN; i++) {
+        p->seen_bytes[i] = count * (Py_ssize_t)p->form.seen_sizes[i];
     }
     return true;
 }
 
-static bool is_sound(PyProgram *p, const Parts *parts, Py_ssize_t count, size_t action_elements) {
-    const bool sound = parts->code_size % (Py_ssize_t)sizeof(Instruction) == 0 &&
-                       parts->constants_size % (Py_ssize_t)sizeof(Constant) == 0 &&
-                       parts->slots_size % (Py_ssize_t)sizeof(Slot) == 0 && parts->seen >= 0 &&
-                       parts->seen <= MOST_SEEN && parts->registers >= 0 &&
-                       take_results(&p->program, parts->results) && measure_seen(p, count) &&
-                       program_is_sound(&p->program, action_elements);
-    if (!sound && !PyErr_Occurred()) {
-        PyErr_SetString(PyExc_ValueError, "a program is not sound");
+void release_program(PyProgram *p) {
+    for (size_t i = 0; i < p->number_of_buffers; i++) {
+        release_buffer(&p->buffers[i]);
     }
-    return sound;
-}
-
-/* The constants' registers begin at the first place in their memory that is aligned. */
-static void fill_constants(PyProgram *p) {
-    const size_t alignment = _Alignof(Register);
-    const size_t past = (size_t)((uintptr_t)p->filled % alignment);
-    Register *filled = (Register *)(void *)(p->filled + (past == 0 ? 0 : alignment - past));
-
-    for (size_t i = 0; i < p->program.number_of_constants; i++) {
-        program_fill(&p->program.constants[i], &filled[i]);
-    }
-    p->program.filled = filled;
-}
-
-/* Two rows may be the same memory. */
-static void note_change(PyProgram *p, const char *changed) {
-    for (size_t i = 0; i < p->program.number_of_rows; i++) {
-        p->rows[i].changes |= p->rows[i].data == changed;
-    }
-}
-
-static void note_changes(PyProgram *p) {
-    for (size_t i = 0; i < p->program.length; i++) {
-        if (p->program.code[i].operation == STORE_ROW) {
-            note_change(p, p->rows[p->program.code[i].extra].data);
-        }
-    }
-}
-
-bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program) {
-    Parts found;
-
-    if (!PyTuple_Check(parts)) {
-        PyErr_SetString(PyExc_TypeError, "a program must be a tuple");
-        return false;
-    }
-    Py_INCREF(parts);
-    program->parts = parts;
-    if (!parse(parts, &found) || !allocate(program, &found) ||
-        !take_rows(program, found.rows, count) || !take_tables(program, found.tables) ||
-        !is_sound(program, &found, count, action_elements)) {
-        return false;
-    }
-    fill_constants(program);
-    note_changes(program);
-    return true;
-}
-
-void release_program(PyProgram *program) {
-    for (size_t i = 0; i < program->number_of_buffers; i++) {
-        release_buffer(&program->buffers[i]);
-    }
-    free(program->buffers);
-    free(program->rows);
-    free(program->tables);
-    free(program->filled);
-    Py_XDECREF(program->parts);
+    free(p->buffers);
+    program_drop(&p->form);
 }
 
 static bool take_one_seen(const PyProgram *program, size_t i, PyObject *array, Py_buffer *buffers,
@@ -216,7 +101,7 @@ static bool take_each_seen(const PyProgram *program, PyObject *arrays, Py_buffer
     Py_ssize_t place = 0;
     bool good = true;
 
-    for (size_t i = 0; good && i < program->program.number_of_seen; i++) {
+    for (size_t i = 0; good && i < program->form.program.number_of_seen; i++) {
         if (!is_dict) {
             array = PyTuple_GetItem(arrays, (Py_ssize_t)i);
         } else if (!PyDict_Next(arrays, &place, NULL, &array)) {
@@ -228,7 +113,7 @@ static bool take_each_seen(const PyProgram *program, PyObject *arrays, Py_buffer
 }
 
 bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen) {
-    const size_t count = program->program.number_of_seen;
+    const size_t count = program->form.program.number_of_seen;
     const bool is_dict = PyDict_Check(arrays), is_tuple = PyTuple_Check(arrays);
 
     if (count == 1 && !is_tuple && !is_dict) {
@@ -272,7 +157,7 @@ static bool take_given(Evaluation *e, PyObject *actions, PyObject *previous) {
 }
 
 static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
-    const size_t wanted = e->program.program.number_of_results;
+    const size_t wanted = e->program.form.program.number_of_results;
 
     if ((size_t)PyTuple_Size(results) != wanted) {
         PyErr_SetString(PyExc_ValueError, "there must be an array for each result");
@@ -289,7 +174,7 @@ static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
 }
 
 static bool evaluate(Evaluation *e) {
-    const Program *program = &e->program.program;
+    const Program *program = &e->program.form.program;
     Register memory[PROGRAM_REGISTERS];
     Registers registers;
     Notes notes = {.outside = false};

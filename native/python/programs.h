@@ -7,20 +7,16 @@
 
 enum { MOST_DIMENSIONS = 8 }; /* of an action */
 
-/* A program, and references to everything that it uses. */
+/* A program, and its rows, which stay in use. */
 typedef struct {
-    Program program;
-    PyObject *parts;
+    ProgramForm form;
     Py_buffer *buffers;
     size_t number_of_buffers;
-    Row *rows;
-    Table *tables;
-    char *filled; /* the memory of the constants' registers */
     Py_ssize_t seen_bytes[MOST_SEEN]; /* the size of each array of observations */
 } PyProgram;
 
-/* Takes a program for count instances. Returns false with an exception if it is not sound; it
- * must be released in any case. */
+/* Takes a program for count instances: a tuple of its form and its rows, also a tuple. Returns false
+ * with an exception if it is not sound; it must be released in any case. */
 bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program);
 void release_program(PyProgram *program);
 
@@ -34,5 +30,7 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
 
 /* Functions of the module */
 PyObject *py_evaluate(PyObject *module, PyObject *args);
+PyObject *py_serve(PyObject *module, PyObject *args);
+PyObject *py_end_with(PyObject *module, PyObject *number);
 
 #endif

@@ -11,8 +11,7 @@
 #endif
 
 #include "buffers.h"
-#include "pool.h"
-#include "system.h"
+#include "form.h"
 
 enum { INPUTS, OUTPUTS, STATUS, OBSERVATIONS, HEALTH, BUFFERS };
 
@@ -22,7 +21,7 @@ typedef struct {
 
 typedef struct {
     PyObject_HEAD Draws draws;
-    PyObject *table, *numbers; /* the memory of the draws, of type bytes */
+    PyObject *form; /* the memory of the draws, of type bytes */
 } PyDraws;
 
 typedef struct {
@@ -33,19 +32,17 @@ typedef struct {
 typedef struct {
     PyObject_HEAD Pool pool;
     bool opened;         /* whether the pool may need closing */
-    PyObject *arguments; /* keeps the targets of the settings alive */
-    PyObject *callback;  /* borrowed from arguments, as are the arrays */
+    Opening opening;
+    PyObject *arguments; /* keeps the arrays and the callback alive */
+    PyObject *callback;
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
-    const char **paths, **categories;
-    System *system;
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
     PyObject *one;     /* another one */
 } PyPool;
 
 extern PyTypeObject *access_type, *draws_type, *guard_type, *snapshot_type;
-extern PyObject *simulation_error; /* raised by calls of a closed pool, and by guards */
-extern PyObject *sleep_function;   /* that of Python, which signals interrupt */
+extern PyObject *sleep_function; /* that of Python, which signals interrupt */
 
 extern PyType_Spec access_spec, draws_spec, guard_spec, snapshot_spec, pool_spec;
 
@@ -53,25 +50,18 @@ extern PyType_Spec access_spec, draws_spec, guard_spec, snapshot_spec, pool_spec
 bool guard_take(PyObject *guard, const char *name);
 void guard_give_back(PyObject *guard);
 
-/* The table of an FMI version; NULL with an exception if there is none. */
-const Fmi *fmi_of(int version, int manner);
 /* Returns whether an object is an access for this pool. Sets an exception if not. */
 bool is_access(const PyPool *self, PyObject *object);
 
+/* A new reference to an object of a module, or NULL with an exception. */
+PyObject *find_object(const char *module_name, const char *name);
+/* Raises a SimulationError of the package: by calls of a closed pool, and by guards. The format has a
+ * place for a name. */
+void raise_simulation_error(const char *format, const char *name);
 
 PyObject *decode(const char *text);
-/* The texts of a tuple of bytes, to be freed; NULL with an exception if it holds others. */
-const char **take_texts(PyObject *tuple);
-/* Takes the tuple that fmugym/pool/settings.py makes, or None. */
-bool take_solving(PyObject *tuple, Solving *solving);
-/* Takes the tuple that fmugym/pool/systems.py makes, or None. The caller drops the system whether
- * or not this returns false with an exception. */
-bool take_system(PyObject *tuple, System **system);
-void drop_system(System *system);
 /* Takes the arguments of a new pool, all but the opening of it. Returns false with an exception. */
-bool take_pool_arguments(PyPool *self, PyObject *args, PyObject *kwargs);
-/* Parses the values of a dict by name, as PyArg_ParseTupleAndKeywords does. */
-bool parse_group(PyObject *group, const char *format, char **names, ...);
+bool take_pool_arguments(PyPool *self, PyObject *args);
 bool has_arguments(Py_ssize_t given, Py_ssize_t expected);
 
 /* Calls. Work runs inside the pool, either with the GIL (alone) or without it. No thread waits

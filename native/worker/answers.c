@@ -1,22 +1,43 @@
-/* Answers and messages. */
-
-#include "answers.h"
+/* What a worker sends. */
 
 #include <stdlib.h>
 #include <string.h>
 
-/* Kinds of errors: a sentence, or why the last status of an instance was bad. */
-enum { ERROR_TEXT, ERROR_FAILURE };
+#include "worker.h"
 
-static void send_message(size_t index, int status, const char *category, const char *text) {
+#if defined _WIN32
+#include <process.h>
+#define getpid _getpid
+#else
+#include <unistd.h>
+#endif
+
+int64_t number_of_process(void) {
+    return (int64_t)getpid();
+}
+
+/* Ends this process if an FMU has forked it and returned in it as well. */
+static void end_twin(const Worker *w) {
+    if (w->process != number_of_process()) {
+        _Exit(0);
+    }
+}
+
+void send_answer(Worker *w, uint64_t code, Writer *writer) {
+    end_twin(w);
+    send_message(&w->channel, code, writer->bytes, writer->size);
+    free(writer->bytes);
+}
+
+static void send_record(Worker *w, size_t index, int status, const char *category,
+                        const char *text) {
     Writer writer = {.bytes = NULL};
 
     write_integer(&writer, (int64_t)index);
     write_integer(&writer, status);
     write_text(&writer, category);
     write_text(&writer, text);
-    send_content(CODE_LOG, writer.bytes, writer.size);
-    free(writer.bytes);
+    send_answer(w, MESSAGE_OF_FMU, &writer);
 }
 
 void worker_report(Worker *w) {
@@ -24,37 +45,36 @@ void worker_report(Worker *w) {
     Message *first = log_take(&w->pool.log, &dropped);
 
     for (const Message *m = first; m != NULL; m = m->next) {
-        send_message(m->index, m->status, m->category, m->text);
+        send_record(w, m->index, m->status, m->category, m->text);
     }
     messages_free(first);
     if (dropped > 0) {
-        send_message(0, STATUS_WARNING, "fmugym", "later messages were dropped: too many at once");
+        send_record(w, 0, STATUS_WARNING, "fmugym",
+                    "later messages were dropped: too many at once");
     }
 }
 
-void send_result(Writer *writer) {
-    send_content(CODE_RESULT, writer->bytes, writer->size);
-    free(writer->bytes);
+void send_result(Worker *w, Writer *writer) {
+    send_answer(w, ANSWER_RESULT, writer);
 }
 
-void send_done(void) {
-    send_content(CODE_RESULT, NULL, 0);
+void send_done(Worker *w) {
+    Writer nothing = {.bytes = NULL};
+    send_result(w, &nothing);
 }
 
-void send_error(const char *text) {
+void send_error(Worker *w, const char *text) {
     Writer writer = {.bytes = NULL};
 
-    write_bytes(&writer, &(char){ERROR_TEXT}, 1);
     write_text(&writer, text);
-    send_content(CODE_ERROR, writer.bytes, writer.size);
-    free(writer.bytes);
+    send_answer(w, ANSWER_ERROR, &writer);
 }
 
 void write_failure(Worker *w, Writer *writer, size_t index) {
     Failure failure = {.doing = NULL};
     const bool found = pool_failure(&w->pool, index, &failure);
 
-    write_bytes(writer, &found, 1);
+    write_integer(writer, found);
     if (found) {
         write_text(writer, failure.doing);
         write_integer(writer, failure.in_warm_up);
@@ -64,6 +84,7 @@ void write_failure(Worker *w, Writer *writer, size_t index) {
         write_text(writer, failure.said);
         write_integer(writer, failure.values != NULL);
         write_block(writer, failure.values, failure.number_of_values * sizeof(double));
+        write_text(writer, failure.part);
         free(failure.said);
         free(failure.values);
     }
@@ -72,22 +93,33 @@ void write_failure(Worker *w, Writer *writer, size_t index) {
 void send_failure(Worker *w, size_t index) {
     Writer writer = {.bytes = NULL};
 
-    write_bytes(&writer, &(char){ERROR_FAILURE}, 1);
     write_integer(&writer, (int64_t)index);
     write_failure(w, &writer, index);
-    send_content(CODE_ERROR, writer.bytes, writer.size);
-    free(writer.bytes);
+    send_answer(w, ANSWER_FAILURE, &writer);
 }
 
+void send_result_unless(Worker *w, ptrdiff_t failed, Writer *writer) {
+    if (failed < 0) {
+        send_result(w, writer);
+    } else {
+        free(writer->bytes);
+        send_failure(w, (size_t)failed);
+    }
+}
+
+/* Outputs of a step whose answer cannot be sent are not published. */
 void worker_publish(Worker *w) {
     const Shared *shared = &w->shared;
-    const size_t count = w->settings.count;
+    const Settings *s = &w->opening.settings;
 
-    for (size_t i = 0; i < w->outputs.count; i++) {
-        memcpy(shared->outputs + i * shared->stride, w->output_values + i * count,
-               count * sizeof(double));
+    end_twin(w);
+    if (!channel_is_open(&w->channel)) {
+        return;
     }
-    memcpy(shared->observations, w->observations,
-           count * w->settings.num_observed * sizeof(float));
-    memcpy(shared->statuses, w->statuses, count);
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        memcpy(shared->outputs + i * shared->stride, w->output_values + i * s->count,
+               s->count * sizeof(double));
+    }
+    memcpy(shared->observations, w->observations, s->count * s->num_observed * sizeof(float));
+    memcpy(shared->statuses, w->statuses, s->count);
 }

@@ -1,50 +1,103 @@
-/* Messages over the standard streams. */
+/* Messages over a connection. */
 
 #include "frames.h"
 
-#define WIN32_LEAN_AND_MEAN
-#include <fcntl.h>
-#include <io.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
-#include <windows.h>
+
+#if !defined _WIN32
+#include <errno.h>
+#include <sched.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
+#endif
 
 enum {
     LONGEST_WATCH = 40000, /* ns before this process goes to sleep; as in channel.py */
     PAUSES = 16            /* looks before others may have the processor */
 };
 
-static HANDLE input, output;
-static const Atomic *watched; /* NULL before frames_watch */
-static uint64_t heard;        /* messages received, in the numbers of the watched count */
+static const size_t LARGEST_PIECE = 1 << 20; /* bytes in a call of the system */
 
-static HANDLE copy_of(DWORD stream) {
-    HANDLE copy = NULL;
-    const HANDLE process = GetCurrentProcess();
+#if defined _WIN32
 
-    DuplicateHandle(process, GetStdHandle(stream), process, &copy, 0, FALSE, DUPLICATE_SAME_ACCESS);
-    return copy;
+bool channel_is_open(const Channel *channel) {
+    (void)channel;
+    return true;
 }
 
-bool frames_open(void) {
-    input = copy_of(STD_INPUT_HANDLE);
-    output = copy_of(STD_OUTPUT_HANDLE);
-    const int nothing = _open("NUL", _O_RDONLY);
-    _dup2(2, 1);
-    _dup2(nothing, 0);
-    setvbuf(stdout, NULL, _IONBF, 0); /* the next call may end the process */
-    /* libraries with a C library of their own look these up */
-    SetStdHandle(STD_OUTPUT_HANDLE, GetStdHandle(STD_ERROR_HANDLE));
-    SetStdHandle(STD_INPUT_HANDLE, (HANDLE)_get_osfhandle(nothing));
-    return input != NULL && output != NULL;
+static void give_way(void) {
+    SwitchToThread();
 }
 
-static bool receive(char *bytes, size_t size) {
+/* How many bytes a call of the system has moved, which goes on in the background with a socket. */
+static size_t moved(HANDLE handle, BOOL done, DWORD count, OVERLAPPED *background) {
+    if (background == NULL) {
+        return done ? count : 0;
+    }
+    const bool begun = done || GetLastError() == ERROR_IO_PENDING;
+    return begun && GetOverlappedResult(handle, background, &count, TRUE) ? count : 0;
+}
+
+/* Return how many bytes, none if the other end is gone. */
+static size_t receive_some(const Channel *c, char *bytes, size_t size) {
+    OVERLAPPED own = {.hEvent = NULL}, *background = c->is_socket ? &own : NULL;
+    DWORD count = 0;
+    const BOOL done = ReadFile(c->input, bytes, (DWORD)size, &count, background);
+    return moved(c->input, done, count, background);
+}
+
+static size_t send_some(const Channel *c, const char *bytes, size_t size) {
+    OVERLAPPED own = {.hEvent = NULL}, *background = c->is_socket ? &own : NULL;
+    DWORD count = 0;
+    const BOOL done = WriteFile(c->output, bytes, (DWORD)size, &count, background);
+    return moved(c->output, done, count, background);
+}
+
+#else
+
+#if !defined MSG_NOSIGNAL
+#define MSG_NOSIGNAL 0
+#endif
+
+bool channel_is_open(const Channel *channel) {
+    struct stat unused;
+    return fstat(channel->socket, &unused) == 0;
+}
+
+static void give_way(void) {
+    sched_yield();
+}
+
+static size_t receive_some(const Channel *c, char *bytes, size_t size) {
+    ssize_t count;
+
+    do {
+        count = recv(c->socket, bytes, size, 0);
+    } while (count < 0 && errno == EINTR);
+    return count < 0 ? 0 : (size_t)count;
+}
+
+static size_t send_some(const Channel *c, const char *bytes, size_t size) {
+    ssize_t count;
+
+    do {
+        count = send(c->socket, bytes, size, MSG_NOSIGNAL);
+    } while (count < 0 && errno == EINTR);
+    return count < 0 ? 0 : (size_t)count;
+}
+
+#endif
+
+static size_t piece_of(size_t size) {
+    return size < LARGEST_PIECE ? size : LARGEST_PIECE;
+}
+
+bool receive_content(Channel *channel, char *bytes, size_t size) {
     while (size > 0) {
-        const DWORD wanted = size > 1 << 20 ? 1 << 20 : (DWORD)size;
-        DWORD received = 0;
-        if (!ReadFile(input, bytes, wanted, &received, NULL) || received == 0) {
+        const size_t received = receive_some(channel, bytes, piece_of(size));
+        if (received == 0) {
             return false;
         }
         bytes += received;
@@ -53,11 +106,10 @@ static bool receive(char *bytes, size_t size) {
     return true;
 }
 
-static bool send(const char *bytes, size_t size) {
+static bool send_all(const Channel *channel, const char *bytes, size_t size) {
     while (size > 0) {
-        const DWORD wanted = size > 1 << 20 ? 1 << 20 : (DWORD)size;
-        DWORD sent = 0;
-        if (!WriteFile(output, bytes, wanted, &sent, NULL) || sent == 0) {
+        const size_t sent = send_some(channel, bytes, piece_of(size));
+        if (sent == 0) {
             return false;
         }
         bytes += sent;
@@ -66,14 +118,9 @@ static bool send(const char *bytes, size_t size) {
     return true;
 }
 
-void frames_watch(const Atomic *bell) {
-    watched = bell;
-    heard = atomic_get(bell);
-}
-
-static bool is_announced(void) {
+static bool is_announced(const Channel *channel) {
     for (int i = 0; i < PAUSES; i++) {
-        if (atomic_get(watched) > heard) {
+        if (atomic_get(channel->bell) > channel->heard) {
             return true;
         }
         spin_pause();
@@ -81,106 +128,35 @@ static bool is_announced(void) {
     return false;
 }
 
-/* Waking a process on an idle processor takes tens of microseconds. A read from a stream cannot
- * wait any other way, and asking Wine whether it would takes about as long. */
-static void wait_for_message(void) {
+/* Waking a process on an idle processor takes tens of microseconds. */
+static void watch_bell(const Channel *channel) {
     const uint64_t deadline = clock_now() + LONGEST_WATCH;
 
-    while (!is_announced() && clock_now() < deadline) {
-        SwitchToThread();
+    while (!is_announced(channel) && clock_now() < deadline) {
+        give_way();
     }
 }
 
-bool receive_code(char *code) {
-    if (watched != NULL) {
-        wait_for_message();
+bool receive_head(Channel *channel, Head *head) {
+    if (channel->bell != NULL) {
+        watch_bell(channel);
     }
-    heard++;
-    return receive(code, 1);
+    channel->heard++;
+    return receive_content(channel, (char *)head, sizeof *head);
 }
 
-bool receive_content(char **bytes, size_t *size) {
-    uint64_t length = 0;
+bool send_message(Channel *channel, uint64_t code, const void *content, size_t size) {
+    const Head head = {code, size};
 
-    *bytes = NULL;
-    if (!receive((char *)&length, sizeof length)) {
-        return false;
+    if (size == 0) {
+        return send_all(channel, (const char *)&head, sizeof head);
     }
-    *size = (size_t)length;
-    *bytes = malloc(*size + 1);
-    return *bytes != NULL && receive(*bytes, *size);
-}
-
-bool send_code(char code) {
-    return send(&code, 1);
-}
-
-bool send_content(char code, const void *bytes, size_t size) {
-    const uint64_t length = size;
-    char head[1 + sizeof length] = {code};
-
-    memcpy(head + 1, &length, sizeof length);
-    return send(head, sizeof head) && send(bytes, size);
-}
-
-/* Reading */
-
-const char *read_bytes(Reader *reader, size_t count) {
-    const char *bytes = reader->at;
-
-    if (!reader->sound || count > (size_t)(reader->end - reader->at)) {
-        reader->sound = false;
-        return NULL;
-    }
-    reader->at += count;
-    return bytes;
-}
-
-static void read_into(Reader *reader, void *value, size_t size) {
-    const char *bytes = read_bytes(reader, size);
-
-    if (bytes == NULL) {
-        memset(value, 0, size);
-    } else {
-        memcpy(value, bytes, size);
-    }
-}
-
-uint8_t read_flag(Reader *reader) {
-    uint8_t flag;
-    read_into(reader, &flag, sizeof flag);
-    return flag;
-}
-
-int64_t read_integer(Reader *reader) {
-    int64_t number;
-    read_into(reader, &number, sizeof number);
-    return number;
-}
-
-double read_number(Reader *reader) {
-    double number;
-    read_into(reader, &number, sizeof number);
-    return number;
-}
-
-const char *read_block(Reader *reader, size_t *size) {
-    *size = (size_t)read_integer(reader);
-    const char *bytes = read_bytes(reader, *size);
-    *size = bytes == NULL ? 0 : *size;
-    return bytes;
-}
-
-const char *read_text(Reader *reader) {
-    size_t size;
-    const char *text = read_block(reader, &size);
-    const char *end = read_bytes(reader, 1);
-
-    if (end == NULL || *end != '\0') {
-        reader->sound = false;
-        return "";
-    }
-    return text;
+    char *whole = memory_for(NULL, sizeof head + size); /* the other end wakes up once */
+    memcpy(whole, &head, sizeof head);
+    memcpy(whole + sizeof head, content, size);
+    const bool sent = send_all(channel, whole, sizeof head + size);
+    free(whole);
+    return sent;
 }
 
 /* Writing */
@@ -190,35 +166,45 @@ void *memory_for(void *old, size_t size) {
 
     if (memory == NULL) {
         fprintf(stderr, "the worker has no memory left\n");
-        ExitProcess(1);
+        fflush(stderr);
+        _Exit(1);
     }
     return memory;
 }
 
-void write_bytes(Writer *writer, const void *bytes, size_t count) {
-    if (writer->size + count > writer->room) {
-        writer->room = 2 * (writer->size + count);
+static char *grow(Writer *writer, size_t size) {
+    const size_t begin = writer->size, whole = size + (8 - size % 8) % 8;
+
+    if (begin + whole > writer->room) {
+        writer->room = 2 * (begin + whole);
         writer->bytes = memory_for(writer->bytes, writer->room);
     }
-    if (count > 0) {
-        memcpy(writer->bytes + writer->size, bytes, count);
-        writer->size += count;
-    }
+    writer->size += whole;
+    memset(writer->bytes + begin + size, 0, whole - size);
+    return writer->bytes + begin;
 }
 
 void write_integer(Writer *writer, int64_t number) {
-    write_bytes(writer, &number, sizeof number);
+    memcpy(grow(writer, sizeof number), &number, sizeof number);
 }
 
 void write_number(Writer *writer, double number) {
-    write_bytes(writer, &number, sizeof number);
+    memcpy(grow(writer, sizeof number), &number, sizeof number);
+}
+
+char *write_room(Writer *writer, size_t size) {
+    write_integer(writer, (int64_t)size);
+    return grow(writer, size);
 }
 
 void write_block(Writer *writer, const void *bytes, size_t size) {
-    write_integer(writer, (int64_t)size);
-    write_bytes(writer, bytes, size);
+    char *room = write_room(writer, size);
+
+    if (size > 0) {
+        memcpy(room, bytes, size);
+    }
 }
 
 void write_text(Writer *writer, const char *text) {
-    write_block(writer, text, text == NULL ? 0 : strlen(text));
+    write_block(writer, text == NULL ? "" : text, text == NULL ? 1 : strlen(text) + 1);
 }

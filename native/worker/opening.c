@@ -6,237 +6,202 @@
 
 #include "worker.h"
 
-bool read_access(Reader *reader, const Fmi *fmi, Access *access) {
-    Block blocks[4];
-    Listing listing;
-
-    for (int i = 0; i < 4; i++) {
-        blocks[i].bytes = read_block(reader, &blocks[i].size);
-    }
-    return reader->sound &&
-           listing_take(&listing, blocks[0], blocks[1], blocks[2], blocks[3]) == NULL &&
-           access_open(access, fmi, &listing);
-}
+#if !defined _WIN32
+#include <dlfcn.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#endif
 
 /* Shared memory */
 
-static char *map_file(const char *path, size_t size) {
-    wchar_t wide[4096];
+#if defined _WIN32
 
-    if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) == 0) {
-        return NULL;
+/* A name of memory, or the path of a file in Wine. */
+static void *mapping_of(const wchar_t *name) {
+    void *mapping = OpenFileMappingW(FILE_MAP_ALL_ACCESS, FALSE, name);
+
+    if (mapping != NULL) {
+        return mapping;
     }
-    HANDLE file = CreateFileW(wide, GENERIC_READ | GENERIC_WRITE,
+    HANDLE file = CreateFileW(name, GENERIC_READ | GENERIC_WRITE,
                               FILE_SHARE_READ | FILE_SHARE_WRITE | FILE_SHARE_DELETE, NULL,
                               OPEN_EXISTING, 0, NULL);
-    if (file == INVALID_HANDLE_VALUE) {
+    if (file != INVALID_HANDLE_VALUE) {
+        mapping = CreateFileMappingW(file, NULL, PAGE_READWRITE, 0, 0, NULL);
+        CloseHandle(file);
+    }
+    return mapping;
+}
+
+static char *map_memory(const Worker *w, const char *name, size_t size) {
+    wchar_t wide[4096];
+
+    (void)w;
+    if (MultiByteToWideChar(CP_UTF8, 0, name, -1, wide, 4096) == 0) {
         return NULL;
     }
-    HANDLE mapping = CreateFileMappingW(file, NULL, PAGE_READWRITE, 0, 0, NULL);
+    void *mapping = mapping_of(wide);
     char *memory =
         mapping == NULL ? NULL : MapViewOfFile(mapping, FILE_MAP_ALL_ACCESS, 0, 0, size);
     if (mapping != NULL) {
         CloseHandle(mapping);
     }
-    CloseHandle(file);
     return memory;
 }
 
-static void *place(const Shared *shared, Reader *reader, size_t element, size_t first) {
-    const uint64_t offset = (uint64_t)read_integer(reader);
+static bool load_before(const char *name, const char *path, char *error, size_t size) {
+    wchar_t wide[4096];
 
-    if (offset > shared->size) {
-        reader->sound = false;
-        return NULL;
+    (void)name;
+    if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0 && LoadLibraryW(wide) != NULL) {
+        return true;
     }
-    return shared->base + offset + element * first;
+    snprintf(error, size, "the library '%s' cannot be loaded: Windows error %lu", path,
+             GetLastError());
+    return false;
 }
 
-static bool open_shared(Worker *w, Reader *reader, size_t num_observed) {
+#else
+
+/* Memory of another size than the request says would end this process later. */
+static char *map_memory(const Worker *w, const char *name, size_t size) {
+    struct stat file;
+
+    (void)name;
+    if (fstat(w->memory, &file) != 0 || file.st_size < 0 || (size_t)file.st_size < size) {
+        return NULL;
+    }
+    void *memory = mmap(NULL, size, PROT_READ | PROT_WRITE, MAP_SHARED, w->memory, 0);
+    return memory == MAP_FAILED ? NULL : memory;
+}
+
+/* A library that serves those loaded after it, unless the loader knows another one of its name. */
+static bool load_before(const char *name, const char *path, char *error, size_t size) {
+    if ((*name != '\0' && dlopen(name, RTLD_LAZY) != NULL) ||
+        dlopen(path, RTLD_LAZY | RTLD_GLOBAL) != NULL) {
+        return true;
+    }
+    snprintf(error, size, "the library '%s' cannot be loaded: %s", path, dlerror());
+    return false;
+}
+
+#endif
+
+static const char *load_all_before(Reader *reader, char *error, size_t size) {
+    size_t count, number;
+    const char **names = read_texts(reader, &number), **paths = read_texts(reader, &count);
+    const char *fault = count == number ? reader->fault : "libraries differ in number";
+
+    for (size_t i = 0; i < count && fault == NULL; i++) {
+        fault = load_before(names[i], paths[i], error, size) ? NULL : error;
+    }
+    free((void *)names);
+    free((void *)paths);
+    return fault;
+}
+
+/* Where an array of so many items begins, of which this worker has those from first on. */
+static void *place(Reader *reader, const Shared *shared, size_t item, size_t first, size_t items) {
+    const size_t size = item * items;
+    const int64_t offset = read_integer_in(reader, 0, (int64_t)shared->size);
+
+    if (offset % 8 != 0 || size > shared->size - (size_t)offset) {
+        reader_refuse(reader, "an array is outside of the shared memory");
+    }
+    return shared->base + offset + item * first;
+}
+
+static void read_places(Worker *w, Reader *reader, size_t first) {
     Shared *shared = &w->shared;
-    const char *path = read_text(reader);
+    const Settings *s = &w->opening.settings;
+    const size_t n = shared->stride;
 
-    shared->size = (uint64_t)read_integer(reader);
-    shared->stride = (size_t)read_integer(reader);
-    const size_t first = (size_t)read_integer(reader);
-    shared->base = reader->sound ? map_file(path, (size_t)shared->size) : NULL;
-    if (shared->base == NULL) {
-        return false;
-    }
-    shared->inputs = place(shared, reader, sizeof(double), first);
-    shared->outputs = place(shared, reader, sizeof(double), first);
-    shared->observations = place(shared, reader, sizeof(float) * num_observed, first);
-    shared->statuses = place(shared, reader, 1, first);
-    shared->mask = place(shared, reader, 1, first);
-    shared->health = place(shared, reader, sizeof(int64_t) * HEALTH_COUNTS, first);
-    char *echo = place(shared, reader, 1, 0);
-    const size_t echo_size = (size_t)read_integer(reader);
-    if (reader->sound) {
+    shared->inputs = place(reader, shared, sizeof(double), first, s->inputs->count * n);
+    shared->outputs = place(reader, shared, sizeof(double), first, s->outputs->count * n);
+    shared->observations = place(reader, shared, sizeof(float) * s->num_observed, first, n);
+    shared->statuses = place(reader, shared, 1, first, n);
+    shared->mask = place(reader, shared, 1, first, n);
+    shared->health = place(reader, shared, sizeof(int64_t) * HEALTH_COUNTS, first, n);
+    shared->progress = place(reader, shared, sizeof(int64_t), first, n);
+    const size_t echo_size = (size_t)read_integer_in(reader, 8, UINT16_MAX);
+    char *echo = place(reader, shared, 1, 0, echo_size);
+    const Atomic *bell = place(reader, shared, sizeof(Atomic), 0, 1);
+    if (reader->fault == NULL) {
         log_echo_to(echo, echo_size);
-        frames_watch((const Atomic *)(echo + echo_size));
-    }
-    return reader->sound;
-}
-
-/* Settings, in the order of fmugym/pool/process/windows.py */
-
-static const char *const *read_texts(Reader *reader, size_t *count) {
-    const int64_t number = read_integer(reader);
-    const char **texts = number < 0 || number > INT32_MAX ? NULL : calloc((size_t)number + 1, sizeof *texts);
-
-    *count = texts == NULL ? 0 : (size_t)number;
-    reader->sound = reader->sound && texts != NULL;
-    for (size_t i = 0; i < *count; i++) {
-        texts[i] = read_text(reader);
-    }
-    return texts;
-}
-
-/* Copies a block of value references, one for each state; NULL if it is empty. */
-static const uint32_t *read_references(Reader *reader, size_t states) {
-    size_t size;
-    const char *bytes = read_block(reader, &size);
-    uint32_t *references = malloc(size + 1);
-
-    reader->sound = reader->sound && references != NULL &&
-                    (size == 0 || size == states * sizeof *references);
-    if (!reader->sound || size == 0) {
-        free(references);
-        return NULL;
-    }
-    return memcpy(references, bytes, size);
-}
-
-/* Copies a block of elements of this size; NULL if it is empty. */
-static const void *read_copy(Reader *reader, size_t size, size_t *count) {
-    size_t total;
-    const char *bytes = read_block(reader, &total);
-    void *copy = malloc(total + 1);
-
-    reader->sound = reader->sound && copy != NULL && total % size == 0;
-    *count = reader->sound ? total / size : 0;
-    if (*count == 0) {
-        free(copy);
-        return NULL;
-    }
-    return memcpy(copy, bytes, total);
-}
-
-static void read_solving(Reader *reader, Solving *solving) {
-    solving->method = method_of(read_text(reader));
-    solving->tolerance = read_number(reader);
-    solving->max_step = read_number(reader);
-    solving->states = (size_t)read_integer(reader);
-    solving->indicators = (size_t)read_integer(reader);
-    solving->completes = read_flag(reader);
-    solving->state_references = read_references(reader, solving->states);
-    solving->rate_references = read_references(reader, solving->states);
-    solving->clocks = read_copy(reader, sizeof(Clock), &solving->number_of_clocks);
-    solving->clocked = read_copy(reader, sizeof(Clocked), &solving->number_of_clocked);
-    reader->sound = reader->sound && solving->method != NULL;
-}
-
-static void read_library(Reader *reader, Settings *s) {
-    size_t paths;
-    const int64_t version = read_integer(reader);
-    const int64_t manner = read_integer(reader);
-
-    s->fmi = fmi_table(version, manner);
-    if (read_flag(reader)) {
-        read_solving(reader, &s->solving);
-    }
-    s->model = read_text(reader);
-    s->token = read_text(reader);
-    s->resources = read_text(reader);
-    s->paths = read_texts(reader, &paths);
-    s->logging = read_flag(reader);
-    s->can_save = read_flag(reader);
-    s->categories = read_texts(reader, &s->number_of_categories);
-    size_t size;
-    s->experiment.structural_references = read_block(reader, &size);
-    s->experiment.number_of_structural = size / sizeof(uint32_t);
-    s->experiment.structural_values = read_block(reader, &size);
-    reader->sound = reader->sound && s->fmi != NULL && paths == 1 &&
-                    size == s->experiment.number_of_structural * sizeof(uint64_t);
-    if (reader->sound) {
-        s->can_save = s->can_save && s->fmi->get_state != NULL;
+        w->channel.bell = bell;
+        w->channel.heard = atomic_get(bell);
     }
 }
 
-static void read_experiment(Reader *reader, Settings *s) {
-    s->experiment.start_time = read_number(reader);
-    s->experiment.has_stop_time = read_flag(reader);
-    s->experiment.stop_time = read_number(reader);
-    s->experiment.has_tolerance = read_flag(reader);
-    s->experiment.tolerance = read_number(reader);
-    s->time_step = read_number(reader);
-    s->substeps = read_integer(reader);
-    s->warm_up_steps = read_integer(reader);
-    s->retries = s->can_save ? read_integer(reader) : 0 * read_integer(reader);
-    s->restores = read_flag(reader) && s->can_save;
-    s->rebuilds = read_flag(reader);
-    s->reloads = read_flag(reader);
-    s->one_initialization = read_flag(reader);
-    s->records = read_flag(reader);
+static const char *open_shared(Worker *w, Reader *reader) {
+    Shared *shared = &w->shared;
+    const size_t count = w->opening.settings.count;
+    const char *name = read_text(reader);
+
+    shared->size = (size_t)read_integer_in(reader, 0, PTRDIFF_MAX);
+    shared->stride = (size_t)read_integer_in(reader, (int64_t)count, INT32_MAX);
+    const size_t first = (size_t)read_integer_in(reader, 0, (int64_t)(shared->stride - count));
+    if (reader->fault != NULL) {
+        return reader->fault;
+    }
+    shared->base = map_memory(w, name, shared->size);
+    if (shared->base == NULL) {
+        return "the shared memory cannot be mapped";
+    }
+    read_places(w, reader, first);
+    return reader->fault;
 }
 
-static void read_variables(Worker *w, Reader *reader) {
-    Settings *s = &w->settings;
-    size_t size;
+static const char *allocate(Worker *w) {
+    Settings *s = &w->opening.settings;
 
-    reader->sound = reader->sound && read_access(reader, s->fmi, &w->inputs) &&
-                    read_access(reader, s->fmi, &w->outputs);
-    s->inputs = &w->inputs;
-    s->outputs = &w->outputs;
-    s->num_observed = (size_t)read_integer(reader);
-    s->sampling = (const unsigned char *)read_block(reader, &size);
-    s->sampling = size == 0 ? NULL : s->sampling;
-    reader->sound = reader->sound && (size == 0 || size == w->outputs.count) &&
-                    s->num_observed <= w->outputs.count;
-    const char *starts = read_block(reader, &size);
-    s->start_outputs = size == 0 ? NULL : starts;
-    s->count = (size_t)read_integer(reader);
-    s->threads = (size_t)read_integer(reader);
-}
-
-static bool allocate(Worker *w) {
-    Settings *s = &w->settings;
-
-    w->output_values = calloc(w->outputs.count * s->count + 1, sizeof *w->output_values);
+    w->output_values = calloc(s->outputs->count * s->count + 1, sizeof *w->output_values);
     w->observations = calloc(s->num_observed * s->count + 1, sizeof *w->observations);
     w->statuses = calloc(s->count, sizeof *w->statuses);
     s->output_values = w->output_values;
     s->status = w->statuses;
     s->health = w->shared.health;
-    return w->output_values != NULL && w->observations != NULL && w->statuses != NULL;
+    const bool enough = w->output_values != NULL && w->observations != NULL && w->statuses != NULL;
+    return enough ? NULL : "out of memory";
 }
 
 /* The outputs of the worker before, as long as nothing else is known. */
 static void take_over_outputs(Worker *w) {
-    const size_t count = w->settings.count;
+    const Settings *s = &w->opening.settings;
 
-    for (size_t i = 0; i < w->outputs.count; i++) {
-        memcpy(w->output_values + i * count, w->shared.outputs + i * w->shared.stride,
-               count * sizeof(double));
+    for (size_t i = 0; i < s->outputs->count; i++) {
+        memcpy(w->output_values + i * s->count, w->shared.outputs + i * w->shared.stride,
+               s->count * sizeof(double));
     }
 }
 
-bool worker_open(Worker *w, Reader *reader, char *error, size_t size) {
-    read_library(reader, &w->settings);
-    read_experiment(reader, &w->settings);
-    read_variables(w, reader);
-    if (!reader->sound) {
-        snprintf(error, size, "the first request is damaged");
+/* Returns why it did not work, or NULL. */
+static const char *open_all(Worker *w, Reader *reader, char *error, size_t size) {
+    const Block form = read_block(reader);
+    const char *fault = reader->fault;
+
+    fault = fault == NULL ? opening_take(&w->opening, form.bytes, form.size) : fault;
+    fault = fault == NULL ? open_shared(w, reader) : fault;
+    fault = fault == NULL ? allocate(w) : fault;
+    fault = fault == NULL ? load_all_before(reader, error, size) : fault;
+    return fault == NULL ? reader->fault : fault;
+}
+
+bool answer_open(Worker *w, Reader *reader) {
+    char error[8192];
+    const char *fault = open_all(w, reader, error, sizeof error);
+
+    if (fault != NULL) {
+        send_error(w, fault);
         return false;
     }
-    if (!open_shared(w, reader, w->settings.num_observed) || !allocate(w)) {
-        snprintf(error, size, "the shared memory cannot be mapped: Windows error %lu",
-                 GetLastError());
-        return false;
-    }
-    if (!pool_open(&w->pool, &w->settings, error, size)) {
+    const bool opened = pool_open(&w->pool, &w->opening.settings, error, sizeof error);
+    worker_report(w);
+    if (!opened) {
+        send_error(w, error);
         return false;
     }
     take_over_outputs(w);
+    send_done(w);
     return true;
 }

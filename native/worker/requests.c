@@ -1,12 +1,12 @@
-/* The answers to requests. */
+/* The answers to requests for steps, resets and values. */
 
 #include <stdlib.h>
 #include <string.h>
 
 #include "../derivatives.h"
-#include "../texts.h"
-#include "answers.h"
+#include "worker.h"
 
+#if defined _WIN32
 /* Windows' own header of this function needs another library. */
 typedef struct {
     DWORD size, page_faults;
@@ -14,51 +14,59 @@ typedef struct {
 } MemoryCounters;
 WINBASEAPI BOOL WINAPI K32GetProcessMemoryInfo(HANDLE process, MemoryCounters *counters,
                                                DWORD size);
+#elif defined __linux__
+#include <stdio.h>
+#include <unistd.h>
+#else
+#include <sys/resource.h>
+#endif
 
 enum { FIRST_RESETS = 4 }; /* of each instance; what they take is no leak */
 
-/* In the order of fmugym/pool/process/windows.py */
-enum {
-    REQUEST_RESET,
-    REQUEST_SAVE,
-    REQUEST_RESTORE,
-    REQUEST_WRITE,
-    REQUEST_SAVE_STATES,
-    REQUEST_RESTORE_STATES,
-    REQUEST_COUNT_STEPS,
-    REQUEST_FAILURE,
-    REQUEST_READ,
-    REQUEST_DIFFERENTIATE,
-    REQUEST_TEXT_OF,
-    REQUEST_CLOSE,
-    REQUESTS
-};
-
-/* Steps */
-
-static Matrix shared_inputs(const Worker *w) {
-    return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
-                    sizeof(double)};
+/* The memory that this process takes, without the pages of files; on macOS the most that it has ever
+ * taken. */
+static int64_t memory_of_process(void) {
+#if defined _WIN32
+    MemoryCounters counters = {.size = sizeof counters};
+    const BOOL known = K32GetProcessMemoryInfo(GetCurrentProcess(), &counters, sizeof counters);
+    return known ? (int64_t)counters.working_set : 0;
+#elif defined __linux__
+    long all, resident = 0, shared = 0;
+    FILE *file = fopen("/proc/self/statm", "re");
+    if (file == NULL || fscanf(file, "%ld %ld %ld", &all, &resident, &shared) != 3) {
+        resident = shared = 0;
+    }
+    if (file != NULL) {
+        fclose(file);
+    }
+    return (int64_t)(resident - shared) * sysconf(_SC_PAGESIZE);
+#else
+    struct rusage usage;
+    return getrusage(RUSAGE_SELF, &usage) == 0 ? (int64_t)usage.ru_maxrss : 0;
+#endif
 }
 
-void worker_step(Worker *w, bool some) {
-    Call call = {.inputs = shared_inputs(w), .observations = w->observations};
+/* By how many bytes the process has grown since its first resets. */
+static int64_t growth_after(Worker *w, const char *mask) {
+    const size_t count = w->opening.settings.count;
 
-    if (some) {
-        call.mask = (Mask){w->shared.mask, 1};
+    for (size_t i = 0; i < count; i++) {
+        w->resets += mask[i] != 0;
     }
-    pool_enter(&w->pool);
-    bool troubled = pool_step(&w->pool, &call) > 0;
-    pool_leave(&w->pool);
-    for (size_t i = 0; some && !troubled && i < w->settings.count; i++) {
-        troubled = w->statuses[i] > STATUS_WARNING; /* also of those in the mask */
+    if (w->resets < FIRST_RESETS * (int64_t)count) {
+        return 0;
     }
-    worker_report(w);
-    worker_publish(w);
-    send_code(troubled ? CODE_TROUBLE : CODE_FINE);
+    const int64_t now = memory_of_process();
+    w->first_memory = w->first_memory == 0 ? now : w->first_memory;
+    return now - w->first_memory;
 }
 
 /* Resets */
+
+Matrix shared_inputs(const Worker *w) {
+    return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
+                    sizeof(double)};
+}
 
 /* A list comes with its number the first time, and later as the number only. */
 static const Access *find_list(Worker *w, Reader *reader) {
@@ -66,8 +74,10 @@ static const Access *find_list(Worker *w, Reader *reader) {
 
     if (read_flag(reader)) {
         w->lists = memory_for(w->lists, (w->number_of_lists + 1) * sizeof *w->lists);
-        w->lists[w->number_of_lists].number = number;
-        if (!read_access(reader, w->settings.fmi, &w->lists[w->number_of_lists].access)) {
+        List *list = &w->lists[w->number_of_lists];
+        list->number = number;
+        if (!read_access(reader, w->opening.settings.fmi, &list->access)) {
+            access_close(&list->access);
             return NULL;
         }
         w->number_of_lists++;
@@ -77,199 +87,118 @@ static const Access *find_list(Worker *w, Reader *reader) {
             return &w->lists[i].access;
         }
     }
+    reader_refuse(reader, "there is no such list of variables");
     return NULL;
-}
-
-static int64_t memory_of_process(void) {
-    MemoryCounters counters = {.size = sizeof counters};
-    const BOOL known = K32GetProcessMemoryInfo(GetCurrentProcess(), &counters, sizeof counters);
-    return known ? (int64_t)counters.working_set : 0;
-}
-
-/* By how many bytes the process has grown since its first resets. */
-static int64_t growth_after(Worker *w, const char *mask) {
-    for (size_t i = 0; i < w->settings.count; i++) {
-        w->resets += mask[i] != 0;
-    }
-    if (w->resets < FIRST_RESETS * (int64_t)w->settings.count) {
-        return 0;
-    }
-    const int64_t now = memory_of_process();
-    w->first_memory = w->first_memory == 0 ? now : w->first_memory;
-    return now - w->first_memory;
 }
 
 /* The values of a list of variables, one column for each instance. */
 static Matrix read_values(Worker *w, Reader *reader, const Access *access) {
-    const ptrdiff_t row = (ptrdiff_t)(w->settings.count * sizeof(double));
-    const size_t count = access == NULL ? 0 : access->count;
-    return (Matrix){read_bytes(reader, count * (size_t)row), row, sizeof(double)};
+    const size_t n = w->opening.settings.count, count = access == NULL ? 0 : access->count;
+    size_t values;
+    const double *first = read_array(reader, sizeof *first, &values);
+
+    if (values != count * n) {
+        reader_refuse(reader, "the values of variables differ in number");
+    }
+    return (Matrix){(const char *)first, (ptrdiff_t)(n * sizeof(double)), sizeof(double)};
 }
 
-static void answer_reset(Worker *w, Reader *reader) {
+void answer_reset(Worker *w, Reader *reader) {
     const Access *start = find_list(w, reader);
     const Matrix values = read_values(w, reader, start);
-    const char *mask = read_bytes(reader, w->settings.count);
-    const Call call = {
-        .inputs = shared_inputs(w), .mask = {mask, 1}, .start = start, .start_values = values};
+    const Block mask = read_block(reader);
+    Call call = {.inputs = shared_inputs(w), .start = start, .start_values = values};
 
-    if (start == NULL || !reader->sound) {
-        send_error("a reset is damaged");
+    if (mask.size != w->opening.settings.count) {
+        reader_refuse(reader, "a mask has another length");
+    }
+    if (reader->fault != NULL) {
+        send_error(w, reader->fault);
         return;
     }
+    call.mask = (Mask){mask.bytes, 1};
+    call.observations = w->observations;
     pool_enter(&w->pool);
     pool_reset(&w->pool, &call);
     pool_leave(&w->pool);
     worker_report(w);
     worker_publish(w);
     Writer writer = {.bytes = NULL};
-    write_integer(&writer, growth_after(w, mask));
+    write_integer(&writer, growth_after(w, mask.bytes));
     write_integer(&writer, (int64_t)number_of_initializations());
-    send_result(&writer);
+    send_result(w, &writer);
 }
 
-/* Variables */
+/* Values */
 
-static void answer_write(Worker *w, Reader *reader) {
+void answer_write(Worker *w, Reader *reader) {
     Access access;
-
-    if (!read_access(reader, w->settings.fmi, &access)) {
-        send_error("a list of variables is damaged");
-        return;
-    }
-    const Matrix values = read_values(w, reader, &access);
     ptrdiff_t failed = -1;
-    if (reader->sound) {
-        double *copy = memory_for(NULL, access.count * (size_t)values.row_stride); /* aligned */
-        memcpy(copy, values.data, access.count * (size_t)values.row_stride);
+
+    read_access(reader, w->opening.settings.fmi, &access);
+    const Matrix values = read_values(w, reader, &access);
+    if (reader->fault != NULL) {
+        send_error(w, reader->fault);
+    } else {
+        Writer nothing = {.bytes = NULL};
         pool_enter(&w->pool);
-        failed = pool_write(&w->pool, &access, copy);
+        failed = pool_write(&w->pool, &access, (const double *)(const void *)values.data);
         pool_leave(&w->pool);
-        free(copy);
+        worker_report(w);
+        send_result_unless(w, failed, &nothing);
     }
     access_close(&access);
-    worker_report(w);
-    if (failed >= 0) {
-        send_failure(w, (size_t)failed);
-    } else {
-        send_done();
-    }
 }
 
-static void answer_read(Worker *w, Reader *reader) {
+void answer_read(Worker *w, Reader *reader) {
+    Writer writer = {.bytes = NULL};
     Access access;
 
-    if (!read_access(reader, w->settings.fmi, &access)) {
-        send_error("a list of variables is damaged");
-        return;
-    }
-    const size_t size = access.count * w->settings.count * sizeof(double);
-    double *values = memory_for(NULL, size);
-    pool_enter(&w->pool);
-    const ptrdiff_t failed = pool_read(&w->pool, &access, values);
-    pool_leave(&w->pool);
-    worker_report(w);
-    if (failed >= 0) {
-        send_failure(w, (size_t)failed);
+    if (!read_access(reader, w->opening.settings.fmi, &access)) {
+        send_error(w, reader->fault);
     } else {
-        send_content(CODE_RESULT, values, size);
+        char *values =
+            write_room(&writer, access.count * w->opening.settings.count * sizeof(double));
+        pool_enter(&w->pool);
+        const ptrdiff_t failed = pool_read(&w->pool, &access, (double *)(void *)values);
+        pool_leave(&w->pool);
+        worker_report(w);
+        send_result_unless(w, failed, &writer);
     }
-    free(values);
     access_close(&access);
 }
 
 static void answer_question(Worker *w, const Question *question) {
-    const size_t size =
-        question->seeded->count * question->others->count * w->settings.count * sizeof(double);
-    double *derivatives = memory_for(NULL, size);
+    Writer writer = {.bytes = NULL};
+    const size_t count =
+        question->seeded->count * question->others->count * w->opening.settings.count;
+    char *derivatives = write_room(&writer, count * sizeof(double));
 
     pool_enter(&w->pool);
-    const ptrdiff_t failed = pool_differentiate(&w->pool, shared_inputs(w), question, derivatives);
+    const ptrdiff_t failed = pool_differentiate(&w->pool, shared_inputs(w), question,
+                                                (double *)(void *)derivatives);
     pool_leave(&w->pool);
     worker_report(w);
-    if (failed >= 0) {
-        send_failure(w, (size_t)failed);
-    } else {
-        send_content(CODE_RESULT, derivatives, size);
-    }
-    free(derivatives);
+    send_result_unless(w, failed, &writer);
 }
 
-static void answer_differentiate(Worker *w, Reader *reader) {
+/* The variables of a part of a system have the functions of its FMU. */
+void answer_differentiate(Worker *w, Reader *reader) {
+    const System *system = w->opening.system;
     const bool adjoint = read_flag(reader);
-    Access seeded = {.count = 0}, others = {.count = 0};
+    const int64_t parts = system == NULL ? 1 : (int64_t)system->count;
+    const size_t part = (size_t)read_integer_in(reader, 0, parts - 1);
+    const Fmi *fmi = system == NULL ? w->opening.settings.fmi : system->parts[part].fmi;
+    Access seeded, others;
 
-    if (read_access(reader, w->settings.fmi, &seeded) &&
-        read_access(reader, w->settings.fmi, &others)) {
-        const Question question = {adjoint, 0, &seeded, &others};
-        answer_question(w, &question);
+    read_access(reader, fmi, &seeded);
+    read_access(reader, fmi, &others);
+    if (reader->fault != NULL) {
+        send_error(w, reader->fault);
     } else {
-        send_error("a list of variables is damaged");
+        const Question question = {adjoint, part, &seeded, &others};
+        answer_question(w, &question);
     }
     access_close(&seeded);
     access_close(&others);
-}
-
-/* Questions */
-
-static void answer_count_steps(Worker *w, Reader *reader) {
-    (void)reader;
-    pool_enter(&w->pool);
-    pool_count_steps(&w->pool);
-    pool_leave(&w->pool);
-    send_done();
-}
-
-static void answer_failure(Worker *w, Reader *reader) {
-    const int64_t index = read_integer(reader);
-    Writer writer = {.bytes = NULL};
-
-    if (index < 0 || (size_t)index >= w->settings.count) {
-        send_error("there is no such instance");
-        return;
-    }
-    write_failure(w, &writer, (size_t)index);
-    send_result(&writer);
-}
-
-static void answer_text_of(Worker *w, Reader *reader) {
-    Writer writer = {.bytes = NULL};
-
-    (void)w;
-    write_text(&writer, text_with(read_number(reader)));
-    send_result(&writer);
-}
-
-static void answer_close(Worker *w, Reader *reader) {
-    (void)reader;
-    pool_enter(&w->pool);
-    pool_close(&w->pool);
-    pool_leave(&w->pool);
-    worker_report(w);
-    send_done();
-}
-
-bool worker_answer(Worker *w, Reader *reader) {
-    static void (*const answers[REQUESTS])(Worker *, Reader *) = {
-        [REQUEST_RESET] = answer_reset,
-        [REQUEST_SAVE] = answer_save,
-        [REQUEST_RESTORE] = answer_restore,
-        [REQUEST_WRITE] = answer_write,
-        [REQUEST_SAVE_STATES] = answer_save_states,
-        [REQUEST_RESTORE_STATES] = answer_restore_states,
-        [REQUEST_COUNT_STEPS] = answer_count_steps,
-        [REQUEST_FAILURE] = answer_failure,
-        [REQUEST_READ] = answer_read,
-        [REQUEST_DIFFERENTIATE] = answer_differentiate,
-        [REQUEST_TEXT_OF] = answer_text_of,
-        [REQUEST_CLOSE] = answer_close,
-    };
-    const uint8_t request = read_flag(reader);
-
-    if (request >= REQUESTS) {
-        send_error("workers in Wine cannot do this");
-        return true;
-    }
-    answers[request](w, reader);
-    return request != REQUEST_CLOSE;
 }

@@ -1,9 +1,9 @@
-/* A worker: a pool for a block of the instances of the process that has started it. */
+/* A worker: a pool for a block of the instances of the process that has started it. It is the same
+ * in a process that the extension serves and in the program for Windows. */
 
 #ifndef FMUGYM_WORKER_H
 #define FMUGYM_WORKER_H
 
-#include "../pool.h"
 #include "frames.h"
 
 /* The block's part of the arrays that the processes share; see
@@ -11,13 +11,12 @@
  * the others have no gaps. */
 typedef struct {
     char *base;
-    uint64_t size;
-    size_t stride;
+    size_t size, stride;
     double *inputs, *outputs;
     float *observations;
     int8_t *statuses;
     const char *mask;
-    int64_t *health;
+    int64_t *health, *progress;
 } Shared;
 
 /* A list of variables that the other process refers to by a number. */
@@ -26,10 +25,14 @@ typedef struct {
     Access access;
 } List;
 
+typedef struct Rolling Rolling;
+
 typedef struct {
+    Channel channel;
+    int memory; /* the descriptor of the shared memory; not used on Windows */
+    int64_t process; /* its number: an FMU may have forked it */
+    Opening opening; /* from here to resets all is of an opened pool */
     Pool pool;
-    Settings settings;
-    Access inputs, outputs;
     Shared shared;
     double *output_values;
     float *observations;
@@ -38,26 +41,49 @@ typedef struct {
     size_t number_of_lists;
     Snapshot **snapshots; /* NULL for those that were freed */
     size_t number_of_snapshots;
+    Rolling *rolling;     /* what surrounds the steps of rollouts, or NULL */
     int64_t resets;       /* of single instances */
     int64_t first_memory; /* bytes of the process after the first resets; 0 before */
 } Worker;
 
-/* Opens the pool as the content of the first request says, which must stay in place. Returns
- * whether that worked; if not, error says why. */
-bool worker_open(Worker *worker, Reader *reader, char *error, size_t size);
+int64_t number_of_process(void);
 
-/* Reads a list of variables: a block of their types, and a block of their value references. */
-bool read_access(Reader *reader, const Fmi *fmi, Access *access);
+/* Answers requests until one is to close, or the other end is gone. */
+void worker_serve(Worker *worker);
+
+/* Opens the pool as the content of the first request says. Returns whether that worked; if not, it has
+ * told why. */
+bool answer_open(Worker *worker, Reader *reader);
+
+/* The answers to other requests. */
+void answer_reset(Worker *worker, Reader *reader);
+void answer_write(Worker *worker, Reader *reader);
+void answer_read(Worker *worker, Reader *reader);
+void answer_differentiate(Worker *worker, Reader *reader);
+void answer_save(Worker *worker, Reader *reader);
+void answer_restore(Worker *worker, Reader *reader);
+void answer_release(Worker *worker, Reader *reader);
+void answer_save_states(Worker *worker, Reader *reader);
+void answer_restore_states(Worker *worker, Reader *reader);
+void answer_roll_out(Worker *worker, Reader *reader);
 
 /* Passes on the messages of the FMUs. */
 void worker_report(Worker *worker);
-
 /* Copies outputs, observations and statuses to the shared memory. */
 void worker_publish(Worker *worker);
+/* The inputs of a step in the shared memory. */
+Matrix shared_inputs(const Worker *worker);
 
-/* Answers a request. Returns whether the worker goes on. */
-bool worker_answer(Worker *worker, Reader *reader);
-void worker_release(Worker *worker, Reader *reader);
-void worker_step(Worker *worker, bool some);
+void send_done(Worker *worker);
+/* Frees what the writer has. */
+void send_answer(Worker *worker, uint64_t code, Writer *writer);
+void send_result(Worker *worker, Writer *writer);
+void send_error(Worker *worker, const char *text);
+/* Sends why the last status of an instance was bad, as an error. */
+void send_failure(Worker *worker, size_t index);
+/* Sends it if an instance has failed, otherwise the result. Frees what the writer has. */
+void send_result_unless(Worker *worker, ptrdiff_t failed, Writer *writer);
+/* Whether there is a failure is the first number. */
+void write_failure(Worker *worker, Writer *writer, size_t index);
 
 #endif

@@ -249,7 +249,7 @@ def fmpy_pool(
         )
 
     def instances(count: int) -> list[FMPyInstance]:
-        fmu.prepare_library()
+        fmu.prepare_libraries()
         libraries = copy_libraries(fmu, fmu.extract(), count)
         return [FMPyInstance(fmu, spec, log, library) for library in libraries]
 

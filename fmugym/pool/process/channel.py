@@ -1,28 +1,30 @@
 """Messages between the pool of processes and one of its workers, over a pair of sockets.
 
-A message is a code of one byte, or a code and an object. The step of a trivial FMU takes a
-microsecond, so the most frequent messages are bare codes. Between processes of Python, objects are
-pickled: both ends trust each other, because they run the same program of the same user.
+A message is a head of two numbers, a code and a size, and a content of this size. The other end is
+``native/worker/frames.c``. It may send anything: no more memory is taken than has come, and every
+wait has a limit.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import pickle
 import select
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from fmugym.pool.process.output import Output
 
-__all__ = ["Channel", "Code", "Coding", "Pickled"]
+__all__ = ["Channel", "LateError"]
 
-_LENGTH: Final = struct.Struct("<Q")
+_HEAD: Final = struct.Struct("=QQ")
+
+_LARGEST_PIECE: Final = 2**20
+"""The most bytes of a content that there is memory for before they have come."""
 
 _LOOKS: Final = 60
 """How often a process looks before it goes to sleep; all looks take about 40 us."""
@@ -36,54 +38,8 @@ _AT_ONCE: Final = getattr(socket, "MSG_DONTWAIT", 0)
 _give_way: Final = getattr(os, "sched_yield", lambda: time.sleep(0.0))
 
 
-class Code:
-    """The codes. Those of replies are capital letters."""
-
-    STEP = b"s"
-    """Step all instances."""
-    STEP_SOME = b"k"
-    """Step all instances except those in the mask."""
-    REQUEST = b"r"
-    """Call a method of the worker. The object is its name and arguments."""
-    RELEASE = b"f"
-    """Free snapshots. The object is their numbers. There is no reply."""
-
-    FINE = b"F"
-    """The step was done, and no status is worse than a warning."""
-    TROUBLE = b"T"
-    """The step was done, and some statuses are worse than a warning."""
-    RESULT = b"R"
-    """The object is what the method returned."""
-    ERROR = b"E"
-    """The object is what the method raised."""
-    LOG = b"L"
-    """The object is a message of the FMU and its level. It may come at any time."""
-    FAULT = b"X"
-    """The object is the exit status of the process, which ends now. Only programs tell it."""
-
-
-class Coding(Protocol):
-    """Turns objects into bytes and back."""
-
-    def dumps(self, code: bytes, content: Any) -> bytes:
-        """Turn the object of a message with this code into bytes."""
-        ...
-
-    def loads(self, code: bytes, data: bytearray) -> Any:
-        """Turn bytes into the object of a message with this code."""
-        ...
-
-
-class Pickled:
-    """The coding between processes of Python; see ``Coding``."""
-
-    def dumps(self, code: bytes, content: Any) -> bytes:
-        """See ``Coding.dumps``."""
-        return pickle.dumps(content, pickle.HIGHEST_PROTOCOL)
-
-    def loads(self, code: bytes, data: bytearray) -> Any:
-        """See ``Coding.loads``."""
-        return pickle.loads(data)
+class LateError(OSError):
+    """A message could not be sent, or its rest has not come, in time."""
 
 
 class Channel:
@@ -97,39 +53,56 @@ class Channel:
         sentinel: A file descriptor that becomes readable when the other process has ended; None
             where there is none.
         output: What the other process prints; passed on while this one waits.
-        coding: How objects are sent.
-        bell: The count of messages sent, in memory that the other process watches while it waits;
-            None if it does not.
+        bell: The count of messages sent, the only element of memory that the other process watches
+            while it waits.
 
     Attributes:
         end: The socket.
     """
 
     def __init__(
-        self,
-        end: socket.socket,
-        sentinel: int | None = None,
-        output: Output | None = None,
-        coding: Coding | None = None,
-        bell: memoryview | None = None,
+        self, end: socket.socket, sentinel: int | None, output: Output, bell: memoryview
     ) -> None:
         self.end = end
-        self._bell = bell
-        self._coding = Pickled() if coding is None else coding
+        self._bell, self._rung = bell, 0
+        self._bell[0] = 0
         self._send, self._receive = end.send, end.recv
         self._descriptor, self._sentinel = end.fileno(), sentinel
         self._lock = threading.Lock()
         self._look = _poller(end.fileno())
-        self._poll = _poller(end.fileno(), sentinel)
-        if output is not None:
-            self._poll = _listener(output, end.fileno(), sentinel)
+        self._poll = _listener(output, end.fileno(), sentinel)
 
-    def send_code(self, code: bytes) -> None:
-        """Send a bare code."""
+    def send(self, code: int, content: bytes = b"", deadline: float = math.inf) -> None:
+        """Send a message; those of several threads do not mix.
+
+        Args:
+            code: The code.
+            content: The content.
+            deadline: Until when, in the time of ``time.monotonic``.
+
+        Raises:
+            OSError: If the other end is gone, or a ``LateError``.
+        """
         with self._lock:
-            self._send(code)
-            if self._bell is not None:  # not earlier, or else the other process would wait for it
-                self._bell[0] += 1
+            self._send_all(_HEAD.pack(code, len(content)) + content, deadline)
+            self._rung += 1
+            self._bell[0] = self._rung  # not earlier, or else the other process would wait for it
+
+    def _send_all(self, data: bytes, deadline: float) -> None:
+        sent = self._send_some(data, deadline)
+        if sent < len(data):
+            view = memoryview(data)[sent:]
+            while view:
+                view = view[self._send_some(view, deadline) :]
+
+    def _send_some(self, data: bytes | memoryview, deadline: float) -> int:
+        while True:
+            try:
+                return self._send(data, _AT_ONCE)
+            except BlockingIOError:
+                if self._has_ended():
+                    raise BrokenPipeError("the other process has ended") from None
+                _wait_to_send(_time_until(deadline), self._descriptor, self._sentinel)
 
     def wait(self, seconds: float | None = None) -> bool:
         """Wait until there is something to receive or the other process has ended.
@@ -153,75 +126,53 @@ class Channel:
             return bool(poll(None))
         return bool(poll(1e3 * min(max(0.0, seconds), _LONGEST_WAIT)))
 
-    def receive_code(self) -> bytes:
-        """Receive the next code, after ``wait``.
+    def receive_head(self, deadline: float) -> tuple[int, int]:
+        """Receive the next code, and the size of the content, after ``wait``.
 
-        Returns:
-            The code; nothing if the other end is closed.
+        Args:
+            deadline: Until when, in the time of ``time.monotonic``.
 
         Raises:
             OSError: If the other process has ended, and left nothing to receive.
+            EOFError: If the other end is closed.
+            LateError: If the whole head has not come in time.
         """
-        return self._receive(1, _AT_ONCE)
+        data = self._receive(_HEAD.size, _AT_ONCE)
+        if len(data) < _HEAD.size:
+            if not data:
+                raise EOFError
+            data += self.receive_content(_HEAD.size - len(data), deadline)
+        code, size = _HEAD.unpack(data)
+        return code, size
 
-    def send_object(self, code: bytes, content: Any) -> None:
-        """Send a code and an object; messages of several threads do not mix."""
-        data = self._coding.dumps(code, content)
-        with self._lock:
-            self._send_all(b"".join((code, _LENGTH.pack(len(data)), data)))
-            if self._bell is not None:
-                self._bell[0] += 1
-
-    def _send_all(self, data: bytes) -> None:
-        view = memoryview(data)
-        while view:
-            try:
-                view = view[self.end.send(view, _AT_ONCE) :]
-            except BlockingIOError:
-                if self._has_ended():
-                    raise BrokenPipeError("the other process has ended") from None
-                _wait_to_send(self._descriptor, self._sentinel)
-
-    def _has_ended(self) -> bool:
-        return self._sentinel is not None and bool(_poller(self._sentinel)(0.0))
-
-    def receive_object(self, code: bytes) -> Any:
-        """Receive the object that follows this code.
+    def receive_content(self, size: int, deadline: float) -> bytes:
+        """Receive a content of this size.
 
         Raises:
-            EOFError: If the other end is gone before the whole object has come.
+            EOFError: If the other end is gone before the whole content has come.
+            LateError: If it has not come in time.
         """
-        (length,) = _LENGTH.unpack(self._receive_exactly(_LENGTH.size))
-        return self._coding.loads(code, self._receive_exactly(length))
-
-    def _receive_exactly(self, count: int) -> bytearray:
-        data = bytearray(count)
-        view = memoryview(data)
-        while view:
-            received = self._receive_into(view)
+        data = bytearray()
+        while len(data) < size:
+            received = self._receive_some(min(size - len(data), _LARGEST_PIECE), deadline)
             if not received:
                 raise EOFError
-            view = view[received:]
-        return data
+            data += received
+        return bytes(data)
 
-    def _receive_into(self, view: memoryview) -> int:
+    def _receive_some(self, size: int, deadline: float) -> bytes:
         has_ended = False
         while True:
             try:
-                return self.end.recv_into(view, 0, _AT_ONCE)
+                return self._receive(size, _AT_ONCE)
             except BlockingIOError:
                 if has_ended:  # and this attempt came after its last bytes
-                    return 0
-                self._poll(None)
+                    return b""
+                self._poll(_time_until(deadline))
                 has_ended = self._has_ended()
 
-    def require_open(self) -> None:
-        """Make sure that this end is open: an FMU may have closed its descriptor.
-
-        Raises:
-            OSError: If it is closed.
-        """
-        os.fstat(self._descriptor)
+    def _has_ended(self) -> bool:
+        return self._sentinel is not None and bool(_poller(self._sentinel)(0.0))
 
     def close(self) -> None:
         """Close this end."""
@@ -241,25 +192,38 @@ def _poller(*descriptors: int | None) -> Callable[[float | None], Any]:
 
 def _listener(output: Output, *descriptors: int | None) -> Callable[[float | None], Any]:
     """Make a function as ``_poller`` does, which passes on output while it waits."""
+    known = [descriptor for descriptor in descriptors if descriptor is not None]
 
     def wait(ms: float | None) -> bool:
         deadline = math.inf if ms is None else time.monotonic() + 1e-3 * ms
         while True:
-            look = _poller(*descriptors, *output.descriptors)
+            look = _poller(*known, *output.descriptors)
             left = None if ms is None else max(0.0, 1e3 * (deadline - time.monotonic()))
-            ready = {descriptor for descriptor, _ in look(left)}
+            ready = {one if isinstance(one, int) else one[0] for one in look(left)}
             if ready.intersection(output.descriptors):
                 output.pump()
-            if ready.intersection(descriptors) or time.monotonic() >= deadline:
-                return bool(ready.intersection(descriptors))
+            if ready.intersection(known) or time.monotonic() >= deadline:
+                return bool(ready.intersection(known))
 
     return wait
 
 
-def _wait_to_send(descriptor: int, sentinel: int | None) -> None:
+def _time_until(deadline: float) -> float:
+    """How many ms to wait at most.
+
+    Raises:
+        LateError: If the time is over.
+    """
+    left = deadline - time.monotonic()
+    if left <= 0.0:
+        raise LateError("the time is over")
+    return 1e3 * min(left, _LONGEST_WAIT)
+
+
+def _wait_to_send(ms: float, descriptor: int, sentinel: int | None) -> None:
     """Wait until something can be sent, or the other process has ended."""
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)
     if sentinel is not None:
         poll.register(sentinel, select.POLLIN)
-    poll.poll()
+    poll.poll(ms)

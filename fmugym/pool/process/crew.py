@@ -16,9 +16,9 @@ from fmugym.errors import FMUGymError, FMULoadError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray
 from fmugym.pool.health import Column
+from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Arrays, Memory
 from fmugym.pool.process.supervisor import INSTANTIATION, LostError, Supervisor, patience_with
-from fmugym.pool.process.worker import Setup
 
 __all__ = ["Crew"]
 
@@ -73,7 +73,9 @@ class Crew:
         """Let all workers make their instances at the same time."""
         try:
             for supervisor in self.supervisors:
-                supervisor.start()
+                supervisor.begin()
+            for supervisor in self.supervisors:
+                supervisor.confirm()
             for supervisor in self.supervisors:
                 supervisor.finish_opening(self._deadline(INSTANTIATION))
         except LostError as lost:
@@ -111,6 +113,7 @@ class Crew:
         replies: dict[Supervisor, Any] = {}
         try:
             for supervisor in supervisors:
+                supervisor.deadline = deadline
                 tell(supervisor)
             for supervisor in supervisors:
                 try:

@@ -1,45 +1,80 @@
-"""Starts the processes of workers: with a fork server, or by spawning where there is none."""
+"""Starts the processes of workers: with the guard, or each by itself where there is no fork."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import multiprocessing
+import marshal
 import multiprocessing.spawn
 import os
-import pickle
 import select
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import weakref
-from collections.abc import Sequence
-from multiprocessing.reduction import DupFd
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from fmugym.pool.process.fork_server import ANSWER, PROGRAM, Program
+from fmugym.pool.process import guard
 from fmugym.pool.process.shared_memory import Memory
-from fmugym.pool.process.worker import run_worker
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["Process", "launch", "launch_program"]
+__all__ = ["Order", "Process", "launch"]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be started.
+
+    Attributes:
+        folder: Where the FMU was extracted to. It is removed if this process is killed.
+        directory: The working directory; the folder if it has been removed.
+        environment: The environment variables.
+        command: A program and its arguments; empty for a worker in a bare interpreter.
+    """
+
+    folder: Path
+    directory: str
+    environment: Mapping[str, str]
+    command: Sequence[str] = ()
+
+    def packed(self) -> bytes:
+        """The order as the guard takes it."""
+        parts = {
+            "folder": str(self.folder),
+            "directory": self.directory,
+            "environment": dict(self.environment),
+            "command": list(self.command),
+            "path": [str(place) for place in sys.path],  # for FMUs that run Python
+        }
+        data = marshal.dumps(parts)
+        return guard.SIZE.pack(len(data)) + data
 
 
 class Process(Protocol):
     """A worker's process.
 
     Attributes:
-        pid: Its number.
-        sentinel: A file descriptor that becomes readable when the process has ended; None where
-            there is none.
+        pid: Its number; 0 before ``confirm``.
+        sentinel: A file descriptor that becomes readable when the process has ended, after
+            ``confirm``; None where there is none.
     """
 
     pid: int
     sentinel: int | None
+
+    def confirm(self) -> None:
+        """Wait until the process is there. Many can be started before one has to be.
+
+        Raises:
+            EOFError: If the guard has ended.
+            OSError: If the system refuses.
+        """
+        ...
 
     def kill(self) -> None:
         """End the process at once, whatever it does."""
@@ -54,92 +89,75 @@ class Process(Protocol):
         ...
 
 
-def launch(end: socket.socket, memory: Memory, folder: Path, pipes: Sequence[int] = ()) -> Process:
+def launch(end: socket.socket, memory: Memory, order: Order, pipes: Sequence[int]) -> Process:
     """Start a worker.
 
     Args:
         end: The worker's end of the channel. The caller may close it afterwards.
         memory: Shared with the worker.
-        folder: Where its FMU was extracted to. It is removed if this process is killed.
+        order: What to start.
         pipes: For its standard output and standard error; not used on Windows.
 
     Raises:
         OSError: If the system refuses.
     """
     if sys.platform == "win32":
-        return _SpawnedProcess(end, memory)
-    return _start(folder, memory.size, (end.fileno(), memory.descriptor, *pipes))
+        return _LoneProcess(end, order)
+    descriptors = end.fileno(), memory.descriptor, *pipes
+    try:
+        return _guard().start(order, descriptors)
+    except ordinary(EOFError, BrokenPipeError, ConnectionResetError):  # it has ended
+        _cached_guard.cache_clear()
+        return _guard().start(order, descriptors)
 
 
-def launch_program(
-    end: socket.socket, program: Program, folder: Path, pipes: Sequence[int]
-) -> Process:
-    """Start a worker that is a program; the channel is its standard input and output.
+def _command(number: int) -> list[str]:
+    """The command that runs the program of ``guard`` in a bare interpreter."""
+    from fmugym import _native
 
-    Args:
-        end: The worker's end of the channel. The caller may close it afterwards.
-        program: What to start.
-        folder: Where its FMU was extracted to. It is removed if this process is killed.
-        pipes: Two, of which the second gets its standard error.
-
-    Raises:
-        OSError: If the system refuses.
-    """
-    with tempfile.TemporaryFile() as order:  # a request of the fork server is limited
-        order.write(pickle.dumps(program))
-        order.flush()
-        return _start(folder, PROGRAM, (end.fileno(), order.fileno(), *pipes))
+    executable = multiprocessing.spawn.get_executable()
+    if executable == sys.executable:  # nobody has set another one
+        executable = getattr(sys, "_base_executable", executable)
+    arguments = guard.__file__, _native.__file__, str(number), str(os.getpid())
+    return [os.fsdecode(executable), "-I", "-S", *arguments]
 
 
-class _ForkServer:
-    """This end of ``fmugym.pool.process.fork_server``; a process has at most one server."""
+class _Guard:
+    """This end of the guard; a process has at most one."""
 
     def __init__(self) -> None:
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            process = _run_fork_server(theirs)
+            process = subprocess.Popen(
+                _command(theirs.fileno()), stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()]
+            )
             self._requests = ours.detach()  # a socket would complain at the interpreter's end
         self.pid = process.pid
         process.returncode = 0  # or else Popen would complain that it still runs
         self._stop = weakref.finalize(self, _stop, self._requests, self.pid)
         self._stop.atexit = False  # pools may still have to close their workers then
 
-    def start(self, folder: Path, size: int, descriptors: Sequence[int]) -> _ForkedProcess:
+    def start(self, order: Order, descriptors: Sequence[int]) -> _GuardedProcess:
         """Start a worker with a lifeline of its own, so that threads do not mix.
 
         Raises:
-            EOFError: If the server has ended.
+            EOFError: If the guard has ended.
             OSError: If the system refuses.
         """
         ours, theirs = socket.socketpair()
         try:
             with theirs, socket.socket(fileno=os.dup(self._requests)) as requests:
-                data = pickle.dumps((str(folder), size))
-                socket.send_fds(requests, [data], [theirs.fileno(), *descriptors])
-            return _ForkedProcess(ours)
+                socket.send_fds(requests, [b"w"], [theirs.fileno(), *descriptors])
+            ours.sendall(order.packed())
+            return _GuardedProcess(ours)
         except BaseException:
             ours.close()
             raise
 
     def forget(self) -> None:
-        """Let go of the server, because this process is a fork of the one that started it."""
+        """Let go of the guard, because this process is a fork of the one that started it."""
         self._stop.detach()
         os.close(self._requests)
-
-
-def _run_fork_server(requests: socket.socket) -> subprocess.Popen[bytes]:
-    program = (
-        f"import sys; sys.path[:] = {sys.path!r}; "
-        "from fmugym.pool.process.fork_server import main; "
-        f"main({requests.fileno()}, {os.getpid()})"
-    )
-    return subprocess.Popen(
-        [multiprocessing.spawn.get_executable(), "-c", program],
-        stdin=subprocess.DEVNULL,
-        pass_fds=[requests.fileno()],
-        # A process that forks should have no threads.
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"},
-    )
 
 
 def _stop(requests: int, pid: int) -> None:
@@ -149,32 +167,23 @@ def _stop(requests: int, pid: int) -> None:
 
 
 @functools.cache
-def _cached_fork_server() -> _ForkServer:
-    return _ForkServer()
+def _cached_guard() -> _Guard:
+    return _Guard()
 
 
 _making = threading.Lock()
 
 
-def _fork_server() -> _ForkServer:
-    """Return the server of this process; several threads may ask at the same time."""
+def _guard() -> _Guard:
+    """Return the guard of this process; several threads may ask at the same time."""
     with _making:
-        return _cached_fork_server()
+        return _cached_guard()
 
 
-def _start(folder: Path, size: int, descriptors: Sequence[int]) -> _ForkedProcess:
-    """Start a worker with the fork server, or with a new one if the old one has ended."""
-    try:
-        return _fork_server().start(folder, size, descriptors)
-    except ordinary(EOFError, BrokenPipeError, ConnectionResetError):
-        _cached_fork_server.cache_clear()
-        return _fork_server().start(folder, size, descriptors)
-
-
-def _forget_fork_server() -> None:
-    if _cached_fork_server.cache_info().currsize:
-        _cached_fork_server().forget()
-        _cached_fork_server.cache_clear()
+def _forget_guard() -> None:
+    if _cached_guard.cache_info().currsize:
+        _cached_guard().forget()
+        _cached_guard.cache_clear()
     _making.release()
 
 
@@ -182,40 +191,38 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(
         before=_making.acquire,
         after_in_parent=_making.release,
-        after_in_child=_forget_fork_server,
+        after_in_child=_forget_guard,
     )
 
 
-class _ForkedProcess:
-    """A worker of the fork server.
+class _GuardedProcess:
+    """A worker of the guard.
 
     Args:
         lifeline: Gives the process number and the exit status. It is closed with the process.
-
-    Raises:
-        EOFError: If the server has ended.
-        OSError: If the server cannot fork.
     """
 
     def __init__(self, lifeline: socket.socket) -> None:
-        self._lifeline = lifeline
+        self._lifeline, self.pid = lifeline, 0
         self.sentinel: int | None = lifeline.fileno()
+
+    def confirm(self) -> None:
         pid = self._answer()
         if pid is None:
-            raise EOFError("the fork server has ended")
+            raise EOFError("the guard has ended")
         if pid < 0:
             raise OSError(-pid, os.strerror(-pid))
         self.pid = pid
 
     def _answer(self) -> int | None:
         try:
-            data = self._lifeline.recv(ANSWER.size, socket.MSG_WAITALL)
+            data = self._lifeline.recv(guard.ANSWER.size, socket.MSG_WAITALL)
         except ConnectionResetError:
             return None
-        return None if len(data) < ANSWER.size else int(ANSWER.unpack(data)[0])
+        return None if len(data) < guard.ANSWER.size else int(guard.ANSWER.unpack(data)[0])
 
     def kill(self) -> None:
-        with Ignoring(OSError):  # the fork server has ended, and it has with it
+        with Ignoring(OSError):  # the guard has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
     def exit_status(self, patience: float) -> int | None:
@@ -225,48 +232,41 @@ class _ForkedProcess:
             return None
         status = self._answer()
         self.forget()
-        return -signal.SIGKILL if status is None else status  # it went with its fork server
+        return -signal.SIGKILL if status is None else status  # it went with its guard
 
     def forget(self) -> None:
         self._lifeline.close()
 
 
-class _SpawnedProcess:
-    """A worker that ``multiprocessing`` has spawned."""
+class _LoneProcess:
+    """A worker on Windows, which has no guard."""
 
     sentinel: int | None = None
 
-    def __init__(self, end: socket.socket, memory: Memory) -> None:
-        context = multiprocessing.get_context("spawn")
-        shared = DupFd(memory.descriptor) if memory.descriptor >= 0 else memory.tag
-        arguments = (end, memory.size, shared)
-        self._process = context.Process(target=_run_spawned, args=arguments, daemon=True)
-        self._process.start()
-        self.pid = self._process.pid or 0
+    def __init__(self, end: socket.socket, order: Order) -> None:
+        share = getattr(end, "share")  # noqa: B009  (mypy knows it on Windows only)
+        process = subprocess.Popen(
+            _command(len(share(os.getpid()))),
+            stdin=subprocess.PIPE,
+            env=dict(order.environment),
+            cwd=order.directory if os.path.isdir(order.directory) else str(order.folder),
+        )
+        self._process, self.pid = process, process.pid
+        assert process.stdin is not None
+        with process.stdin:
+            process.stdin.write(share(process.pid))
+
+    def confirm(self) -> None:
+        """Do nothing: it is there."""
 
     def kill(self) -> None:
         self._process.kill()
 
     def exit_status(self, patience: float) -> int | None:
-        self._process.join(patience)
-        return self._process.exitcode
+        try:
+            return self._process.wait(patience)
+        except subprocess.TimeoutExpired:
+            return None
 
     def forget(self) -> None:
-        """Do nothing: ``multiprocessing`` itself forgets the processes of another process."""
-
-
-def _run_spawned(end: socket.socket, size: int, shared: Any) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    if isinstance(shared, str):
-        memory = Memory(size, tag=shared)
-    else:
-        memory = Memory(size, shared.detach())
-        memory.close()
-    sys.exit(run_worker(end, memory))
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-    os._exit(1)
+        """Do nothing: the process ends with its channel."""

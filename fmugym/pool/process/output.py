@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from fmugym.signals import Ignoring
 
-__all__ = ["Output", "print_line_by_line", "redirect"]
+__all__ = ["Output", "print_line_by_line"]
 
 _LINES: Final = 10
 _LINE_LENGTH: Final = 300
@@ -130,14 +130,6 @@ def _write(stream: int, data: bytes) -> None:
     with Ignoring(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
-
-
-def redirect(output: int, error: int) -> None:
-    """Let a worker print to its parent's pipes, line by line, since the next may be its last."""
-    for descriptor, stream in zip((output, error), _STREAMS, strict=True):
-        os.dup2(descriptor, stream)
-        os.close(descriptor)
-    print_line_by_line()
 
 
 def print_line_by_line() -> None:

@@ -34,19 +34,32 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import IndexArray
+from fmugym.pool.derivatives import Question, Variables, differentiated
+from fmugym.pool.form import table_of
 from fmugym.pool.health import HealthArray
-from fmugym.pool.process.channel import Code
 from fmugym.pool.process.crew import Crew
+from fmugym.pool.process.requests import (
+    Answer,
+    Reader,
+    Request,
+    read_values,
+    request_differentiate,
+    request_index,
+    request_listing,
+    request_reset,
+    request_text_of,
+    request_write,
+)
+from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
-from fmugym.pool.process.worker import Setup
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
-    from fmugym.pool.process.rollouts import PlayOfWorkers
+    from fmugym.pool.process.rollouts import PlayOfWorkers, Rolled
 
 __all__ = ["ProcessPool"]
 
@@ -102,6 +115,7 @@ class ProcessPool(SavingPool):
         except BaseException:
             fmu.close()
             raise
+        self._version = table_of(fmu.description)
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
@@ -157,11 +171,11 @@ class ProcessPool(SavingPool):
             told = None if number in supervisor.known else variables
             supervisor.known.add(number)
             supervisor.forget_output()
-            supervisor.tell("reset", number, told, values[:, block], mask[block])
+            content = request_reset(number, told, self._version, values[:, block], mask[block])
+            supervisor.tell(Request.RESET, content, supervisor.read_growth)
 
-        for supervisor, growth in self._crew.run("a reset", alive, tell).items():
+        for supervisor in self._crew.run("a reset", alive, tell):
             supervisor.note_success()
-            supervisor.growth = growth
             block = supervisor.block
             self._crew.lost[block] &= ~mask[block]
         return [s for s in used if s.is_new]
@@ -220,14 +234,14 @@ class ProcessPool(SavingPool):
             return self._step(None)
 
     def _step(self, skip: MaskArray | None) -> int:
-        code = Code.STEP
+        request = Request.STEP
         if skip is not None or self._crew.any_lost:
-            code = Code.STEP_SOME
+            request = Request.STEP_SOME
             np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
         replies = self._crew.run(
-            "a step", self._crew.able, lambda supervisor: supervisor.step(code)
+            "a step", self._crew.able, lambda supervisor: supervisor.step(request)
         )
-        if not self._crew.any_lost and Code.TROUBLE not in replies.values():
+        if not self._crew.any_lost and Answer.TROUBLE not in replies.values():
             return 0
         self._crew.note_lost()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
@@ -244,23 +258,30 @@ class ProcessPool(SavingPool):
 
     @property
     def rolls_out(self) -> bool:
-        """See ``Pool.rolls_out``; the program in Wine runs no hooks."""
-        return self._setup.wine is None
+        """See ``Pool.rolls_out``."""
+        return True
 
     def roll_out(self, *arrays: Any) -> int:
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
+        from fmugym.pool.process.rollouts import read_rolled
+
         actions, seen, *judged = arrays
         play = self._play = self._play or self._describe_play()
+        own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
 
         def tell(supervisor: Supervisor) -> None:
-            block = supervisor.block
-            departure = play.departure(block, actions, seen)
-            supervisor.roll_out(self._plays, play.play, play.counts[block], departure)
+            block, is_known = supervisor.block, supervisor.knows_play(self._plays)
+            supervisor.begin_progress(play.counts[block])
+            count = block.stop - block.start
+            supervisor.tell(
+                Request.ROLL_OUT,
+                play.request(block, actions, is_known=is_known),
+                lambda reader: read_rolled(reader, count, own),
+            )
 
         with self._lock:
             replies = self._crew.run(ROLLOUT, self._crew.able, tell)
             self._crew.note_lost()
-        own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
         return int(np.count_nonzero(self._crew.lost)) + _take_rolled(replies, own)
 
     def _describe_play(self) -> PlayOfWorkers:
@@ -294,7 +315,9 @@ class ProcessPool(SavingPool):
             self._crew.run(
                 "setting parameters",
                 self._crew.supervisors,
-                lambda s: s.tell("write", variables, np.ascontiguousarray(values[:, s.block])),
+                lambda s: s.tell(
+                    Request.WRITE, request_write(variables, self._version, values[:, s.block])
+                ),
             )
 
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
@@ -315,7 +338,13 @@ class ProcessPool(SavingPool):
             if not self._crew.lost[index]:
                 within = index - supervisor.block.start
                 texts = self._crew.run(
-                    "a question", [supervisor], lambda s: s.tell("failure", within)
+                    "a question",
+                    [supervisor],
+                    lambda s: s.tell(
+                        Request.FAILURE,
+                        request_index(within),
+                        lambda reader: s.failure_in(reader, within),
+                    ),
                 )
                 for text in texts.values():
                     return f"{text}{supervisor.printed}"
@@ -325,7 +354,7 @@ class ProcessPool(SavingPool):
         """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
         with self._lock:
             if not self._crew.refusal:
-                self._crew.run("a question", self._crew.able, lambda s: s.tell("count_steps"))
+                self._crew.run("a question", self._crew.able, lambda s: s.tell(Request.COUNT_STEPS))
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)
@@ -339,27 +368,46 @@ class ProcessPool(SavingPool):
             if self._crew.refusal or not self._gives_texts:
                 return None
             crew = self._crew
-            answers = crew.run("a question", crew.able, lambda s: s.tell("text_of", number))
+            content = request_text_of(number)
+            answers = crew.run(
+                "a question",
+                crew.able,
+                lambda s: s.tell(Request.TEXT_OF, content, Reader.text),
+            )
             return next(filter(None, answers.values()), None)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         self._gives_texts |= any(variable.kind == "string" for variable in variables)
-        return np.concatenate(self._asked("reading variables", "read", variables), axis=1)
+        content = request_listing(variables, self._version)
+        found = self._asked("reading variables", Request.READ, content, (len(variables),))
+        return np.concatenate(found, axis=1)
 
-    def differentiate(
-        self, unknowns: tuple[Variable, ...], knowns: tuple[Variable, ...]
-    ) -> FloatArray:
+    def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
         """See ``Pool.differentiate``."""
-        parts = self._asked("a directional derivative", "differentiate", unknowns, knowns)
-        return np.concatenate(parts, axis=2)
+        about = self._setup.description, self._spec, self.num_instances
+        return differentiated(*about, self._differentiate, unknowns, knowns)
 
-    def _asked(self, doing: str, name: str, *arguments: Any) -> list[FloatArray]:
-        """Ask all workers for arrays, in the order of their blocks."""
+    def _differentiate(self, question: Question) -> FloatArray:
+        content = request_differentiate(*question)
+        doing, shape = "a directional derivative", (len(question.seeded), len(question.others))
+        return np.concatenate(self._asked(doing, Request.DIFFERENTIATE, content, shape), axis=2)
+
+    def _asked(
+        self, doing: str, request: Request, content: bytes, shape: tuple[int, ...]
+    ) -> list[FloatArray]:
+        """Ask all workers for arrays of this shape and their instances, in the order of blocks."""
         with self._lock:
             self._require_present()
             crew = self._crew
-            parts = crew.run(doing, crew.supervisors, lambda s: s.tell(name, *arguments))
+
+            def tell(supervisor: Supervisor) -> None:
+                count = supervisor.block.stop - supervisor.block.start
+                supervisor.tell(
+                    request, content, lambda reader: read_values(reader, (*shape, count))
+                )
+
+            parts = crew.run(doing, crew.supervisors, tell)
             self._require_present()
             return list(parts.values())
 
@@ -382,15 +430,14 @@ class ProcessPool(SavingPool):
             raise SimulationError(self.failure(int(missing[0])))
 
 
-def _take_rolled(replies: Mapping[Supervisor, Any], arrays: Sequence[npt.NDArray[Any]]) -> int:
+def _take_rolled(replies: Mapping[Supervisor, Rolled], arrays: Sequence[npt.NDArray[Any]]) -> int:
     """Put the results of rollouts together; returns how many instances had trouble."""
-    for reply in replies.values():
-        if isinstance(reply, IndexError):  # of a hook
-            raise reply
-    for supervisor, (_, parts) in replies.items():
-        for array, part in zip(arrays, parts, strict=True):
+    if any(reply.is_outside for reply in replies.values()):
+        raise IndexError("a hook looks up an index outside of its table")
+    for supervisor, reply in replies.items():
+        for array, part in zip(arrays, reply.arrays, strict=True):
             array[:, supervisor.block] = part
-    return sum(troubled for troubled, _ in replies.values())
+    return sum(reply.troubled for reply in replies.values())
 
 
 def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:

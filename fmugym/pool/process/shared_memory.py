@@ -20,6 +20,9 @@ import numpy.typing as npt
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec, StatusArray
 from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 
+if sys.platform == "linux":
+    import fcntl
+
 __all__ = [
     "ECHO_SIZE",
     "Arrays",
@@ -27,7 +30,6 @@ __all__ = [
     "make_arrays",
     "make_bell",
     "make_echo",
-    "make_progress",
     "offsets_of",
     "size_for",
 ]
@@ -40,7 +42,9 @@ ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
 
 _BELL: Final = np.dtype(np.uint64)
-_PROGRESS: Final = np.dtype(np.int64)
+
+if sys.platform == "linux":
+    _ONE_SIZE: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
 class Arrays(NamedTuple):
@@ -49,6 +53,7 @@ class Arrays(NamedTuple):
     Attributes:
         mask: Which instances not to step, shape (N,).
         counts: See ``fmugym.pool.health``, shape (N, HEALTH_COUNTS).
+        progress: The steps of each episode in a rollout, shape (N,).
     """
 
     inputs: FloatArray
@@ -57,6 +62,7 @@ class Arrays(NamedTuple):
     statuses: StatusArray
     mask: MaskArray
     counts: HealthArray
+    progress: npt.NDArray[np.int64]
 
     def block(self, columns: slice) -> Arrays:
         """Return the parts that belong to some of the instances."""
@@ -67,6 +73,7 @@ class Arrays(NamedTuple):
             self.statuses[columns],
             self.mask[columns],
             self.counts[columns],
+            self.progress[columns],
         )
 
 
@@ -78,6 +85,7 @@ def _layout(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
         ((count,), np.int8),
         ((count,), np.bool_),
         ((count, HEALTH_COUNTS), np.int64),
+        ((count,), np.int64),
     ]
 
 
@@ -88,7 +96,7 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
 
 def size_for(spec: PoolSpec, count: int, workers: int) -> int:
     """Return the bytes that a pool of ``count`` instances needs."""
-    return offsets_of(spec, count, workers)[-1] + _padded_size((count,), _PROGRESS)
+    return offsets_of(spec, count, workers)[-2]
 
 
 def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
@@ -111,24 +119,17 @@ def offsets_of(spec: PoolSpec, count: int, worker: int = 0) -> list[int]:
     for row in _layout(spec, count):
         offsets.append(offsets[-1] + _padded_size(*row))
     offsets[-1] += worker * (ECHO_SIZE + _ALIGNMENT)
-    return offsets
+    return [*offsets, offsets[-1] + ECHO_SIZE]
 
 
 def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.NDArray[np.uint8]:
     """Return where a worker's FMUs leave their last words, a text that ends with a zero byte."""
-    offset = offsets_of(spec, count, worker)[-1]
-    return np.ndarray(ECHO_SIZE, np.uint8, memory.map, offset)
+    return np.ndarray(ECHO_SIZE, np.uint8, memory.map, offsets_of(spec, count, worker)[-2])
 
 
 def make_bell(memory: Memory, spec: PoolSpec, count: int, worker: int) -> memoryview:
     """Return the count of the messages to a worker, as the only element of a view."""
-    offset = offsets_of(spec, count, worker)[-1] + ECHO_SIZE
-    return np.ndarray(1, _BELL, memory.map, offset).data
-
-
-def make_progress(memory: Memory, count: int) -> npt.NDArray[np.int64]:
-    """Return the steps of each episode in a rollout, shape (N,); they end the memory."""
-    return np.ndarray(count, _PROGRESS, memory.map, memory.size - _padded_size((count,), _PROGRESS))
+    return np.ndarray(1, _BELL, memory.map, offsets_of(spec, count, worker)[-1]).data
 
 
 class Memory:
@@ -167,10 +168,12 @@ class Memory:
 
 
 def _anonymous_file(size: int) -> int:
-    if hasattr(os, "memfd_create"):
-        descriptor = os.memfd_create("fmugym", os.MFD_CLOEXEC)
+    if sys.platform == "linux":
+        descriptor = os.memfd_create("fmugym", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     else:
         with tempfile.TemporaryFile() as file:
             descriptor = os.dup(file.fileno())
     os.ftruncate(descriptor, size)
+    if sys.platform == "linux":  # a worker that shrinks it would end all processes that use it
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, _ONE_SIZE)
     return descriptor

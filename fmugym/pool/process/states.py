@@ -9,6 +9,14 @@ from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray, ended_state
 from fmugym.pool.process.crew import Crew
+from fmugym.pool.process.requests import (
+    Reader,
+    Request,
+    read_states,
+    request_restore,
+    request_restore_states,
+    request_save_states,
+)
 from fmugym.pool.process.supervisor import Supervisor
 
 __all__ = ["SnapshotOfWorkers", "StatesOfWorkers"]
@@ -39,7 +47,11 @@ class StatesOfWorkers:
 
     def save(self) -> SnapshotOfWorkers:
         """Let each worker keep the state of its block."""
-        numbers = self._crew.run("saving a state", self._crew.supervisors, lambda s: s.tell("save"))
+        numbers = self._crew.run(
+            "saving a state",
+            self._crew.supervisors,
+            lambda s: s.tell(Request.SAVE, read=_read_number),
+        )
         return SnapshotOfWorkers({s: (s.generation, number) for s, number in numbers.items()})
 
     def require_own(self, snapshot: object) -> None:
@@ -64,7 +76,7 @@ class StatesOfWorkers:
         self._crew.run(
             "restoring a state",
             concerned,
-            lambda s: s.tell("restore", parts[s][1], mask[s.block]),
+            lambda s: s.tell(Request.RESTORE, request_restore(parts[s][1], mask[s.block])),
         )
         self._crew.note_lost()
 
@@ -72,18 +84,22 @@ class StatesOfWorkers:
         self, indices: IndexArray, records: bool, start_time: float, outputs: FloatArray
     ) -> list[bytes]:
         """Save instances; the episodes of those that are lost have ended with these outputs."""
-        states = {
-            index: ended_state(start_time, outputs[:, index])
-            for index in indices[self._crew.lost[indices]].tolist()
-        }
+        states: dict[int, bytes] = {}
         parts = self._by_worker(indices[~self._crew.lost[indices]])
-        replies = self._crew.run(
-            "saving states",
-            list(parts),
-            lambda s: s.tell("save_states", _within(s, parts[s]), records),
-        )
+
+        def tell(supervisor: Supervisor) -> None:
+            own = _within(supervisor, parts[supervisor])
+            supervisor.tell(
+                Request.SAVE_STATES,
+                request_save_states(own, records),
+                lambda reader: read_states(reader, len(own), len(outputs)),
+            )
+
+        replies = self._crew.run("saving states", list(parts), tell)
         for supervisor, reply in replies.items():
             states.update(zip(parts[supervisor].tolist(), reply, strict=True))
+        lost = indices[self._crew.lost[indices]].tolist()  # some of them maybe just now
+        states |= {index: ended_state(start_time, outputs[:, index]) for index in lost}
         return [states[index] for index in indices.tolist()]
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
@@ -95,7 +111,8 @@ class StatesOfWorkers:
         def tell(supervisor: Supervisor) -> None:
             wanted = parts[supervisor]
             own = [state_of[index] for index in wanted.tolist()]
-            supervisor.tell("restore_states", own, _within(supervisor, wanted))
+            content = request_restore_states(own, _within(supervisor, wanted))
+            supervisor.tell(Request.RESTORE_STATES, content)
 
         for supervisor in self._crew.run("restoring states", alive, tell):
             supervisor.note_success()
@@ -108,6 +125,12 @@ class StatesOfWorkers:
             s: (indices >= s.block.start) & (indices < s.block.stop) for s in self._crew.supervisors
         }
         return {s: indices[own] for s, own in blocks.items() if own.any()}
+
+
+def _read_number(reader: Reader) -> int:
+    number = reader.integer()
+    reader.end()
+    return number
 
 
 def _within(supervisor: Supervisor, indices: IndexArray) -> IndexArray:

@@ -8,18 +8,28 @@ import math
 import socket
 import time
 from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, NoReturn
 
-from fmugym.errors import printable
+from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.process.channel import Channel, Code
+from fmugym.pool.callbacks import Receiver
+from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.last_words import describe_exit, lines_of_echo
-from fmugym.pool.process.launcher import Process
+from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
-from fmugym.pool.process.shared_memory import Memory, make_echo, make_progress
-from fmugym.pool.process.transport import transport_for
-from fmugym.pool.process.worker import Setup
+from fmugym.pool.process.requests import (
+    Answer,
+    DamagedError,
+    Reader,
+    Request,
+    read_failure,
+    request_indices,
+)
+from fmugym.pool.process.setup import Setup
+from fmugym.pool.process.shared_memory import Memory, make_arrays, make_bell, make_echo
+from fmugym.pool.reports import loading_failed
 from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
@@ -41,6 +51,8 @@ _LAST_MOMENT: Final = 0.05
 
 _LONGEST_KILL: Final = 2.0
 """Seconds that a killed process may take to end; a system call may hold it for longer."""
+
+_STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
 
 _TAIL: Final = 10
 """How many of the FMU's last messages the cause of a death quotes."""
@@ -71,7 +83,12 @@ class Supervisor:
         is_new: Whether no reset has succeeded in this process yet.
         known: The numbers of the lists of variables that this process knows.
         released: The snapshots without any reference left, by generation and number.
+        receiver: Gets the messages of the worker's FMUs.
+        deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
+        initializations: How many initializations all workers of this process have begun.
     """
+
+    initializations: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -86,11 +103,15 @@ class Supervisor:
         self.is_new = True
         self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
-        self._setup, self._log = setup, log
-        self._transport = transport_for(setup, memory)
-        self._echo = make_echo(memory, setup.spec, setup.num_instances, setup.number)
-        self._progress = make_progress(memory, setup.num_instances)[setup.block]
+        self.deadline = math.inf
+        self.receiver = Receiver(log, setup.description, setup.block.start)
+        self._setup, self._log, self._memory = setup, log, memory
+        place = setup.spec, setup.num_instances
+        self._echo = make_echo(memory, *place, setup.number)
+        self._progress = make_arrays(memory, *place).progress[setup.block]
         self._done = b""
+        self._read: Callable[[Reader], Any] | None = None
+        self._content = b""
         self._output = Output()
         self._deaths = 0
         self._process: Process | None = None
@@ -110,34 +131,60 @@ class Supervisor:
         Raises:
             LostError: If the system refuses.
         """
+        self.begin()
+        self.confirm()
+
+    def begin(self) -> None:
+        """Begin to start a process; see ``confirm``.
+
+        Raises:
+            LostError: If the system refuses.
+        """
+        with _refusals():
+            setup = self._setup.with_copy() if self._setup.needs_copy else self._setup
+            self._content = setup.opening(self._memory)
+            self._process, self._channel = self._launch(setup)
+        self._opening = True
+
+    def confirm(self) -> None:
+        """Wait until the process is there, and tell it what to open.
+
+        Raises:
+            LostError: If the system refuses.
+        """
+        assert self._process is not None
         try:
-            self._process, self._channel = self._launch()
-        except ordinary(OSError, EOFError) as error:
-            raise LostError(f"no worker process can be started: {error}") from None
+            with _refusals():
+                self._process.confirm()
+        except LostError:
+            self.forget()
+            self._opening = False
+            raise
         self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
+        self._initializations = 0
         self.known.clear()
         self._play = -1
-        self.tell("open", self._setup)
-        self._opening = True
+        self.tell(Request.OPEN, self._content)
+        self._content = b""
 
-    def _launch(self) -> tuple[Process, Channel]:
+    def _launch(self, setup: Setup) -> tuple[Process, Channel]:
         end, other_end = socket.socketpair()
         output = Output()
         try:
             with other_end:
                 output.open()
-                process = self._transport.launch(other_end, output.writing_ends)
+                process = launch(other_end, self._memory, setup.order(), output.writing_ends)
         except BaseException:
             end.close()
             output.close()
             raise
         output.release_writing_ends()
         self._output = output
-        coding, bell = self._transport.coding(), self._transport.bell()
-        return process, Channel(end, process.sentinel, output, coding, bell)
+        bell = make_bell(self._memory, setup.spec, setup.num_instances, setup.number)
+        return process, Channel(end, process.sentinel, output, bell)
 
     def revive(self) -> None:
         """Start a process if there is none, with longer and longer pauses between deaths.
@@ -186,7 +233,7 @@ class Supervisor:
         deaths = self._deaths
         self.begin_closing()
         self.close(deadline)
-        self._deaths, self.reason = deaths, printable(f"{self._setup.path.name}: {reason}")
+        self._deaths, self.reason = deaths, printable(f"{self._name}: {reason}")
 
     def note_success(self) -> None:
         """Remember that a reset has succeeded."""
@@ -206,7 +253,7 @@ class Supervisor:
         if self._opening:
             self.bury("the pool was closed")
         if self._process is not None:
-            self.tell("close")
+            self.tell(Request.CLOSE)
 
     def close(self, deadline: float) -> None:
         """Wait until it has freed them, and end it if this takes too long."""
@@ -225,39 +272,45 @@ class Supervisor:
         """Whether a reply is due."""
         return self._busy
 
-    def step(self, code: bytes) -> None:
+    def step(self, request: Request) -> None:
         """Ask the worker to step; failures show in the reply."""
-        self._busy, self._asked = True, time.monotonic()
+        self._busy, self._asked, self._read = True, time.monotonic(), None
         try:
             if self.released:
                 self._release()
-            self._channel.send_code(code)
+            self._channel.send(request, deadline=self.deadline)
         except ordinary(OSError):  # "Ignoring" takes longer
             return
 
-    def tell(self, name: str, *arguments: Any) -> None:
-        """Ask for a call of one of the worker's methods; failures show in the reply."""
-        self._busy, self._asked = True, time.monotonic()
+    def tell(
+        self,
+        request: Request,
+        content: bytes = b"",
+        read: Callable[[Reader], Any] = Reader.end,
+    ) -> None:
+        """Ask the worker for something; failures show in the reply.
+
+        Args:
+            request: What it is asked for.
+            content: The content of the request.
+            read: Reads the answer; raises a ``DamagedError`` if it is none.
+        """
+        self._busy, self._asked, self._read = True, time.monotonic(), read
         self._output.pump()
         with Ignoring(OSError):
             if self.released:
                 self._release()
-            self._channel.send_object(Code.REQUEST, (name, arguments))
+            self._channel.send(request, content, self.deadline)
 
-    def roll_out(self, number: int, play: Any, steps: Any, departure: Any) -> None:
-        """Ask for a rollout; failures show in the reply.
+    def knows_play(self, number: int) -> bool:
+        """Whether the worker knows the play with this number; from now on it does."""
+        known, self._play = number == self._play, number
+        return known
 
-        Args:
-            number: The number of the play.
-            play: What surrounds the steps.
-            steps: Those of the episodes until now, shape of the block.
-            departure: See ``RollingWorker.roll_out``.
-        """
-        told = None if number == self._play else play
-        self._play = number
+    def begin_progress(self, steps: Any) -> None:
+        """Note the steps of the episodes before a rollout, shape of the block."""
         self._progress[:] = steps
         self._done = self._progress.tobytes()
-        self.tell("roll_out", told, departure)
 
     def forget_output(self) -> None:
         """Forget what was printed, because it would not explain a later failure."""
@@ -275,7 +328,7 @@ class Supervisor:
         while self.released:
             owner, number = self.released.popleft()
             numbers += [number] if owner == generation else []
-        self._channel.send_object(Code.RELEASE, numbers)
+        self._channel.send(Request.RELEASE, request_indices(numbers), self.deadline)
 
     def reply(self, deadline: float, doing: str) -> Any:
         """Wait for the reply.
@@ -285,15 +338,14 @@ class Supervisor:
             doing: What the worker does, for the cause of a death.
 
         Returns:
-            ``Code.FINE`` or ``Code.TROUBLE`` for a step; what the method returned; or the
-            exception that it raised.
+            ``Answer.FINE`` or ``Answer.TROUBLE`` for a step; the result; or a ``SimulationError``.
 
         Raises:
             LostError: If the worker has died or is late.
         """
         if self._opening:
             self.finish_opening(deadline)
-        result = self._receive(deadline, doing)
+        result = self._receive(deadline, doing, self._read)
         self._busy = False
         return result
 
@@ -303,38 +355,87 @@ class Supervisor:
         Raises:
             LostError: If it could not make them.
         """
-        result = self._receive(deadline, INSTANTIATION)
+        result = self._receive(deadline, INSTANTIATION, Reader.end)
         self._opening = False
         if isinstance(result, Exception):
-            self.bury(f"{result}{self.printed}")
+            self.bury(f"{self._why_not_loaded(str(result))}{self.printed}")
             raise LostError(self.reason) from result
 
-    def _receive(self, deadline: float, doing: str) -> Any:
+    def _why_not_loaded(self, text: str) -> str:
+        """Say which libraries are missing, or else what the worker has said."""
+        try:
+            if self._setup.wine is None:
+                self._setup.fmu.require_libraries(self._setup.folder)
+        except FMULoadError as error:
+            return str(error)
+        return loading_failed(self._name, text)
+
+    def _receive(self, deadline: float, doing: str, read: Callable[[Reader], Any] | None) -> Any:
         while True:
             left = deadline - time.monotonic() if deadline < math.inf else None
-            if not self._channel.wait(left):
-                if time.monotonic() >= deadline and not _is_debugged(self.pid):
-                    deadline = self._extended(deadline, doing)
-                continue
-            try:
-                code = self._channel.receive_code()
-                if code == Code.FINE or code == Code.TROUBLE:
-                    return code
-                content = self._channel.receive_object(code)
-            except ordinary(EOFError, OSError):
-                self._explain_death(doing)
-            if code == Code.LOG:
-                self._pass_on(*content)
-            elif code == Code.FAULT:
-                self._fault = content
-            else:
-                return content
+            result = None
+            if self._channel.wait(left):
+                try:
+                    code, size = self._channel.receive_head(deadline)
+                    if read is None and code in _STEPPED:
+                        return code
+                    result = self._take(code, self._channel.receive_content(size, deadline), read)
+                except LateError:
+                    self._end_hang(doing)
+                except ordinary(EOFError, OSError):
+                    self._explain_death(doing)
+                except DamagedError as error:
+                    what = f"worker process {self.pid} has sent what is no answer in {doing}"
+                    self._end(what, error)
+            if result is not None:
+                return result[0]
+            if time.monotonic() >= deadline and not _is_debugged(self.pid):
+                deadline = self._extended(deadline, doing)
 
-    def _pass_on(self, level: int, message: str) -> None:
-        self._tail.append(message)
-        self._log.log(level, "%s", message)
+    def _take(
+        self, code: int, content: bytes, read: Callable[[Reader], Any] | None
+    ) -> tuple[Any] | None:
+        """Take a message; returns the answer to the request if it is one."""
+        reader = Reader(content)
+        if code == Answer.MESSAGE:
+            self._pass_on(reader)
+        elif code == Answer.FAULT:
+            self._fault = reader.integer()
+        elif code == Answer.ERROR:
+            return (SimulationError(reader.text()),)
+        elif code == Answer.FAILURE:
+            index = reader.index(self._setup.count)
+            return (SimulationError(self.failure_in(reader, index)),)
+        elif code == Answer.RESULT and read is not None:
+            return (read(reader),)
+        else:
+            raise DamagedError(f"the code {code}")
+        return None
 
-    def _explain_death(self, doing: str) -> None:
+    def read_growth(self, reader: Reader) -> None:
+        """Read the answer to a reset."""
+        self.growth, count = reader.integer(), reader.integer()
+        reader.end()
+        Supervisor.initializations += max(0, count - self._initializations)
+        self._initializations = count
+
+    def failure_in(self, reader: Reader, index: int) -> str:
+        """Read why an instance has failed, counted within the block; "" if it has not."""
+        setup = self._setup
+        name = f"{setup.description.model_identifier}_{self.block.start + index}"
+        return read_failure(reader, setup.description, setup.spec, name)
+
+    def _pass_on(self, reader: Reader) -> None:
+        index = reader.index(self.receiver.sources * self._setup.count)
+        record = index, reader.integer(), reader.text(), reader.text()
+        self._tail.append(self.receiver.text_of(*record))
+        self.receiver(*record)
+
+    @property
+    def _name(self) -> str:
+        return self._setup.fmu.path.name
+
+    def _explain_death(self, doing: str) -> NoReturn:
         assert self._process is not None
         pid, status = self._process.pid, self._process.exit_status(_LAST_MOMENT)
         if status is None:
@@ -355,7 +456,7 @@ class Supervisor:
         self._done, self._asked = done, time.monotonic()
         return self._asked + patience
 
-    def _end_hang(self, doing: str) -> None:
+    def _end_hang(self, doing: str) -> NoReturn:
         """End a worker that is late; messages that it has not sent yet are lost."""
         factor = "ten times " if patience_with(doing) > 1 else ""
         seconds = time.monotonic() - self._asked
@@ -363,14 +464,29 @@ class Supervisor:
             f"worker process {self.pid} took longer than {factor}call_timeout for {doing} and was "
             f"ended after {seconds:.3g} s"
         )
+        self._end(what)
+
+    def _end(self, what: str, error: Exception | None = None) -> NoReturn:
+        """End a worker that lives, but is of no use."""
         self._output.drain()
         self.bury(self._cause(what))
-        raise LostError(self.reason)
+        raise LostError(self.reason) from error
 
     def _cause(self, text: str) -> str:
         lines = lines_of_echo(self._echo.tobytes()) or list(self._tail)
         said = quoted(as_messages(lines))
-        return printable(f"{self._setup.path.name}: {text}{said}{self.printed}")
+        return printable(f"{self._name}: {text}{said}{self.printed}")
+
+
+@contextlib.contextmanager
+def _refusals() -> Iterator[None]:
+    """Turn what the system refuses into the loss of a worker."""
+    try:
+        yield
+    except FMULoadError as error:
+        raise LostError(str(error)) from None
+    except ordinary(OSError, EOFError) as error:
+        raise LostError(f"no worker process can be started: {error}") from None
 
 
 def _is_debugged(pid: int) -> bool:

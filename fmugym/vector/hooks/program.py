@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.extension import has_native_pool
+from fmugym.pool.form import form_of_program
 
 __all__ = [
     "LETTERS",
@@ -190,12 +191,21 @@ class Program:
             return bool((self.code[:, 0] == OPERATIONS.index(kind)).any())
         return any(row[0] == kind for row in self.rows)
 
-    def with_rows(self, find: Callable[[Row], npt.NDArray[Any]]) -> tuple[Any, ...]:
-        """The program as the native pool takes it, with the arrays of its rows."""
-        rows = tuple(map(find, self.rows))
-        parts = self.code.tobytes(), self.constants.tobytes(), self.slots.tobytes()
-        counts = self.registers, self.seen, self.results
-        return (*parts, rows, self.tables, *counts)
+    def with_rows(
+        self, find: Callable[[Row], npt.NDArray[Any]]
+    ) -> tuple[bytes, tuple[npt.NDArray[Any], ...]]:
+        """The program as the native pool takes it: its form, and the arrays of its rows."""
+        form = form_of_program(
+            self.code.tobytes(),
+            self.constants.tobytes(),
+            self.slots.tobytes(),
+            range(len(self.rows)),
+            self.tables,
+            self.registers,
+            self.seen,
+            self.results,
+        )
+        return form, tuple(map(find, self.rows))
 
 
 def evaluate(

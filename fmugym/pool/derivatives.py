@@ -1,0 +1,86 @@
+"""Derivatives of FMUs, and of systems by the chain rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.variable import Variable
+from fmugym.errors import SimulationError
+from fmugym.fmi.chain import chained_jacobian
+from fmugym.pool.base import FloatArray
+from fmugym.pool.form import table_of
+from fmugym.pool.spec import PoolSpec
+from fmugym.systems.description import SystemDescription
+from fmugym.systems.layout import Layout
+
+__all__ = ["Question", "Variables", "differentiated"]
+
+Variables = tuple[Variable, ...]
+
+
+class Question(NamedTuple):
+    """What an engine differentiates; see ``native/derivatives.h``.
+
+    Attributes:
+        adjoint: Whether the FMU differentiates unknowns by all knowns, not all unknowns by a known.
+        part: The component of a system; 0 for an FMU.
+        version: See ``fmugym.pool.form.table_of``.
+        seeded: The unknowns if it is adjoint, otherwise the knowns.
+        others: The others.
+    """
+
+    adjoint: bool
+    part: int
+    version: int
+    seeded: Variables
+    others: Variables
+
+
+Ask = Callable[[Question], FloatArray]
+"""Answers with an array of shape (seeded, others, N)."""
+
+
+def differentiated(
+    description: ModelDescription,
+    spec: PoolSpec,
+    count: int,
+    ask: Ask,
+    unknowns: Variables,
+    knowns: Variables,
+) -> FloatArray:
+    """Differentiate; see ``Pool.differentiate``.
+
+    Args:
+        description: That of the FMU or system.
+        spec: That of the pool.
+        count: The number of instances.
+        ask: Asks the engine.
+        unknowns: As for ``Pool.differentiate``.
+        knowns: As for ``Pool.differentiate``.
+    """
+    if not isinstance(description, SystemDescription):
+        return _of_fmu(0, description, ask, unknowns, knowns)
+    layout = Layout(description, spec.inputs, spec.outputs)
+
+    def differentiate(part: int, of: Variables, by: Variables) -> FloatArray:
+        return np.moveaxis(_of_fmu(part, layout.parts[part].description, ask, of, by), -1, 0)
+
+    ends = [[layout.ends_of(variable) for variable in some] for some in (unknowns, knowns)]
+    found = chained_jacobian(layout, differentiate, count, *ends)
+    return np.moveaxis(found, 0, -1)
+
+
+def _of_fmu(
+    part: int, description: ModelDescription, ask: Ask, unknowns: Variables, knowns: Variables
+) -> FloatArray:
+    capabilities = description.capabilities
+    if not capabilities.provides_derivatives:
+        raise SimulationError(f"{description.model_name} provides no derivatives")
+    adjoint = not capabilities.provides_directional_derivatives
+    seeded, others = (unknowns, knowns) if adjoint else (knowns, unknowns)
+    found = ask(Question(adjoint, part, table_of(description), seeded, others))
+    return found if adjoint else found.swapaxes(0, 1)

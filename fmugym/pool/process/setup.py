@@ -1,0 +1,175 @@
+"""What a worker is told when it starts."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.fmu import FMU
+from fmugym.errors import FMULoadError
+from fmugym.pool.base import PoolSpec
+from fmugym.pool.form import Files, Writer, form_of_pool
+from fmugym.pool.process.launcher import Order
+from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
+from fmugym.pool.saving import keeps_records
+from fmugym.pool.spec import ResetMethod
+from fmugym.signals import ordinary
+from fmugym.wine.loader import windows_path
+from fmugym.wine.prefix import Wine
+
+__all__ = ["Setup"]
+
+_COPIES: Final = "copies-for-workers"
+"""The folder within the FMU's one that has the copies."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a worker needs to know.
+
+    Attributes:
+        fmu: The FMU.
+        folder: Where it was extracted to.
+        files: Where its files are.
+        before: The libraries to load before its own; see ``LoadableFMU.libraries_before``.
+        spec: What to do at each reset and step.
+        num_instances: N, the instances of all workers together.
+        logs_all: Whether FMUs are asked to log everything.
+        directory: The working directory; empty if it has been removed.
+        environment: The environment variables.
+        block: The indices of the worker's instances.
+        number: Which of the pool's workers it is.
+        threads: See ``NativePool``.
+        own_files: Whether the worker has a copy of the folder, which is also its working
+            directory, because instances would share files otherwise.
+        wine: What the worker needs to run in Wine; None for one of this system.
+    """
+
+    fmu: FMU
+    folder: Path
+    files: Files
+    before: tuple[tuple[str, str], ...]
+    spec: PoolSpec
+    num_instances: int
+    logs_all: bool
+    directory: str
+    environment: Mapping[str, str]
+    block: slice
+    number: int = 0
+    threads: int = 1
+    own_files: bool = False
+    wine: Wine | None = None
+
+    @classmethod
+    def of(cls, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> Setup:
+        """Extract an FMU, and say what a worker for all of its instances needs to know."""
+        folder = fmu.extract()
+        return cls(
+            fmu=fmu,
+            folder=folder,
+            files=_files_of(fmu, folder),
+            before=_libraries_before(fmu, folder),
+            spec=spec.fitting(fmu.description),
+            num_instances=num_instances,
+            logs_all=log.isEnabledFor(logging.INFO),
+            directory=_working_directory(),
+            environment=dict(os.environ),
+            block=slice(num_instances),
+            wine=Wine.ready() if fmu.in_wine else None,
+        )
+
+    @property
+    def description(self) -> ModelDescription:
+        """The description of the FMU."""
+        return self.fmu.description
+
+    @property
+    def count(self) -> int:
+        """The number of the worker's instances."""
+        return int(self.block.stop - self.block.start)
+
+    @property
+    def needs_copy(self) -> bool:
+        """Whether the worker needs its own copy of the folder: an FMU may keep state in files."""
+        return self.own_files or self.spec.reset_method is ResetMethod.PROCESS
+
+    def with_copy(self) -> Setup:
+        """Copy the folder afresh, in the place of the copy of an earlier worker.
+
+        Raises:
+            FMULoadError: If the system refuses.
+        """
+        folder = self.folder / _COPIES / str(self.number)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.copytree(self.folder, folder, ignore=shutil.ignore_patterns(_COPIES))
+        except ordinary(OSError, shutil.Error) as error:
+            raise FMULoadError(
+                f"{self.fmu.path.name} needs a copy of its files for each process: {error}"
+            ) from None
+        directory = str(folder) if self.own_files else self.directory
+        return replace(
+            self,
+            folder=folder,
+            files=_files_of(self.fmu, folder),
+            before=_libraries_before(self.fmu, folder),
+            directory=directory,
+        )
+
+    def order(self) -> Order:
+        """What to start."""
+        directory = self.directory or str(self.folder)
+        if self.wine is None:
+            return Order(self.folder, directory, self.environment)
+        environment = self.wine.environment(self.environment)
+        return Order(self.folder, directory, environment, self.wine.command)
+
+    def opening(self, memory: Memory) -> bytes:
+        """The first request: what to load, how to step it, and where the shared memory is."""
+        writer = Writer()
+        writer.block(
+            form_of_pool(
+                self.description,
+                self.spec,
+                self.files,
+                self.count,
+                self.threads,
+                logging=self.logs_all,
+                records=keeps_records(self.description, self.spec),
+            )
+        )
+        self._write_memory(writer, memory)
+        writer.texts([name.encode() for name, _ in self.before])
+        writer.texts([os.fsencode(path) for _, path in self.before])
+        return writer.form()
+
+    def _write_memory(self, writer: Writer, memory: Memory) -> None:
+        """Name the memory on Windows, and in Wine by this process's descriptor of it."""
+        path = windows_path(Path("/proc", str(os.getpid()), "fd", str(memory.descriptor)))
+        writer.text(os.fsencode(path if self.wine is not None else memory.tag))
+        writer.integers(memory.size, self.num_instances, self.block.start)
+        *arrays, echo, bell = offsets_of(self.spec, self.num_instances, self.number)
+        writer.integers(*arrays, ECHO_SIZE, echo, bell)
+
+
+def _files_of(fmu: FMU, folder: Path) -> Files:
+    if fmu.in_wine:
+        return Files.in_wine(fmu, folder)
+    return Files.here(fmu, folder, [library for _, library in fmu.libraries_in(folder)])
+
+
+def _libraries_before(fmu: FMU, folder: Path) -> tuple[tuple[str, str], ...]:
+    return () if fmu.in_wine else tuple(fmu.libraries_before(folder))
+
+
+def _working_directory() -> str:
+    try:
+        return os.getcwd()
+    except ordinary(OSError):
+        return ""
