@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from fmugym.recording import Recorder, Recording, replay
     from fmugym.systems import Component, Connection, FMUSystem
     from fmugym.task.snapshot import Snapshot
-    from fmugym.tools.agents import load_agent
+    from fmugym.training.agents import load_agent
     from fmugym.vector import FMUVectorEnv
 
 __all__ = [
@@ -104,7 +104,7 @@ _MODULES = {
     "recording": ["Recorder", "Recording", "replay"],
     "systems": ["Component", "Connection", "FMUSystem"],
     "task.snapshot": ["Snapshot"],
-    "tools.agents": ["load_agent"],
+    "training.agents": ["load_agent"],
     "linearization": ["LinearModel", "linearize"],
     "linearization.sensitivities": ["derivatives"],
     "linearization.trajectories": ["linearize_along"],

@@ -36,6 +36,7 @@ __all__ = [
     "TaskError",
     "UnknownParameterError",
     "nearest_name",
+    "plain",
     "printable",
     "reason",
     "shortened",
@@ -69,6 +70,14 @@ def printable(text: object) -> str:
     if line.isprintable():
         return line
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
+
+def plain(text: object) -> str:
+    """Bring a text of a foreign file into one line, with letters of any language.
+
+    Other characters are escaped: a terminal may obey them.
+    """
+    return printable(" ".join(str(text).split()))
 
 
 class FMUGymError(Exception):

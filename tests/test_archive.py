@@ -253,7 +253,7 @@ class TestBadArchives:
             make_env(archive_limits=ArchiveLimits(max_entries=1))
         with pytest.raises(FMULoadError, match="the limit is 1; if you trust it, raise max_entr"):
             make_env(archive_limits={"max_entries": 1})
-        with pytest.raises(ConfigError, match="archive_limits must be ArchiveLimits"):
+        with pytest.raises(ConfigError, match="archive_limits must be a table"):
             make_env(archive_limits=[1])
 
     def test_preload_is_a_list(self, fmu_path):

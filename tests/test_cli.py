@@ -487,7 +487,7 @@ class TestCommand:
         assert file.read_text() == "precious"
         assert main(["new", fmu, "--output", str(file), "--force"]) == 0
         assert "time_step" in file.read_text()
-        assert list(tmp_path.iterdir()) == [file]
+        assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
 
     def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, capsys):
         file = tmp_path / "run.csv"

@@ -13,10 +13,10 @@ import pytest
 
 import fmugym
 from fmugym import __main__ as program
+from fmugym.episodes.evaluation import Score, plot_scores
 from fmugym.series import TimeSeries
 from fmugym.tools import speed
 from fmugym.tools.cli import _parsed, _parser, main
-from fmugym.tools.evaluation import Score, plot_scores
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 PID = "pid of=T setpoint=21 kp=0.3 ti=7200"

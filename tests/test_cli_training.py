@@ -16,10 +16,10 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
+from fmugym.episodes.evaluation import HELD_OUT_SEED, confidence, evaluate, warning_of_one_reward
+from fmugym.episodes.simulation import Player, action_of
 from fmugym.tools.cli import main
-from fmugym.tools.evaluation import HELD_OUT_SEED, confidence, evaluate, warning_of_one_reward
-from fmugym.tools.simulation import Player, action_of
-from fmugym.tools.training import Plan, arguments_of, train
+from fmugym.training.training import Plan, arguments_of, train
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 SCENARIOS = {
@@ -365,7 +365,7 @@ class TestTrain:
     @pytest.mark.parametrize("patience", [1, 0])
     def test_an_interruption_in_an_evaluation(self, tmp_path, capsys, monkeypatch, patience):
         """The agent is kept, although it was never evaluated if there is a second Ctrl-C."""
-        from fmugym.tools import training
+        from fmugym.training import training
 
         original, calls = training.evaluate, iter([False] * 1 + [True] + [False] * 9 * patience)
 

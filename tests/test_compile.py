@@ -14,8 +14,8 @@ from source_tools import BOTH, build_description, write_source_fmu
 
 from fmugym import FMU, FMULoadError
 from fmugym.pool import PoolSpec
+from fmugym.repair.compiling import compile_fmu
 from fmugym.tools.cli import main
-from fmugym.tools.compiling import compile_fmu
 from fmugym.trial import opening
 
 

@@ -30,7 +30,8 @@ STOREYS = [
     {"baselines"},
     {"search"},
     {"registration", "recording", "testing", "sb3", "torchrl", "declared", "series"},
-    {"export", "logs", "minari"},
+    {"export", "logs", "minari", "episodes", "repair"},
+    {"training"},
     {"envs", "pettingzoo", "rllib", "tools"},
     {"__init__", "__main__", "clock"},
 ]

@@ -17,6 +17,7 @@ from fmugym.baselines import PID, controller_of
 from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.parsing import search_of
+from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
 from fmugym.search.agent import AGENT, Agent
 from fmugym.search.entrants import merits_of
@@ -26,7 +27,6 @@ from fmugym.search.policy import LIMIT, Form, Policy, Scale
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
 from fmugym.tools import searching
-from fmugym.tools.evaluation import HELD_OUT_SEED
 from fmugym.tools.searching import Quest
 from fmugym.vector import FMUVectorEnv
 

@@ -15,7 +15,7 @@ from process_tools import run_python
 from fmugym import FMU, ConfigError, Task
 from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.loader import ask
-from fmugym.tools import compilers, stand_in
+from fmugym.repair import compilers, stand_in
 from fmugym.tools.cli import main
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="libraries of Linux")

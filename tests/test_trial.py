@@ -11,7 +11,7 @@ import time
 import building
 import numpy as np
 import pytest
-from fmu_tools import PlainEnv, edited_fmu, library_name, write_fmu
+from fmu_tools import PlainEnv, edited_fmu, grouped, library_name, write_fmu
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
@@ -78,7 +78,7 @@ def started(monkeypatch):
 
 
 def step_once(path, **config):
-    env = PlainEnv(path, CONFIG | config)
+    env = PlainEnv(path, grouped(CONFIG | config))
     try:
         env.reset()
         return env.step(np.ones(1))[0].tolist()

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import fmu_tools
 import model_tools
 
 import fmugym
@@ -35,7 +36,7 @@ class WordsEnv(fmugym.FMUEnv):
             "time_step": STEP,
             "bounds": {"u": (-1, 1)},
         } | options
-        super().__init__(path, config, level, **keywords)
+        super().__init__(path, fmu_tools.grouped(config), level, **keywords)
 
     def _is_done(self):
         return self.state[0] > 1e9

@@ -13,11 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMUGymError
+from fmugym.errors import FMUGymError, plain
 from fmugym.linearization import linearize
 from fmugym.pool.spec import FIXED_STEP_SOLVERS
 from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_of
-from fmugym.tools.overview import plain
 from fmugym.trial.known import known_verdict
 
 __all__ = ["Advice", "Doubt", "advise", "lines_of", "rounded_down"]

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
+from fmugym.episodes.progress import progress
+from fmugym.episodes.simulation import Player, simulate
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.logs import PlantLog, play_log
 from fmugym.recording import Recorder, Recording
 from fmugym.tools.options import MINARI, only_player, say, say_json
-from fmugym.tools.progress import progress
-from fmugym.tools.simulation import Player, simulate
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_of_datasets", "dataset_of", "make_dataset", "show_dataset"]

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from fmugym.errors import plain
 from fmugym.tools.advice import Advice, lines_of
-from fmugym.tools.overview import plain
 
 __all__ = ["Finding", "Report"]
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
 from fmugym.declared.writing import as_toml
+from fmugym.episodes.progress import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
     Commands,
@@ -26,7 +27,6 @@ from fmugym.tools.options import (
     say_json,
     tell,
 )
-from fmugym.tools.progress import progress
 from fmugym.tools.targets import maker_of
 
 __all__ = ["add_tune"]

@@ -11,9 +11,10 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared.format import SCHEMA
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, plain
+from fmugym.repair.compiling import compile_fmu
+from fmugym.repair.stand_in import build_stand_in, replaceable
 from fmugym.systems import FMUSystem
-from fmugym.tools.compiling import compile_fmu
 from fmugym.tools.datasets import show_dataset
 from fmugym.tools.options import (
     MINARI,
@@ -26,10 +27,9 @@ from fmugym.tools.options import (
     say_json,
     write_text,
 )
-from fmugym.tools.overview import as_text, overview, plain
+from fmugym.tools.overview import as_text, overview
 from fmugym.tools.proposal import Proposal, preload_line
 from fmugym.tools.skeleton import Skeleton
-from fmugym.tools.stand_in import build_stand_in, replaceable
 from fmugym.tools.systems import as_text_of_system, find_model, open_model, overview_of_system
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate

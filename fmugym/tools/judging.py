@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Outcome
+from fmugym.episodes.evaluation import HELD_OUT_SEED, student
 from fmugym.search.agent import Agent
-from fmugym.tools.evaluation import HELD_OUT_SEED, student
 
 __all__ = ["Verdict", "judge"]
 

@@ -14,12 +14,11 @@ from typing import Any, Final
 
 from fmugym.baselines.tuning import LEAST_CANDIDATES
 from fmugym.checks import check_number
+from fmugym.episodes.evaluation import Score, table
+from fmugym.episodes.progress import Advance, progress
+from fmugym.episodes.records import title_of
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
-from fmugym.tools.agents import FACTS
-from fmugym.tools.checkpoints import CHECKPOINT
-from fmugym.tools.diary import Diary
-from fmugym.tools.evaluation import Score, table
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -30,14 +29,15 @@ from fmugym.tools.options import (
     say_json,
     tell,
 )
-from fmugym.tools.outcome import write_curve, write_outcome
-from fmugym.tools.progress import Advance, progress
-from fmugym.tools.records import title_of
 from fmugym.tools.searching import STATE, Quest, search
 from fmugym.tools.targets import maker_of, scenarios_of
-from fmugym.tools.tracking import TRACKERS, tracker_for
-from fmugym.tools.training import TRAINING, Plan, Watch, arguments_of, facts_of, train
-from fmugym.tools.tuning import tune
+from fmugym.training.agents import FACTS
+from fmugym.training.checkpoints import CHECKPOINT
+from fmugym.training.diary import Diary
+from fmugym.training.outcome import write_curve, write_outcome
+from fmugym.training.tracking import TRACKERS, tracker_for
+from fmugym.training.training import TRAINING, Plan, Watch, arguments_of, facts_of, train
+from fmugym.training.tuning import tune
 
 __all__ = ["add_train"]
 

@@ -16,12 +16,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
-from fmugym.errors import ConfigError, shown
+from fmugym.episodes.progress import quiet
+from fmugym.episodes.simulation import Player, action_of, policy_of
+from fmugym.errors import ConfigError, plain, shown
 from fmugym.systems.plan import MASTERS
-from fmugym.tools.agents import agent_player
-from fmugym.tools.overview import plain
-from fmugym.tools.progress import quiet
-from fmugym.tools.simulation import Player, action_of, policy_of
+from fmugym.training.agents import agent_player
 
 __all__ = [
     "HELP_OF_TASK",

@@ -15,11 +15,11 @@ from typing import Any, Final
 from fmugym.archive.fmu import FMU
 from fmugym.archive.missing import missing_tool, note_on
 from fmugym.archive.variable import Variable
-from fmugym.errors import FMULoadError, printable
+from fmugym.errors import FMULoadError, plain
 from fmugym.pool.base import first_of
 from fmugym.trial.known import known_verdict
 
-__all__ = ["as_text", "overview", "plain", "start_value", "tables"]
+__all__ = ["as_text", "overview", "start_value", "tables"]
 
 SCHEMA: Final = 1
 """Raised when a key goes or changes its meaning; new keys do not raise it."""
@@ -171,14 +171,6 @@ def start_value(variable: Variable) -> bool | int | float | str | None:
         return number if math.isfinite(number) else text
     except (ValueError, OverflowError):
         return text
-
-
-def plain(text: object) -> str:
-    """Bring a text of a foreign file into one line, with letters of any language.
-
-    Other characters are escaped: a terminal may obey them.
-    """
-    return printable(" ".join(str(text).split()))
 
 
 def as_text(facts: Mapping[str, Any]) -> str:

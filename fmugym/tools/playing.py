@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.env import FMUEnv
-from fmugym.errors import FMUGymError
+from fmugym.episodes.evaluation import Score, each_score, plot_scores, table
+from fmugym.episodes.progress import progress
+from fmugym.episodes.records import Recording, require_format, require_picture, title_of
+from fmugym.episodes.simulation import Player, Summary, simulate
+from fmugym.errors import FMUGymError, plain
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
-from fmugym.tools.evaluation import Score, each_score, plot_scores, table
 from fmugym.tools.options import (
     Commands,
     add_command,
@@ -25,10 +28,6 @@ from fmugym.tools.options import (
     say_json,
     shown_in_any_case,
 )
-from fmugym.tools.overview import plain
-from fmugym.tools.progress import progress
-from fmugym.tools.records import Recording, require_format, require_picture, title_of
-from fmugym.tools.simulation import Player, Summary, simulate
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 

@@ -20,12 +20,12 @@ import numpy as np
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
-from fmugym.errors import ConfigError, FMULoadError
+from fmugym.errors import ConfigError, FMULoadError, plain
+from fmugym.repair.stand_in import replaceable
 from fmugym.search.guessing import guessed_controller
 from fmugym.systems.description import SystemDescription
-from fmugym.tools.overview import plain, start_value
+from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
-from fmugym.tools.stand_in import replaceable
 
 __all__ = ["Proposal", "preload_line"]
 

@@ -17,6 +17,7 @@ import numpy as np
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.env import FMUEnv
+from fmugym.episodes.progress import Advance, no_progress
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.agent import Agent
 from fmugym.search.entrants import NO_MERIT, Merit
@@ -24,11 +25,10 @@ from fmugym.search.guessing import guessed_controllers
 from fmugym.search.probe import MOST_PROBED, Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search
 from fmugym.signals import ordinary
-from fmugym.tools.agents import FACTS
-from fmugym.tools.diary import EVALUATIONS
 from fmugym.tools.judging import Verdict, judge
-from fmugym.tools.progress import Advance, no_progress
-from fmugym.tools.training import require_new
+from fmugym.training.agents import FACTS
+from fmugym.training.diary import EVALUATIONS
+from fmugym.training.training import require_new
 
 __all__ = ["STATE", "Quest", "search"]
 

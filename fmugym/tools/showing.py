@@ -6,10 +6,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, plain
 from fmugym.tools.demo import LinearController, Training, show, write_picture
 from fmugym.tools.options import Commands, add_command, add_json, check_numbers, say, say_json
-from fmugym.tools.overview import plain
 
 __all__ = ["add_demo"]
 

@@ -10,9 +10,9 @@ from typing import Any
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
 from fmugym.declared.systems import fmu_of
-from fmugym.errors import ConfigError
+from fmugym.errors import ConfigError, plain
 from fmugym.systems import FMUSystem
-from fmugym.tools.overview import overview, plain, tables
+from fmugym.tools.overview import overview, tables
 
 __all__ = ["as_text_of_system", "find_model", "open_model", "overview_of_system"]
 

@@ -19,10 +19,19 @@ from typing import Any, Final
 from gymnasium import spaces
 
 from fmugym.env import FMUEnv
+from fmugym.episodes.evaluation import (
+    HELD_OUT_SEED,
+    Score,
+    Wrap,
+    evaluate,
+    warning_of_one_reward,
+)
+from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.simulation import Player
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.scaling import can_be_scaled
 from fmugym.signals import ordinary
-from fmugym.tools.agents import (
+from fmugym.training.agents import (
     FACTS,
     agent_player,
     algorithm_of,
@@ -30,18 +39,9 @@ from fmugym.tools.agents import (
     policy_with,
     save,
 )
-from fmugym.tools.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
-from fmugym.tools.diary import EVALUATIONS, RECORDS, Diary
-from fmugym.tools.evaluation import (
-    HELD_OUT_SEED,
-    Score,
-    Wrap,
-    evaluate,
-    warning_of_one_reward,
-)
-from fmugym.tools.progress import Advance, no_progress
-from fmugym.tools.simulation import Player
-from fmugym.tools.tracking import Tracker
+from fmugym.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
+from fmugym.training.diary import EVALUATIONS, RECORDS, Diary
+from fmugym.training.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
 __all__ = [

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.env import FMUEnv
+from fmugym.episodes.evaluation import HELD_OUT_SEED
+from fmugym.episodes.records import About
+from fmugym.episodes.simulation import simulate
 from fmugym.errors import ConfigError
 from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.pictures import svg_of
-from fmugym.tools.agents import FACTS, agent_player
-from fmugym.tools.diary import CURVE, REPORT, Diary, curve_of, draw_curve
-from fmugym.tools.evaluation import HELD_OUT_SEED
-from fmugym.tools.records import About
-from fmugym.tools.simulation import simulate
-from fmugym.tools.training import Plan
+from fmugym.training.agents import FACTS, agent_player
+from fmugym.training.diary import CURVE, REPORT, Diary, curve_of, draw_curve
+from fmugym.training.training import Plan
 
 __all__ = ["write_curve", "write_outcome"]
 

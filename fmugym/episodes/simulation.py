@@ -14,8 +14,8 @@ from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
+from fmugym.episodes.progress import Advance, no_progress
 from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.tools.progress import Advance, no_progress
 
 __all__ = [
     "Player",

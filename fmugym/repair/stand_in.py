@@ -21,8 +21,8 @@ from fmugym.archive.dependencies import libraries_of
 from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError
+from fmugym.repair.compilers import find_compiler
 from fmugym.signals import ordinary
-from fmugym.tools.compilers import find_compiler
 
 __all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
 
@@ -114,7 +114,7 @@ def _compile(path: Path, symbols: Mapping[str, str]) -> None:
 
 
 def _source() -> str:
-    return (resources.files("fmugym.tools") / "stand_in.c").read_text()
+    return (resources.files("fmugym.repair") / "stand_in.c").read_text()
 
 
 def _served() -> set[str]:

@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.env import FMUEnv
+from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.simulation import Player, Summary, simulate
+from fmugym.errors import plain
 from fmugym.extras import imported
-from fmugym.tools.overview import plain
-from fmugym.tools.progress import Advance, no_progress
-from fmugym.tools.simulation import Player, Summary, simulate
 
 __all__ = [
     "HELD_OUT_SEED",

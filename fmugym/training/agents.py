@@ -18,12 +18,12 @@ import numpy as np
 from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
+from fmugym.episodes.simulation import Player, Policy, policy_of_controller
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import imported
 from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.agent import AGENT, Agent
 from fmugym.signals import ordinary
-from fmugym.tools.simulation import Player, Policy, policy_of_controller
 
 __all__ = [
     "FACTS",

@@ -21,7 +21,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError, FMUGymError, reason, shown
 from fmugym.signals import ordinary
-from fmugym.tools.agents import algorithm_of
+from fmugym.training.agents import algorithm_of
 
 __all__ = ["CHECKPOINT", "latest_checkpoint", "load_checkpoint", "save_checkpoint"]
 

@@ -12,8 +12,8 @@ from typing import Any, Final
 
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
-from fmugym.tools.agents import algorithm_of
-from fmugym.tools.training import TRIALS, Plan, Watch, require_new, train
+from fmugym.training.agents import algorithm_of
+from fmugym.training.training import TRIALS, Plan, Watch, require_new, train
 
 __all__ = ["tune"]
 

@@ -1,0 +1,1 @@
+"""Episodes of a task: who acts, what comes of it, and files about it."""

@@ -1,0 +1,1 @@
+"""Libraries that FMUs lack on this machine, and the compiler that builds them."""

@@ -1,0 +1,1 @@
+"""Trainings with the algorithms of Stable-Baselines3."""
