@@ -16,6 +16,7 @@ See ``fuzz_driver.py``.
 import contextlib
 import functools
 import logging
+import math
 import re
 import sys
 
@@ -224,11 +225,11 @@ class Noise:
         send, head, content = Channel.send, Channel.receive_head, Channel.receive_content
         forget = Supervisor._forget_process
 
-        def send_damaged(channel, code, data=b""):
+        def send_damaged(channel, code, data=b"", deadline=math.inf):
             if self.hits("request"):
                 data = damaged(self.rng, data or bytes(8))
                 code = self.rng.randrange(24) if self.rng.random() < 0.1 else code
-            send(channel, code, data)
+            send(channel, code, data, deadline)
 
         def receive_odd_head(channel, deadline):
             code, size = head(channel, deadline)

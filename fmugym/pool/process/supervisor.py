@@ -46,7 +46,7 @@ _MOST_DEATHS: Final = 5
 _FIRST_PAUSE: Final = 0.05
 """Seconds before a worker is started after its second death in a row; doubled for each more."""
 
-_LAST_MOMENT: Final = 0.05
+_LAST_MOMENT: Final = 0.5
 """Seconds that a worker that has closed its channel may take to end."""
 
 _LONGEST_KILL: Final = 2.0
