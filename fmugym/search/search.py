@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -199,12 +199,9 @@ class Search:
         return None
 
     def _leaders(self) -> list[Entrant]:
-        """The best two; of equal ones, those with fewer weights, which have entered first.
-
-        One that is not better than the baseline leads only if none is.
-        """
-        ranked = _ranked(self._contenders)
-        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[:2]
+        """The best two; one that is not better than the baseline leads only if none is."""
+        ranked = sorted(self._contenders, key=lambda one: one.merit)
+        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[-2:]
 
     def _next(self, leaders: Sequence[Entrant]) -> Entrant:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
@@ -321,8 +318,8 @@ class Search:
         if self.baseline is None:
             agents, searches = list(self._fixed), [*self._tuned, *self._guesses]
         else:
-            agents = [self.baseline]
-            searches = _ranked([*self._contenders, *self._gone])[:2]
+            agents, searches = [self.baseline], [*self._contenders, *self._gone]
+            searches = sorted(searches, key=lambda one: one.merit)[-2:]
         agents += [one.make.agent(numbers) for one in searches for numbers in one.offers()]
         count = min(_LAST, max(self.episodes, self._played // (_PART * max(1, len(agents)))))
         return agents, range(_FINAL, _FINAL + (count if self.episodes > 1 else 1))
@@ -333,7 +330,3 @@ class Search:
         if len(agents) < 2:
             return agents[0] if agents else None
         return self._best_of(arena, agents, seeds)[0]
-
-
-def _ranked(entrants: Iterable[Entrant]) -> list[Entrant]:
-    return sorted(entrants, key=lambda one: one.merit, reverse=True)
