@@ -197,17 +197,6 @@ class Pool:
     ) -> int:
         """Start those in the mask anew, and write their observations."""
 
-    def step_or_reset(
-        self,
-        inputs: Array | None,
-        start: Access,
-        values: Array,
-        mask: Array | None,
-        observations: Array | None,
-        /,
-    ) -> int:
-        """Start those in the mask anew and step the others, and write all observations."""
-
     def prepare_play(
         self,
         *,
@@ -340,10 +329,4 @@ class Pool:
 
         Returns:
             How many of the instances have a status worse than a warning.
-        """
-
-    def costs(self) -> tuple[float, float, float, float]:
-        """The measured ns per instance of some methods; 0 if unknown.
-
-        They are ``step``, ``reset``, ``step_or_reset`` and ``play``.
         """

@@ -45,11 +45,6 @@ size_t pool_reset(Pool *pool, const Call *call) {
     return run_with_starts(&task, schedule_choose(pool, call->mask));
 }
 
-size_t pool_step_or_reset(Pool *pool, const Call *call) {
-    Task task = {.pool = pool, .call = call, .operation = MIXED};
-    return run_with_starts(&task, pool->settings.count);
-}
-
 static void tell_ends(Task *task, Ends *ends) {
     ends->ended = (size_t)atomic_get(&task->ended);
     ends->started = (size_t)atomic_get(&task->started);

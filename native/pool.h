@@ -160,7 +160,7 @@ typedef struct {
     uint32_t calls;
 } Cost;
 
-enum { STEP, RESET, MIXED, PLAY, RESTORE, ROLLOUT, BEFORE, AFTER, OPERATIONS };
+enum { STEP, RESET, PLAY, RESTORE, ROLLOUT, BEFORE, AFTER, OPERATIONS };
 
 typedef struct Pool {
     struct Pool *next; /* next in the list of all pools */
@@ -270,8 +270,6 @@ typedef struct {
 size_t pool_step(Pool *pool, const Call *call);
 /* Resets the instances in the mask, or all if there is no mask. Writes their observations. */
 size_t pool_reset(Pool *pool, const Call *call);
-/* Resets the instances in the mask and steps the others. Writes all observations. */
-size_t pool_step_or_reset(Pool *pool, const Call *call);
 /* Resets the instances whose episode has ended and steps the others. Runs the programs of the
  * turn before and after. Writes all observations. */
 size_t pool_play(Pool *pool, const Call *call, Ends *ends);

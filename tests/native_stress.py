@@ -174,10 +174,6 @@ class Subject:
         values[0, :: int(self.rng.integers(2, 9))] = -1.0  # what the cart-pole refuses, aloud
         self.pool.reset_into(self.start, values, self.mask() if self.rng.random() < 0.7 else None)
 
-    def step_or_reset(self):
-        observations = np.empty((self.n, len(self.outputs)), np.float32)
-        self.pool.step_or_reset(None, self.start, self.values, self.mask(), observations)
-
     def prepare_play(self):
         variables, before = np.zeros((1, self.n)), np.zeros((1, self.n))
         self.pool.prepare_play(
@@ -276,16 +272,13 @@ class Subject:
     def health(self):
         self.pool.health()
 
-    def costs(self):
-        return self.pool.costs
-
     def close(self):
         if self.rng.random() < 0.05:
             self.pool.close()
 
 
 ACTIONS = (
-    *("step_own", "step_own", "step", "reset", "step_or_reset", "prepare_play", "draw"),
+    *("step_own", "step_own", "step", "reset", "prepare_play", "draw"),
     *(
         "play",
         "play",
@@ -298,7 +291,7 @@ ACTIONS = (
         "read",
         "health",
     ),
-    *("costs", "close"),
+    "close",
     *("bundle", "unbundle", "unbundle", "write", "roll_out", "roll_out"),
 )
 

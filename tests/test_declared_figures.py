@@ -4,9 +4,9 @@ from functools import partial
 
 import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
-from fmugym import FMUVectorEnv
 from fmugym.errors import TaskError
 
 DT = 0.05
@@ -73,24 +73,7 @@ def test_figures_are_those_of_the_steps():
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
 def test_figures_of_many_environments(hooks, mode):
-    make = partial(fmugym.load, TASK)
-    envs, singles = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode), []
-    if hooks == "compiled":
-        assert envs.inside.engine._task.left == {}
-    envs.reset(seed=4)
-    for i in range(3):
-        singles.append(make())
-        singles[i].reset(seed=4 + i)
-    for step in range(12):
-        actions = envs.action_space.sample()
-        *_, infos = envs.step(actions)
-        if mode == "same_step" and step == 11:
-            infos = infos["final_info"]
-        for i, env in enumerate(singles):
-            *_, info = env.step(actions[i])
-            assert {name: infos["kpis"][name][i] for name in info["kpis"]} == info["kpis"]
-    for env in (envs, *singles):
-        env.close()
+    assert require_same_alone(partial(fmugym.load, TASK), 14, mode, hooks=hooks)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import pytest
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym import FMUVectorEnv
 from fmugym.declared import functions
 from fmugym.errors import TaskError
 
@@ -421,18 +420,7 @@ def test_mistakes_in_errors_of_forecasts(error, fact):
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_random_steps_of_many_environments(hooks):
-    make = partial(fmugym.load, RANDOM)
-    envs, singles = FMUVectorEnv(make, 2, hooks=hooks), [make(), make()]
-    observations, _ = envs.reset(seed=9)
-    expected = [env.reset(seed=9 + i)[0] for i, env in enumerate(singles)]
-    np.testing.assert_array_equal(observations, expected)
-    for _ in range(19):
-        observations, rewards, *_ = envs.step(np.zeros((2, 1), np.float32))
-        results = [env.step([0.0]) for env in singles]
-        np.testing.assert_array_equal(observations, [result[0] for result in results])
-        np.testing.assert_array_equal(rewards, [result[1] for result in results])
-    for env in (envs, *singles):
-        env.close()
+    require_same_alone(partial(fmugym.load, RANDOM), 19, hooks=hooks)
 
 
 def test_an_argument_that_does_not_exist():

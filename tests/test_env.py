@@ -436,10 +436,11 @@ def test_the_class_may_be_subclassed_for_a_relative_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     from my_relative_env import Mine
 
-    env = Mine()
-    env.reset()
-    assert np.isfinite(env.step(0.0)[0]).all()
-    env.close()
+    for cls in (Mine, type("Derived", (Mine,), {})):
+        env = cls()
+        env.reset()
+        assert np.isfinite(env.step(0.0)[0]).all()
+        env.close()
     with pytest.raises(fmugym.FMULoadError, match="somewhere"):
         Mine("Other.fmu")
     sys.modules.pop("my_relative_env")

@@ -220,19 +220,6 @@ class TestStates:
         again = [step(pool, *action) for action in actions[13:]]
         np.testing.assert_array_equal(first, again)
 
-    @both_interfaces
-    def test_all_pools_give_the_same_numbers(self, make_pool, interface):
-        rows = {}
-        for kind in KINDS:
-            inputs = ("strike", "command", "pace")
-            pool = start(make_pool(kind, interface, 2, inputs, COUNTS + LASTS, 0.17))
-            random = np.random.default_rng(2)
-            rows[kind] = [
-                step(pool, *random.integers(0, 2, (2, 2)), random.uniform(0.05, 0.6, 2))
-                for _ in range(30)
-            ]
-        np.testing.assert_array_equal(rows["process"], rows["native"])
-
 
 class Env(fmugym.FMUEnv):
     def _is_done(self):
@@ -252,18 +239,6 @@ class TestEnvironments:
     def test_single_and_vector_environments_agree(self, fmu_path, isolation):
         path = fmu_path()
         require_same_alone(lambda: Env(path, self.CONFIG, isolation=isolation), 15)
-
-    def test_snapshots_go_on_alike(self, fmu_path):
-        env = Env(fmu_path(), self.CONFIG)
-        env.reset(seed=1)
-        for _ in range(5):
-            env.step(np.array([1, 3.0]))
-        snapshot = env.save_state()
-        first = [env.step(np.array([i % 2, i]))[0] for i in range(9)]
-        env.restore_state(snapshot)
-        again = [env.step(np.array([i % 2, i]))[0] for i in range(9)]
-        np.testing.assert_array_equal(first, again)
-        env.close()
 
 
 class TestRefusals:

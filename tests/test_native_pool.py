@@ -201,34 +201,6 @@ def test_any_calls(model, version, options, seed):
         company.play(120)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
-def test_all_types_and_faults(probe, version):
-    inputs = ["a", "n", "on", "c", "mode", "n_free"]
-    outputs = ["sum", "n_out", "mix", "on_out", "mode_out", "steps", "end"]
-    if version == 3:
-        inputs += ["Float32_in", "Int8_in", "UInt16_in", "Int64_in"]
-        outputs += ["Float32_out", "Int8_out", "UInt16_out", "Int64_out"]
-    limits = {"n": 5, "on": 2, "mode": 3, "Int8_in": 100, "UInt16_in": 60000, "Int64_in": 2**40}
-    count, starts = 9, ["fault", "fault_step", "gain"]
-    rng = np.random.default_rng(version)
-    with closing(Company(probe(version), inputs, outputs, starts, count, version)) as company:
-        for _ in range(60):
-            faults = rng.choice([0, 0, 2, 3, 4, 5, 6, 7], count)
-            values = np.array(
-                [faults, rng.integers(1, 5, count), rng.choice([1.0, 2.0], count)], float
-            )
-            company.reset(values, rng.random(count) < 0.7)
-            for _ in range(4):
-                rows = [
-                    rng.integers(0, limits[n], count)
-                    if n in limits
-                    else rng.normal(size=count).round(3)
-                    for n in inputs
-                ]
-                rows[inputs.index("n_free")] = rng.integers(-(2**31), 2**31, count)
-                company.step(np.array(rows, float), None)
-
-
 @pytest.mark.parametrize("width", [2, 70])
 @pytest.mark.parametrize("count", [1, 3])
 def test_values_beyond_those_of_observations(probe, count, width):
@@ -272,14 +244,13 @@ def cart_pole(threads=1, count=300, **options):
 
 
 def test_results_do_not_depend_on_the_number_of_threads():
-    expected = None
+    jobs, results = _native.statistics()["jobs"], set()
     for threads in (1, 2, 4):
         pool = cart_pole(threads)
-        result = rollout(pool)
-        assert pool.costs["step"] * 300 > 20e3  # ns: enough to call helpers
+        results.add(rollout(pool))
         pool.close()
-        assert expected in (None, result)
-        expected = result
+    assert _native.statistics()["jobs"] > jobs  # there was enough to do to call helpers
+    assert len(results) == 1
 
 
 def test_heavy_tails(native, busy):
@@ -381,22 +352,6 @@ class TestFastWay:
         assert pool.reset_into(variables, values) == 0
         assert pool.step_into(pool.inputs, np.array([False, False, False, True])) == 2
         assert pool.step_into(pool.inputs) == 3  # those that have ended and the one skipped before
-
-    def test_step_or_reset(self, native):
-        path, names = bundled_fmu("Pendulum", "3.0"), (["tau"], ["theta", "theta_dot"])
-        pool, other = native(path, *names, 50, threads=2), native(path, *names, 50)
-        rng = np.random.default_rng(0)
-        observations = np.zeros((50, 2), np.float32)
-        for each in (pool, other):
-            each.reset((each.variable("q_0"),), np.ones((1, 50)))
-        for _ in range(30):
-            inputs, mask = rng.normal(size=(1, 50)), rng.random(50) < 0.2
-            values = rng.choice([0.5, 1.5], (1, 50))
-            pool.step_or_reset(inputs, (pool.variable("q_0"),), values, mask, observations)
-            other.step(inputs, mask)
-            other.reset((other.variable("q_0"),), values, mask)
-            np.testing.assert_array_equal(pool.outputs, other.outputs)
-            np.testing.assert_array_equal(observations, other.outputs.T.astype(np.float32))
 
     def test_observations_of_a_reset(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x", "theta"], 4)

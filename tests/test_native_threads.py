@@ -99,7 +99,7 @@ def step():
 def ask():
     while thread.is_alive():
         pool.failure(0)
-        pool.costs, pool.health()
+        pool.health()
 
 thread = threading.Thread(target=step)
 thread.start()

@@ -19,6 +19,7 @@ import test_strings
 import values_tools
 import wine_tools
 from pythonfmu import FmuBuilder
+from vector_tools import require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
@@ -84,22 +85,7 @@ def test_vector_environments_read_texts(feedthrough, options, hooks):
     def make():
         return Echo(feedthrough[3], max_episode_steps=2, **options)
 
-    envs = FMUVectorEnv(make, 3, hooks=hooks)
-    singles = [make() for _ in range(3)]
-    _, infos = envs.reset(seed=4)
-    assert infos["told"].tolist() == [e.reset(seed=4 + i)[1]["told"] for i, e in enumerate(singles)]
-    for step in range(8):
-        _, rewards, _, ended, infos = envs.step(np.zeros(3, np.int64))
-        for index, env in enumerate(singles):
-            if step % 3 == 2:
-                assert infos["told"][index] == env.reset()[1]["told"]
-            else:
-                _, reward, _, over, info = env.step(0)
-                assert (rewards[index], ended[index]) == (reward, over)
-                assert infos["told"][index] == info["told"]
-    for env in singles:
-        env.close()
-    envs.close()
+    assert require_same_alone(make, 8, hooks=hooks)
 
 
 def test_the_other_hooks_stay_compiled(feedthrough, caplog):

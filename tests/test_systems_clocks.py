@@ -10,8 +10,9 @@ from system_tools import (
     linear,
     linear_fmu,
 )
+from vector_tools import require_same_alone
 
-from fmugym import FMU, Component, ConfigError, FMUEnv, FMUSystem, FMUVectorEnv
+from fmugym import FMU, Component, ConfigError, FMUEnv, FMUSystem
 from fmugym.tools import cli
 
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
@@ -110,16 +111,7 @@ class Env(FMUEnv):
 
 def test_environments_set_and_see_clocks(fmus):
     system = with_follower(fmus)
-    envs = FMUVectorEnv(lambda: Env(system), 2)
-    single = Env(system)
-    envs.reset(seed=1)
-    single.reset(seed=1)
-    for strike in (0, 1, 1, 0):
-        rows = envs.step(np.full((2, 1), strike))[0]
-        assert np.array_equal(rows[0], single.step([strike])[0])
-        assert rows[:, 2].tolist() == [strike] * 2
-    envs.close()
-    single.close()
+    require_same_alone(lambda: Env(system), 9)
 
 
 class TestRefusals:

@@ -1,7 +1,6 @@
 """Archives as tools make them: what is not as the standard has it is tidied up, told, and runs."""
 
 import gc
-import re
 import stat
 import zipfile
 from pathlib import Path
@@ -207,10 +206,6 @@ class TestLibraries:
         refused(
             path, rf"2 libraries .*\(One{SUFFIX}, Two{SUFFIX}\), but none is named Probe{SUFFIX}"
         )
-
-    def test_for_other_platforms_only(self, make):
-        path = make(2, lambda n: "binaries/win99/Other.dll" if n.endswith(SUFFIX) else n)
-        refused(path, re.escape(f"({library_name(2)}); it was built for: win99"))
 
 
 class TestLinks:

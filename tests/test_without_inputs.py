@@ -1,8 +1,8 @@
 """FMUs without inputs run in every setting; a task may choose parameters instead."""
 
 import gymnasium
-import numpy as np
 import pytest
+from vector_tools import require_same_alone
 
 import fmugym
 
@@ -38,14 +38,4 @@ class FallingEnv(fmugym.FMI2CSEnv):
 
 @pytest.mark.parametrize(("hooks", "isolation"), SETTINGS)
 def test_vector_equals_single(hooks, isolation):
-    envs = fmugym.FMUVectorEnv(FallingEnv, 3, hooks=hooks, isolation=isolation)
-    singles = [FallingEnv(isolation=isolation) for _ in range(3)]
-    observations, _ = envs.reset(seed=1)
-    expected = [single.reset(seed=1 + i)[0] for i, single in enumerate(singles)]
-    np.testing.assert_array_equal(observations, expected)
-    for _ in range(5):
-        observations = envs.step(np.zeros(3, np.int64))[0]
-        expected = [single.step(0)[0] for single in singles]
-        np.testing.assert_array_equal(observations, expected)
-    for env in (envs, *singles):
-        env.close()
+    require_same_alone(FallingEnv, 5, hooks=hooks, isolation=isolation)

@@ -6,8 +6,7 @@ vector environment its internal arrays and calls without any conversion:
 * write ``pool.inputs``, call ``pool.step_own()``, read ``pool.outputs``, ``pool.statuses`` and
   ``pool.observations``;
 * ``pool.step_into`` and ``pool.reset_into`` write the observations to the caller's memory and
-  return how many instances had trouble; the caller reads the statuses only if there are any;
-* ``pool.step_or_reset`` restarts ended instances while it steps the others.
+  return how many instances had trouble; the caller reads the statuses only if there are any.
 """
 
 from __future__ import annotations
@@ -118,7 +117,6 @@ class NativePool(SavingPool):
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self._watched(self._pool.reset)
-        self._step_or_reset = self._watched(self._pool.step_or_reset)
         self._watched_play = self._watched(self._pool.play), self._watched(self._pool.reset_by)
 
     def _open(self, log: logging.Logger, private_libraries: bool) -> _native.Pool:
@@ -330,45 +328,6 @@ class NativePool(SavingPool):
             return self._reset(access, values, _as_mask(mask), observations)
 
     _reset_some = reset_into
-
-    def step_or_reset(
-        self,
-        inputs: FloatArray | None,
-        variables: tuple[Variable, ...],
-        values: FloatArray,
-        mask: MaskArray,
-        observations: FloatArray32 | None = None,
-    ) -> int:
-        """Start the instances in the mask anew and step the others, in one call.
-
-        The result is that of ``step``, which skips the mask, and ``reset`` with the mask. This is
-        faster, because no thread waits for the end of one before it begins the other.
-
-        Args:
-            inputs: As for ``step_into``.
-            variables: As for ``reset``.
-            values: As for ``reset``.
-            mask: Which instances to start anew, shape (N,).
-            observations: As for ``step``; all rows are filled.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """
-        access = self._accesses.get(variables) or self._access(variables)
-        try:
-            return self._step_or_reset(inputs, access, values, mask, observations)
-        except (TypeError, BufferError, ValueError) as error:
-            require_refusal(error)
-            self._open_pool()
-            inputs = None if inputs is None else np.asarray(inputs, np.float64)
-            values = np.asarray(values, np.float64)
-            return self._step_or_reset(inputs, access, values, _as_mask(mask), observations)
-
-    @property
-    def costs(self) -> dict[str, float]:
-        """The measured time of one instance in ns by method; 0 if it is not known yet."""
-        names = ("step", "reset", "step_or_reset", "play")
-        return dict(zip(names, self._pool.costs(), strict=True))
 
     def prepare_play(
         self,

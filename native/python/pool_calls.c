@@ -89,12 +89,11 @@ static bool view_start(PyPool *self, PyObject *access, PyObject *values, PyCall 
 }
 
 static void do_call(PyPool *self, bool alone, void *context) {
-    static size_t (*const functions[])(Pool *, const Call *) = {
-        [STEP] = pool_step, [RESET] = pool_reset, [MIXED] = pool_step_or_reset};
     Doing *d = context;
 
     d->call.alone = alone;
-    d->troubled = functions[d->operation](&self->pool, &d->call);
+    d->troubled = d->operation == STEP ? pool_step(&self->pool, &d->call)
+                                       : pool_reset(&self->pool, &d->call);
 }
 
 static PyObject *result_of(PyPool *self, const Doing *d, bool done) {
@@ -141,18 +140,6 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     if (has_arguments(nargs, 4) && view_inputs(self, Py_None, &c) &&
         view_start(self, args[0], args[1], &c) && view_mask(self, args[2], &c) &&
         view_observations(self, args[3], &c)) {
-        return finish(self, &c);
-    }
-    return give_up(&c);
-}
-
-PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-    PyCall c = {.doing = {.operation = MIXED}};
-
-    if (has_arguments(nargs, 5) && view_inputs(self, args[0], &c) &&
-        view_start(self, args[1], args[2], &c) && view_mask(self, args[3], &c) &&
-        view_observations(self, args[4], &c)) {
         return finish(self, &c);
     }
     return give_up(&c);
@@ -332,20 +319,4 @@ PyObject *py_count_steps(PyObject *object, PyObject *unused) {
         return NULL;
     }
     Py_RETURN_NONE;
-}
-
-static void do_copy_costs(PyPool *self, bool alone, void *context) {
-    (void)alone;
-    memcpy(context, self->pool.costs, sizeof self->pool.costs);
-}
-
-PyObject *py_costs(PyObject *object, PyObject *unused) {
-    Cost costs[OPERATIONS];
-
-    (void)unused;
-    if (!perform((PyPool *)object, ALWAYS_SHORT, do_copy_costs, costs)) {
-        return NULL;
-    }
-    return Py_BuildValue("(dddd)", costs[STEP].low, costs[RESET].low, costs[MIXED].low,
-                         costs[PLAY].low);
 }

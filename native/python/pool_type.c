@@ -101,7 +101,6 @@ static PyMethodDef methods[] = {
     {"step_own", py_step_own, METH_NOARGS, NULL},
     FAST("step", py_step),
     FAST("reset", py_reset),
-    FAST("step_or_reset", py_step_or_reset),
     {"prepare_play", (PyCFunction)(void (*)(void))py_prepare_play, METH_VARARGS | METH_KEYWORDS,
      NULL},
     FAST("play", py_play),
@@ -121,7 +120,6 @@ static PyMethodDef methods[] = {
     FAST("restore_states", py_restore_states),
     {"count_steps", py_count_steps, METH_NOARGS, NULL},
     {"close", py_close, METH_NOARGS, NULL},
-    {"costs", py_costs, METH_NOARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

@@ -86,13 +86,11 @@ bool report_messages(PyPool *self);
 PyObject *py_step_own(PyObject *object, PyObject *unused);
 PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_step_or_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_failure(PyObject *object, PyObject *argument);
 PyObject *py_count_steps(PyObject *object, PyObject *unused);
-PyObject *py_costs(PyObject *object, PyObject *unused);
 PyObject *py_save_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
