@@ -31,7 +31,7 @@ def without_retired(given: Mapping[str, _Value]) -> dict[str, _Value]:
     return {key: value for key, value in given.items() if key not in RETIRED}
 
 
-_OURS: Final = frozenset({"fmugym", "gymnasium"})
+_OURS: Final = frozenset({"fmugym", "functools", "gymnasium"})
 
 
 def warn_of_gone(text: str) -> None:

@@ -256,8 +256,7 @@ class Subject:
         observations = np.empty((*shape, len(self.outputs)), np.float32)
         actions = self.rng.integers(0, 2, shape)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            drawn = np.zeros((1, self.n))
-            self.pool.roll_out(actions, observations, np.empty(shape), *flags, drawn)
+            self.pool.roll_out(actions, observations, np.empty(shape), *flags)
             counts["rolled out"] += 1
 
     def forget(self):

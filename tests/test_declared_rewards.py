@@ -120,4 +120,6 @@ def test_what_many_expressions_read_is_written_once(task, monkeypatch, text, cou
 
     monkeypatch.setattr(Expression, "code", write)
     fmugym.load(path).close()
-    assert max(map(written.count, written)) <= 4  # once for each moment in which it is evaluated
+    assert (
+        max(map(written.count, written)) <= 5
+    )  # once for each moment that evaluates it, and to check

@@ -35,7 +35,7 @@ def test_the_slow_path_works_and_says_so_once():
         [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
     )
     assert result.stdout.count("FMUs are stepped by FMPy, which is slow") == 1
-    assert "Python's headers. Install them" in result.stdout
+    assert "Python's headers were missing. Install them" in result.stdout
     refusals = [line for line in result.stdout.splitlines() if line.startswith("refused: ")]
     assert len(refusals) == 3
     assert all("C extension" in line for line in refusals)
