@@ -246,7 +246,7 @@ class TestWaiting:
 def test_odd_values_are_refused(key, value):
     with pytest.raises(fmugym.ConfigError, match=key):
         fmugym.EnvConfig.from_dict(
-            {"model_input_names": "u", "model_output_names": "y", key: value}
+            {"model_input_names": "u", "model_output_names": "y", "foreign": {key: value}}
         )
 
 
