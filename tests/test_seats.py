@@ -41,7 +41,7 @@ def test_of_two_environments(options):
         SeatedEnv(max_instances=2, **options)
     text = str(caught.value)
     assert "Pendulum.fmu needs 1 more instance(s)" in text
-    assert "'max_instances' allows 2 at once in this process" in text
+    assert "'max_instances' of 'foreign' allows 2 at once in this process" in text
     assert text.count("1 for an environment") == 2
     assert "close environments" in text
     assert "licence_wait" in text

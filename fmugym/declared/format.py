@@ -62,7 +62,7 @@ def _within(read: Callable[[str, Any], float], **limits: Any) -> Callable[[str, 
 def _probability(what: str, value: Any) -> float:
     found = number(what, value)
     if not 0 < found < 1:
-        raise ConfigError(f"{what}: expected a probability between 0 and 1, got {shown(value)}")
+        raise ConfigError(f"expected a probability between 0 and 1, got {shown(value)}")
     return found
 
 
