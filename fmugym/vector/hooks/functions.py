@@ -115,8 +115,9 @@ def _computed(
     dtype = operands[0].dtype
     wider = np.dtype(np.bool_) if ufunc in _LOGICAL else _WIDER.get(dtype, dtype)
     if ufunc in _POWERS and result.kind == "f" and _is_two(graph, operands[1]):
-        squares: Symbols = operands[0].cast(result) * operands[0].cast(result)
-        return squares  # as numpy computes them
+        base: Any = operands[0].cast(result)
+        squares: Symbols = base * base  # as numpy computes them
+        return squares
     is_missing = operation_of(ufunc, letter_of(dtype)) is None
     operation = operation_of(ufunc, letter_of(wider))
     if is_missing and operation is not None:
@@ -133,7 +134,8 @@ def _computed(
 
 
 def _is_two(graph: Graph, exponent: Symbols) -> bool:
-    return exponent.ndim == 0 and graph.value(exponent.cells[()]) == 2.0
+    cells: Any = exponent.cells
+    return exponent.ndim == 0 and bool(graph.value(cells[()]) == 2.0)
 
 
 _POWERS: Final = {np.power, np.float_power}
