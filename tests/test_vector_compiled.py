@@ -350,3 +350,21 @@ class TestReadingTheLastStep:
                 expected = tuple(getattr(one, name) for one in self.singles(self.ACTIONS[:count]))
                 assert env.get_attr(name) == expected, name
         env.close()
+
+
+class Weighing(Drawing):
+    """The reward is for a parameter that only some options give."""
+
+    def _reward_policy(self):
+        return self.parameters.get("b", -1.0) + 0.0 * self.state[0]
+
+
+def test_programs_know_parameters_that_options_add():
+    """They were compiled when there was no such parameter."""
+    ways = [FMUVectorEnv(Weighing, 3, hooks=hooks) for hooks in ("compiled", "array", "per_env")]
+    for envs in ways:
+        envs.reset(seed=1)
+        assert envs.step(envs.action_space.sample()).rewards.tolist() == [-1.0] * 3
+        envs.reset(options={"model_parameters": {"b": 0.25}})
+        assert envs.step(envs.action_space.sample()).rewards.tolist() == [0.25] * 3
+        envs.close()

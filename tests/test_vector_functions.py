@@ -191,3 +191,21 @@ def test_functions_of_float32_have_the_tolerance_of_float32():
     assert compiled(np.exp, values("d"))[1] == 1e-12
     assert compiled(np.exp, values("f"))[1] == 1e-5
     assert compiled(lambda x: np.floor(x) % 3, values("f"))[1] == 0.0
+
+
+@pytest.mark.parametrize(
+    "square",
+    [
+        lambda x: x**2,
+        lambda x: x**2.0,
+        lambda x: np.power(x, 2),
+        lambda x: np.float_power(x, np.int64(2)),
+    ],
+)
+def test_squares_are_products_as_in_numpy(square):
+    """The C library's power takes thirty times as long, and may round otherwise."""
+    numbers = np.random.default_rng(0).normal(size=COUNT) * 10.0 ** np.arange(-75, 75)
+    found, tolerance = compiled(square, numbers)
+    assert tolerance == 0.0
+    np.testing.assert_array_equal(found, numbers * numbers)
+    np.testing.assert_array_equal(square(numbers), numbers * numbers)

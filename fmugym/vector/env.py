@@ -157,7 +157,6 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
 
     # Episodes and steps.
 
-    @alone
     def reset(
         self,
         *misplaced: object,
@@ -179,6 +178,11 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             ConfigError: If seeds or options do not fit.
             SimulationError: If an FMU cannot be initialized, or the vector environment is closed.
         """
+        return self.inside.guard.run("reset", FMUVectorEnv._reset, self, misplaced, seed, options)
+
+    def _reset(
+        self, misplaced: tuple[object, ...], seed: Any, options: Mapping[str, Any] | None
+    ) -> tuple[Any, dict[str, Any]]:
         check_misplaced(misplaced)
         if self.closed or self._background.is_pending:
             require_open(self, "reset")
@@ -222,15 +226,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 came when the FMUs had stepped, until all environments are reset.
             PendingStepError: Between ``step_async`` and ``step_wait``; a ``SimulationError``, too.
         """
-        return self.inside.guard.run("step", FMUVectorEnv._step_alone, self, actions)
-
-    def _step_alone(self, actions: Any) -> StepResult:
-        inside = self.inside
-        if not inside.episodes.is_ready or self.closed or self._background.is_pending:
-            self._refuse_step("step")
-        if self._waits and inside.engine.any_ended:
-            self._require_ready("step")
-        return self._step(actions)
+        return self.inside.guard.run("step", FMUVectorEnv._step, self, actions)
 
     @alone
     def step_async(self, actions: Any) -> None:
@@ -249,7 +245,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         """
         self._require_ready("step_async")
         copied = actions.copy() if type(actions) is np.ndarray else copy.deepcopy(actions)
-        self._background.begin(self._step, copied)
+        self._background.begin(self._step, copied, True)
 
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """Wait for the step that ``step_async`` has begun.
@@ -283,12 +279,18 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             index = int(np.flatnonzero(engine.ended)[0])
             raise SimulationError(f"the episode of environment {index} has ended: reset it first")
 
-    def _step(self, actions: Any) -> StepResult:
-        engine = self.inside.engine
+    def _step(self, actions: Any, in_background: bool = False) -> StepResult:
+        inside = self.inside
+        is_busy = self._background.is_pending and not in_background
+        if not inside.episodes.is_ready or self.closed or is_busy:
+            self._refuse_step("step")
+        engine = inside.engine
+        if engine.any_ended and self._waits:
+            self._require_ready("step")
         try:
             result = engine.step(actions, engine.ended.copy() if engine.any_ended else None)
             if engine.any_ended and self.autoreset_mode is _SAME_STEP:
-                for look in self.inside.at_ends:
+                for look in inside.at_ends:
                     look(actions)
                 return self._start_again(result, engine.ended.copy())
         except BaseException:  # as in a single environment

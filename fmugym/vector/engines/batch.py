@@ -589,9 +589,11 @@ class BatchEngine(Engine):
             ConfigError: If they do not fit.
         """
         space: Any = self.env.action_space
-        with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
-            array = checked_actions(space, self._n, actions).astype(space.dtype, copy=False)
-        return np.require(array, requirements=["C", "A"])
+        array = checked_actions(space, self._n, actions)
+        if array.dtype != space.dtype:
+            with np.errstate(over="ignore"):  # the action becomes infinite, and so does an input
+                array = array.astype(space.dtype)
+        return np.ascontiguousarray(array)
 
     def roll_out(self, actions: npt.NDArray[Any]) -> tuple[Any, ...] | None:
         """See ``Engine.roll_out``."""
@@ -620,15 +622,15 @@ class BatchEngine(Engine):
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
-        env = self.env
-        before = env.action, env.previous_action, env.previous_state
-        env.previous_action, env.action = env.action, np.moveaxis(actions, 0, -1)
-        env.previous_state, env.inside.in_hooks = env.state.copy(), True
+        env, read = self.env, self.env.inside.readings
+        before = read.action, read.previous_action, read.previous_state
+        read.previous_action, read.action = read.action, results.environments_last(actions)
+        read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
         finally:
             env.inside.in_hooks = False
-            env.action, env.previous_action, env.previous_state = before
+            read.action, read.previous_action, read.previous_state = before
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
@@ -661,9 +663,9 @@ class BatchEngine(Engine):
         """Call the hooks that are not compiled, and handle faults."""
         if self._left_after:
             result = self._with_hooks_left(result, troubled, started)
-        wrong = not_finite(result.rewards), not_finite(result.observations)
-        if troubled or any(rows is not None for rows in wrong):
-            self._mend(result, started, wrong)
+        rewards, observations = not_finite(result.rewards), not_finite(result.observations)
+        if troubled or rewards is not None or observations is not None:
+            self._mend(result, started, (rewards, observations))
         return result
 
     def _with_hooks_left(

@@ -159,7 +159,8 @@ class PerEnvEngine(Engine):
                     result = _concluded(env, statuses[index], tuple(columns[index]))
                 else:
                     result = env.step(items[index])
-                self._observations[index] = _copied(result[0])
+                is_new = env.inside.pool_observes and self._together
+                self._observations[index] = result[0] if is_new else _copied(result[0])
                 results.append(result)
         except FMUGymError as error:
             raise _located(error, index) from error
