@@ -57,6 +57,9 @@ void play_draw(const Turn *turn, size_t index) {
     const Draws *d = play->draws;
     double *values = turn->drawn + index;
 
+    if (turn->drawn == NULL) { /* as in rollouts: no episode that has ended is followed */
+        return;
+    }
     draws_take(d, &play->streams[index], values, play->count);
     for (size_t i = 0; i < d->count; i++) {
         if (d->draws[i].row >= 0) {
@@ -176,7 +179,7 @@ static void start_variables(const Turn *turn, const uint32_t *starting, size_t c
             memcpy(start->row.data + starting[j] * start->row.size, &start->bits, start->row.size);
         }
     }
-    for (size_t i = 0; i < play->number_of_drawn_variables; i++) {
+    for (size_t i = 0; turn->drawn != NULL && i < play->number_of_drawn_variables; i++) {
         const DrawnVariable *variable = &play->drawn_variables[i];
         const double *values = turn->drawn + variable->draw * play->count;
         for (size_t j = 0; j < count; j++) {

@@ -174,7 +174,8 @@ def _play(case):
 def what_is_wrong_with(error):
     """What is wrong with the text of an error, or ""."""
     text = str(error)
-    return "" if text.isprintable() and len(text) < LONG else f"text: {text[:LONG]!r}"
+    is_printable = all(map(str.isprintable, text.split("\n")))  # a line for each mistake of a file
+    return "" if is_printable and len(text) < LONG else f"text: {text[:LONG]!r}"
 
 
 def describe(value):

@@ -93,7 +93,7 @@ def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path,
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
     (command,) = re.findall(
-        r"^fmugym (info --repair model.fmu .*)$", DOCUMENT.read_text(), re.MULTILINE
+        r"^fmugym (info --repair model.fmu .* lib)$", DOCUMENT.read_text(), re.MULTILINE
     )
     replaced = {"model.fmu": str(fmu_path), "lib": str(tmp_path)}
     assert main([replaced.get(word, word) for word in command.split()]) == 0

@@ -236,8 +236,11 @@ class TestEnvironments:
             )
 
     def test_keys_for_a_single_fmu(self):
-        for key, value in (("interface", "co_simulation"), ("preload", ["/x.so"])):
-            config = {"model_input_names": [], "model_output_names": ["warmth"], key: value}
+        for key, given in (
+            ("interface", {"interface": "co_simulation"}),
+            ("preload", {"foreign": {"preload": ["/x.so"]}}),
+        ):
+            config = {"model_input_names": [], "model_output_names": ["warmth"], **given}
             with pytest.raises(ConfigError, match=key):
                 Open(two_houses(), config)
 

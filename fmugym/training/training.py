@@ -173,11 +173,11 @@ def train(
         FileExistsError: If the folder exists, unless a training is resumed.
     """
     sb3 = imported_for_training("fmugym.sb3")
-    _check_arguments(plan)
     if resume:
         _require_same(plan)
     else:
         require_new(plan.folder)
+        _check_arguments(plan)
     wrap = _recorder(plan, resume)
     venv = sb3.make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed, wrap=wrap)
     try:

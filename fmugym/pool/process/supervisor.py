@@ -358,7 +358,7 @@ class Supervisor:
         result = self._receive(deadline, INSTANTIATION, Reader.end)
         self._opening = False
         if isinstance(result, Exception):
-            self.bury(f"{self._why_not_loaded(str(result))}{self.printed}")
+            self.bury(f"{self._why_not_loaded(result.args[0])}{self.printed}")
             raise LostError(self.reason) from result
 
     def _why_not_loaded(self, text: str) -> str:
