@@ -156,7 +156,7 @@ def test_a_task_by_hand_is_the_same_task(tasks, index):
 DOCUMENTS = {
     "readme": "docs/speed.md",
     "vector": "docs/vector.md",
-    "hooks": "docs/vector.md",
+    "hooks": "docs/vector.md",  # where rows of both tables have the same names
     "training": "docs/training.md",
 }
 
@@ -167,7 +167,7 @@ def test_tables_of_the_documentation_have_the_rows_that_stand_there(name):
     assert (result.returncode, result.stderr) == (0, "")
     text = (RUN.parent.parent / DOCUMENTS[name]).read_text(encoding="utf-8")
     written, measured = tables_in(text), tables_in(result.stdout)
-    rows = {"readme": 18, "vector": 5, "hooks": 3, "training": 2}[name]  # and their headers
+    rows = {"readme": 18, "vector": 5, "hooks": 5, "training": 2}[name]  # and their headers
     same = [key for key in measured if key in written and not key.startswith(":-")]
     assert len(same) == rows
     assert name != "training" or written["task"] == measured["task"]
