@@ -91,17 +91,9 @@ class RigEnv(FMI2CSEnv):
 
 
 @pytest.fixture
-def make():
+def make(opened):
     """Make environments over rigs that are closed after the test."""
-    envs = []
-
-    def make_env(backend, **config):
-        envs.append(RigEnv(backend, **config))
-        return envs[-1]
-
-    yield make_env
-    for env in envs:
-        env.close()
+    return lambda backend, **config: opened(RigEnv(backend, **config))
 
 
 def push(torque):

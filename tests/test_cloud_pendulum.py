@@ -23,17 +23,13 @@ M, L, B, G = 0.06, 0.1, 4e-4, 9.81  # kg, m, N m s/rad, m/s^2: the published nom
 
 
 @pytest.fixture(name="make_lab")
-def fixture_make_lab():
+def fixture_make_lab(opened):
     """Make labs on a clock that stands still, closed after the test."""
-    labs = []
 
     def make(preset="ideal", **options):
-        labs.append(Lab(preset, clock=ManualClock(), seed=0, **options))
-        return labs[-1]
+        return opened(Lab(preset, clock=ManualClock(), seed=0, **options))
 
-    yield make
-    for lab in labs:
-        lab.close()
+    return make
 
 
 def swings(count, amplitude=0.1, seed=0):

@@ -222,16 +222,8 @@ class TestCopies:
         params=[copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))],
         ids=["copy", "deepcopy", "pickle"],
     )
-    def clone(self, request):
-        made = []
-
-        def clone(env):
-            made.append(request.param(env))
-            return made[-1]
-
-        yield clone
-        for env in made:
-            env.close()
+    def clone(self, request, opened):
+        return lambda env: opened(request.param(env))
 
     def test_a_copy_is_an_environment_of_its_own(self, make_env, clone):
         env = make_env(model_parameters={"gain": fmugym.Uniform(0.0, 1.0)}, max_episode_steps=3)

@@ -76,17 +76,13 @@ def config(bounds=None, **parameters):
 
 
 @pytest.fixture
-def make():
+def make(opened):
     """Make environments that are closed after the test."""
-    made = []
 
     def make(bounds=None, fmu=FMU, **parameters):
-        made.append(PlainEnv(fmu, config(bounds, **parameters)))
-        return made[-1]
+        return opened(PlainEnv(fmu, config(bounds, **parameters)))
 
-    yield make
-    for env in made:
-        env.close()
+    return make
 
 
 @pytest.fixture

@@ -119,17 +119,13 @@ def fixture_one_thread():
 
 
 @pytest.fixture(name="make")
-def fixture_make():
+def fixture_make(opened):
     """Make environments for SB3 that are closed after the test."""
-    made = []
 
     def make(env="fmugym/CartPole-v0", num_envs=3, **kwargs):
-        made.append(make_sb3_env(env, num_envs, **{"monitor": False, **kwargs}))
-        return made[-1]
+        return opened(make_sb3_env(env, num_envs, **{"monitor": False, **kwargs}))
 
-    yield make
-    for venv in made:
-        venv.close()
+    return make
 
 
 def singles(env, count, **kwargs):

@@ -25,17 +25,13 @@ newer_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS[1:])
 
 
 @pytest.fixture
-def make_env(tmp_path):
-    envs = []
-
+def make_env(tmp_path, opened):
     def make(version, token, way="native", categories=None, **options):
         chosen = {} if categories is None else {"categories": categories}
-        envs.append(WordsEnv(words_fmu(tmp_path, version, token, **chosen), **WAYS[way], **options))
-        return envs[-1]
+        path = words_fmu(tmp_path, version, token, **chosen)
+        return opened(WordsEnv(path, **WAYS[way], **options))
 
-    yield make
-    for env in envs:
-        env.close()
+    return make
 
 
 def fault(env, steps=3):
