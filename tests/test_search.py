@@ -29,6 +29,7 @@ from fmugym.search.search import VALIDATION, Search
 from fmugym.tools import searching
 from fmugym.tools.searching import Quest
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.engines.batch import BatchEngine
 
 AXES = np.linalg.qr(np.random.default_rng(7).normal(size=(6, 6)))[0]
 STRETCH = 10.0 ** np.linspace(0, 2, 6)  # lengths of axes, so that variances differ by 1e4
@@ -201,6 +202,30 @@ FALLING = {
 }
 
 
+class Branching(fmugym.TaskEnv):
+    """A hook that can only be called for one environment at a time."""
+
+    def __init__(self, **options):
+        super().__init__(FALLING, **options)
+
+    def _is_truncated(self):
+        return bool(self.step_count < 0)
+
+
+class Sorted(Branching):
+    """A hook that can be called for all environments at once, but not be compiled."""
+
+    def _is_truncated(self):
+        return np.sort(np.array(self.state), axis=0)[1] < -1e9
+
+
+class Stepping(Branching):
+    """A step of its own."""
+
+    def step(self, action):
+        return super().step(action)
+
+
 def load(document=FALLING, **changes):
     task = {key: value for key, value in (document | changes).items() if value is not None}
     return partial(fmugym.load, fmugym.Task.from_dict(task))
@@ -263,10 +288,32 @@ class TestArena:
             arena.play(pid, GAINS[:1], [1])
             assert arena.play(pid, GAINS, SEEDS).returns.tolist() == first.returns.tolist()
 
-    def test_its_steps_are_counted(self):
-        """Nobody ends an episode of 40 steps here."""
-        _, arena = played(load(terminated=None))
-        assert arena.steps == 40 * 15
+    @pytest.mark.parametrize("most_envs", [512, 7])
+    @pytest.mark.parametrize("kind", ["compiled", "arrays", "per_env", "own_step", "process"])
+    def test_no_episode_is_stepped_beyond_its_end(self, kind, most_envs):
+        """The FMUs do as many steps as the episodes in single environments have."""
+        make = {
+            "compiled": load(),
+            "arrays": Sorted,
+            "per_env": Branching,
+            "own_step": Stepping,
+            "process": partial(fmugym.load, fmugym.Task.from_dict(FALLING), isolation="process"),
+        }[kind]
+        lengths = []
+        with closing(make()) as env:
+            for (gain,) in GAINS:
+                controller = PID("theta", 0.0, kp=gain, td=0.2).bind(env)
+                for seed in SEEDS:
+                    controller.reset()
+                    lengths.append(episode(env, controller, seed)[2])
+        with closing(Arena(make, most_envs, costs=["effort"])) as arena:
+            outcome = arena.play(pid, GAINS, SEEDS)
+            stepped = sum(envs.health["steps"].sum() for envs in arena._envs.values())
+        assert stepped == arena.steps == sum(lengths)
+        assert len(set(lengths)) > 3
+        expected, _ = played(load(), costs=["effort"])
+        assert outcome.returns == pytest.approx(expected.returns, rel=1e-12)
+        assert outcome.costs == pytest.approx(expected.costs, rel=1e-12)
 
     def test_the_ceiling_holds(self):
         with closing(Arena(load(terminated=None))) as arena:
@@ -1095,17 +1142,18 @@ class Budget:
 
     def __init__(self, monkeypatch):
         self.steps, self.is_open = 0, True
-        step, judge = FMUVectorEnv.step, searching.judge
+        step, judge = BatchEngine.step, searching.judge
 
-        def counted(envs, actions):
-            self.steps += envs.num_envs * self.is_open
-            return step(envs, actions)
+        def counted(engine, actions, resetting, resting=None):
+            idle = 0 if resting is None else np.count_nonzero(resting)
+            self.steps += (len(actions) - idle) * self.is_open
+            return step(engine, actions, resetting, resting)
 
         def judged(*arguments):
             self.is_open = False
             return judge(*arguments)
 
-        monkeypatch.setattr(FMUVectorEnv, "step", counted)
+        monkeypatch.setattr(BatchEngine, "step", counted)
         monkeypatch.setattr(searching, "judge", judged)
         monkeypatch.setattr(searching, "monotonic", lambda: 1e-4 * self.steps)
         monkeypatch.setattr(Probe, "round_time", lambda *_: 0.0)

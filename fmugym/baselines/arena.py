@@ -58,7 +58,7 @@ class Arena:
         costs: The names of costs to add up.
 
     Attributes:
-        steps: The steps of all environments until now.
+        steps: The steps of all episodes until now.
         ceiling: The largest number of them.
     """
 
@@ -104,23 +104,16 @@ class Arena:
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
-            totals = self._play(envs, controller, [seeds[index] for index in which.tolist()], watch)
+            own = [seeds[index] for index in which.tolist()]
+            totals = self._play(envs, controller, own, len(part), watch)
             groups.append(totals[:, : len(part)])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, watched = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._costs)], axis=-1)
         return Outcome(totals[0], costs, watched)
 
-    def most_of(self, jobs: int) -> int:
-        """The largest number of steps that so many episodes take in a new arena."""
-        size = self._size_for(jobs)
-        return math.ceil(jobs / size) * size * self._most_steps
-
-    def _size_for(self, jobs: int) -> int:
-        return min(jobs, self._most_envs, _WIDEST)
-
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
-        size = self._size_for(jobs)
+        size = min(jobs, self._most_envs, _WIDEST)
         if size not in self._envs and sum(self._envs) + size > self._most_envs:
             larger = [count for count in self._envs if count > size]
             if larger:
@@ -131,19 +124,28 @@ class Arena:
         return self._envs[size]
 
     def _play(
-        self, envs: FMUVectorEnv, controller: Controller, seeds: list[int], watch: Any
+        self, envs: FMUVectorEnv, controller: Controller, seeds: list[int], count: int, watch: Any
     ) -> FloatArray:
-        """Rewards, costs and what is watched, summed over an episode, shape (1 + c + r, N)."""
+        """Rewards, costs and what is watched, summed over an episode, shape (1 + c + r, N).
+
+        Environments from ``count`` on rest, as do those whose episodes have ended.
+        """
         observations, infos = envs.reset(seed=seeds)
         totals: FloatArray = np.zeros((1 + len(self._costs), len(seeds)))
         watched: FloatArray = np.empty((0, len(seeds)))
-        running = np.ones(len(seeds), dtype=bool)
-        counted: Any = True  # whose numbers count; True for all, which takes less time
+        running = np.arange(len(seeds)) < count
         for _ in range(self._most_steps):
-            if self.steps + len(seeds) > self.ceiling:
+            if self.steps + count > self.ceiling:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
+            self.steps += count
             actions = controller.act(observations, infos)
-            observations, rewards, terminated, truncated, infos = envs.step(actions)
+            counted: Any = True  # whose numbers count; for all, that takes less time
+            if count == len(seeds):
+                result = envs.step(actions)
+            else:
+                counted = running
+                result = envs.inside.engine.step(actions, None, ~running)
+            observations, rewards, terminated, truncated, infos = result
             costs = (infos["costs"][name] for name in self._costs)
             for total, values in zip(totals, (rewards, *costs), strict=True):
                 np.add(total, values, out=total, where=counted)
@@ -151,11 +153,10 @@ class Arena:
                 seen = watch(controller)
                 watched = watched if len(watched) else np.zeros(seen.shape)
                 np.add(watched, seen, out=watched, where=counted)
-            self.steps += len(seeds)
             ended = terminated | truncated
             if ended.any():
-                running &= ~ended
-                counted = running
-                if not running.any():
+                running = running & ~ended
+                count = int(np.count_nonzero(running))
+                if not count:
                     break
         return np.concatenate([totals, watched])

@@ -43,8 +43,8 @@ _FEWEST: Final = 20
 
 _SLOW: Final = 1e-4
 _GROUP: Final = 8
-"""If a step takes longer than this in seconds, so many environments step together, so that an
-episode that has ended is not stepped on until the longest of many ends."""
+"""If a step takes longer than this in seconds, so many environments step together: more would
+hardly be faster, and take long to open."""
 
 _LONGEST: Final = 2**31
 """Steps of a scenario, which has a length of its own."""
@@ -248,7 +248,6 @@ class _Run:
                 self._course.search = pickle.loads(self._kept)
                 self._write()
             self._quest.tell(self._text())
-            self._arena.close()  # a new one takes no more steps than what is reserved
             self._arena.ceiling = self._most
             found = self._course.search
             try:
@@ -282,7 +281,8 @@ class _Run:
     def _reserved(self) -> int:
         """The steps that the last validation may take."""
         agents, seeds = self._course.search.last_validation()
-        return len(agents) * self._arena.most_of(len(seeds)) if len(agents) > 1 else 0
+        episodes = len(agents) * len(seeds) if len(agents) > 1 else 0
+        return episodes * self._course.probe.most_steps
 
     def _keep(self) -> None:
         """Remember the search as it is between two rounds."""

@@ -234,8 +234,7 @@ def roll_out_by_steps(
     over = np.zeros(len(engine.ended), np.bool_)
     results: list[StepResult] = []
     for step in range(horizon):
-        starting = engine.ended.copy() if engine.any_ended else None
-        result = engine.step(act(step, observations), starting)
+        result = engine.step(act(step, observations), None, over.copy() if over.any() else None)
         if over.any():
             result = _without(result, observations, over)
         over |= result.terminated | result.truncated

@@ -86,8 +86,17 @@ class Engine(ABC):
         return None
 
     @abstractmethod
-    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
-        """Step the environments; those in the mask start an episode instead."""
+    def step(
+        self, actions: Any, resetting: MaskArray | None, resting: MaskArray | None = None
+    ) -> StepResult:
+        """Step the environments.
+
+        Args:
+            actions: Of all environments.
+            resetting: Which ones start an episode instead; None for none.
+            resting: Which ones stay as they are, with a reward of 0; their episodes count as
+                ended. None for none; at most one of both masks is given.
+        """
 
     @abstractmethod
     def seed_of(self, index: int) -> int | None:

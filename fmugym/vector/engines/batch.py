@@ -527,8 +527,12 @@ class BatchEngine(Engine):
 
     # Steps.
 
-    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+    def step(
+        self, actions: Any, resetting: MaskArray | None, resting: MaskArray | None = None
+    ) -> StepResult:
         """See ``Engine.step``."""
+        if resting is not None:
+            return self._step_around(actions, resting)
         if self._left or (resetting is not None and not self._pool_starts):
             actions = self._checked_before(actions, resetting)
         at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
@@ -546,6 +550,22 @@ class BatchEngine(Engine):
         result, troubled, self.any_ended, started = played
         if troubled or self._left_after:
             return self._completed(result, troubled, started)
+        return result
+
+    def _step_around(self, actions: Any, resting: MaskArray) -> StepResult:
+        """Step the environments that do not rest; what is not stepped counts as just started."""
+        play, checked = self._play, self._checked_before(actions, resting)
+        self.has_moved = True
+        self.ended[:] = resting
+        self._pool.statuses[resting] = 0
+        play.before(checked)
+        self._pool.step(None, resting)
+        result: StepResult
+        result, troubled, *_ = play.after(checked)
+        if troubled or self._left_after:
+            result = self._completed(result, troubled, resting)
+        self.ended |= resting
+        self.any_ended = True
         return result
 
     def _checked_before(self, actions: Any, resetting: MaskArray | None) -> npt.NDArray[Any]:

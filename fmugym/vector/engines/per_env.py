@@ -127,34 +127,43 @@ class PerEnvEngine(Engine):
         self.note_starts(mask)
         return self._joined(), gathered(infos, len(self._envs))
 
-    def step(self, actions: Any, resetting: MaskArray | None) -> StepResult:
+    def step(
+        self, actions: Any, resetting: MaskArray | None, resting: MaskArray | None = None
+    ) -> StepResult:
         """See ``Engine.step``."""
         self.has_moved = False
-        items = self._actions(actions)
-        starting = [False] * len(items) if resetting is None else resetting.tolist()
+        items, idle = self._actions(actions), resetting if resting is None else resting
+        idles = [False] * len(items) if idle is None else idle.tolist()
         try:
             if self._together:
-                self._take_actions(items, [*compress(range(len(items)), map(not_, starting))])
-                self._pool.step(None, resetting, self._pool.observations)
+                self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
+                self._pool.step(None, idle, self._pool.observations)
             self.has_moved = True
-            return self._result(self._results(items, starting))
+            result = self._result(self._results(items, idles, starts=resting is None))
         except BaseException:
             for env in self._envs:
                 env.inside.in_hooks = False
                 if self.has_moved:  # its FMU has stepped without a result
                     env.inside.ended = True
             raise
+        if resting is not None:
+            result.truncated[resting] = False
+            self.ended |= resting
+            self.any_ended = True
+        return result
 
-    def _results(self, items: Sequence[Any], starting: Sequence[bool]) -> list[Result]:
-        """Let the environments conclude the step one after another, or start an episode."""
+    def _results(self, items: Sequence[Any], idle: Sequence[bool], *, starts: bool) -> list[Result]:
+        """Let the environments conclude the step one after another, start an episode, or rest."""
         results: list[Result] = []
         statuses, columns = self._pool.statuses.tolist(), self._pool.outputs.T.tolist()
         index = 0
         try:
-            for index, (env, is_start) in enumerate(zip(self._envs, starting, strict=True)):
-                if is_start:
+            for index, (env, is_idle) in enumerate(zip(self._envs, idle, strict=True)):
+                if is_idle and not starts:
+                    result: Result = self._observations[index], 0.0, False, False, {}
+                elif is_idle:
                     observation, info = self._reset(index, None, {})
-                    result: Result = observation, 0.0, False, False, info
+                    result = observation, 0.0, False, False, info
                 elif self._together:
                     result = _concluded(env, statuses[index], tuple(columns[index]))
                 else:
