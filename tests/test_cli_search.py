@@ -62,6 +62,11 @@ def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_pa
     assert searched(capsys, task, folder, "--seed", "9", "--force")[0] == 0
     assert facts_of(folder) != before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "task.toml", "wrong.toml"]
+    before = facts_of(folder)
+    few = written(tmp_path, "few", controllers={"pi": TASK["controllers"]["pi"]})
+    code, _, err = searched(capsys, few, folder, "--minutes", "1e-9", "--force")
+    assert (code, "rounds are too few" in err) == (1, True)
+    assert facts_of(folder) == before
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "file").touch()
@@ -81,7 +86,7 @@ def facts_of(folder):
 
 
 def curve(folder):
-    """The scores; how many environments were idle depends on when they were made."""
+    """The scores; the steps of a round that was interrupted count, too."""
     lines = (folder / "evaluations.csv").read_text().splitlines()
     return [line.partition(",")[2] for line in lines]
 
@@ -211,6 +216,7 @@ class TestCourse:
         code, out, err = searched(capsys, task, tmp_path / "a", "--rounds", ROUNDS)
         assert (code, out) == (130, "")
         assert "nothing" in err
+        assert not (tmp_path / "a").exists()
 
 
 def words_after(text, mark):

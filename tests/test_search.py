@@ -1114,11 +1114,12 @@ class TestSearch:
         assert facts["rounds"] == 3
         assert Agent.load(tmp_path / "agent").text.startswith("pid of=theta")
 
-    def test_a_search_that_finds_nothing_does_not_block_its_folder(self, tmp_path):
+    def test_a_search_that_finds_nothing_leaves_no_folder(self, tmp_path):
         one = {"pi": CONTROLLERS["pi"]}
         limits = {"rounds": None, "steps": MOST_PROBED + 20, "candidates": 32}
         with pytest.raises(ConfigError, match="0 rounds are too few"):
             searched(tmp_path / "agent", controllers=one, terminated=None, **limits)
+        assert not (tmp_path / "agent").exists()
         _, facts = searched(tmp_path / "agent", rounds=3, controllers=one)
         assert facts["rounds"] == 3
         with pytest.raises(FileExistsError):

@@ -6,7 +6,7 @@ import csv
 import json
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -123,13 +123,17 @@ def search(quest: Quest, *, resume: bool = False) -> tuple[Verdict, dict[str, An
     """
     begin = monotonic()
     course = _resumed(quest) if resume else _begun(quest)
-    run = _Run(quest, course, begin)
-    run.tell_the_plan()
-    return run.judged(run.winner())
+    try:
+        run = _Run(quest, course, begin)
+        run.tell_the_plan()
+        return run.judged(run.winner())
+    finally:
+        with suppress(OSError):  # something was found, so that the folder is not empty
+            quest.folder.rmdir()
 
 
 def _begun(quest: Quest) -> _Course:
-    require_new(quest.folder, STATE)
+    require_new(quest.folder)
     if quest.steps is not None and quest.steps <= MOST_PROBED:
         raise ConfigError(
             f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
@@ -246,7 +250,7 @@ class _Run:
                 self._search()
             finally:
                 self._course.search = pickle.loads(self._kept)
-                self._write()
+                self._write(self._leader())
             self._quest.tell(self._text())
             self._arena.ceiling = self._most
             found = self._course.search
@@ -254,12 +258,12 @@ class _Run:
                 winner = found.winner(self._arena)
             except CeilingError:  # no round has had enough steps
                 winner = None
-            self._write_state()
-        if winner is None:
-            raise ConfigError(
-                f"{found.rounds} rounds are too few to find anything: give more --minutes, "
-                "--rounds or --steps"
-            )
+            if winner is None:
+                raise ConfigError(
+                    f"{found.rounds} rounds are too few to find anything: give more --minutes, "
+                    "--rounds or --steps"
+                )
+            self._write(winner)
         return winner
 
     def _search(self) -> None:
@@ -324,16 +328,19 @@ class _Run:
                     writer.writerow(["steps", "reward", found.baseline.name])
                 writer.writerow([self._arena.steps, best[1], found.merit_of_baseline[1]])
         if monotonic() - self._written > _BETWEEN_WRITES:
-            self._write()
+            self._write(self._leader())
 
-    def _write(self) -> None:
-        """Write the best agent until now, and the state of the search."""
-        self._written, known = monotonic(), self._course.search.known()
-        if known:
-            self._save(max(known, key=lambda one: one[1])[0])
-        self._write_state()
+    def _leader(self) -> Agent | None:
+        """The best agent until now; None if there is none."""
+        known = self._course.search.known()
+        return max(known, key=lambda one: one[1])[0] if known else None
 
-    def _write_state(self) -> None:
+    def _write(self, agent: Agent | None) -> None:
+        """Write an agent and the state of the search, if there is an agent."""
+        self._written = monotonic()
+        if agent is None:
+            return
+        self._save(agent)
         self._course.steps = self._arena.steps
         path = self._quest.folder / STATE
         part = path.with_suffix(".part")
@@ -361,7 +368,6 @@ class _Run:
     def judged(self, winner: Agent) -> tuple[Verdict, dict[str, Any]]:
         """Write the winner, and let it play beside the others."""
         quest, probe, found = self._quest, self._course.probe, self._course.search
-        self._save(winner)
         if winner is found.baseline:
             quest.tell(
                 f"nothing was found that beats {winner.name}: the folder has that controller"

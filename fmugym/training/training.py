@@ -224,15 +224,15 @@ def _check_arguments(plan: Plan) -> None:
             raise unknown_name(f"argument of {plan.algorithm}", name, known)
 
 
-def require_new(folder: Path, *unfinished: str) -> None:
-    """Refuse a folder that has more in it than a search for arguments, or these files.
+def require_new(folder: Path) -> None:
+    """Refuse a folder that has more in it than a search for arguments.
 
     Raises:
         FileExistsError: If it has.
     """
     if folder.exists() and not {path.name for path in folder.iterdir()} <= {
-        *(TRIALS, f"{TRIALS}.csv"),
-        *unfinished,
+        TRIALS,
+        f"{TRIALS}.csv",
     }:
         raise FileExistsError(f"{folder} exists; name a new folder")
 
