@@ -2,11 +2,14 @@
 
 import csv
 import io
+import itertools
 import json
 import re
 import shutil
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -239,6 +242,25 @@ def test_targets_are_reached(task, rounds, target, tmp_path, capsys):
     assert len(told["test"][told["agent"]]["rewards"]["unseen episodes"]) == 100
 
 
+class Bar:
+    """In the place of tqdm's."""
+
+    def __init__(self, told, **options):
+        self.told = told
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        return None
+
+    def set_postfix_str(self, text, refresh):
+        self.told.append(text)
+
+    def update(self, steps):
+        return None
+
+
 class TestOutput:
     def test_it_tells_what_it_does(self, task, tmp_path, capsys):
         code, out, err = searched(
@@ -254,12 +276,31 @@ class TestOutput:
         for fact in ("lazy", "tuned pi", "unseen episodes", "effort", "of at most 1"):
             assert fact in out
 
-    def test_scores_are_plain_lines(self, task, tmp_path, capsys, monkeypatch):
-        """Also in a short search, and where no bar can be shown."""
-        monkeypatch.setitem(sys.modules, "tqdm", None)
+    @pytest.mark.parametrize(
+        ("is_terminal", "has_tqdm"), [(True, True), (False, True), (True, False)]
+    )
+    def test_scores_are_a_bar_or_plain_lines(
+        self, is_terminal, has_tqdm, task, tmp_path, capsys, monkeypatch
+    ):
+        """There is a line every ten seconds, and in any case at the end; a round takes a second."""
+        told = []
+        clock = itertools.count()
+        monkeypatch.setattr("fmugym.tools.learning.monotonic", clock.__next__)
+        module = SimpleNamespace(tqdm=partial(Bar, told)) if has_tqdm else None
+        monkeypatch.setitem(sys.modules, "tqdm", module)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
         code, _, err = searched(capsys, task, tmp_path / "a", "--rounds", "25")
         assert code == 0
-        assert re.search(r"^round 25, best -[\d.]+, lazy -[\d.]+$", err, re.MULTILINE)
+        lines = [line for line in err.splitlines() if line.startswith("round")]
+        if told:
+            assert len(lines) == 1
+            rounds = [int(re.match(r"round (\d+)", text)[1]) for text in told]
+            assert rounds == sorted({*rounds, 1, 2, 25})
+        else:
+            assert 2 <= len(lines) <= 4
+        assert bool(told) == (is_terminal and has_tqdm)
+        for text in (lines[-1], *told[-1:]):
+            assert re.fullmatch(r"round 25, best -[\d.]+, lazy -[\d.]+", text)
 
     def test_json(self, task, tmp_path, capsys):
         code, out, _ = searched(capsys, task, tmp_path / "a", "--rounds", "32", "--json")

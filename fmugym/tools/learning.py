@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from math import isfinite
@@ -15,7 +15,7 @@ from typing import Any, Final
 from fmugym.baselines.tuning import LEAST_CANDIDATES
 from fmugym.checks import check_number
 from fmugym.episodes.evaluation import Score, table
-from fmugym.episodes.progress import Advance, progress
+from fmugym.episodes.progress import Advance, no_progress, progress
 from fmugym.episodes.records import title_of
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
@@ -174,7 +174,7 @@ def _search(arguments: argparse.Namespace) -> None:
     )
     total = round(quest.seconds) if isfinite(quest.seconds) else None
     with progress(total, "train", "s") as advance:
-        quest = replace(quest, advance=_now_and_then(advance))
+        quest = replace(quest, advance=_lines() if advance is no_progress else advance)
         try:
             verdict, facts = search(quest, resume=arguments.resume)
         except KeyboardInterrupt:
@@ -191,13 +191,12 @@ def _search(arguments: argparse.Namespace) -> None:
         tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
 
 
-def _now_and_then(advance: Advance) -> Callable[[float, str], None]:
-    """Tell the scores in a line every ten seconds, and beside the bar."""
+def _lines() -> Advance:
+    """Tell the scores in a line every ten seconds."""
     last = monotonic()
 
     def show(seconds: float, text: str) -> None:
         nonlocal last
-        advance(seconds, text)
         if monotonic() - last > _BETWEEN_LINES:
             last = monotonic()
             tell(text)
