@@ -2,6 +2,7 @@
 
 import itertools
 from contextlib import closing, suppress
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from types import SimpleNamespace
@@ -1167,8 +1168,22 @@ class TestBudget:
         budget = Budget(monkeypatch)
         limits = {"rounds": None, "minutes": 60, "steps": ceiling, "envs": envs}
         _, facts = searched(tmp_path / "agent", **limits)
-        assert 0.7 * ceiling < budget.steps <= ceiling
-        assert facts["steps"] == budget.steps
+        assert 0.7 * ceiling < facts["steps"] <= ceiling
+        assert 0 <= facts["steps"] - budget.steps < MOST_PROBED
+
+    def test_what_fits_a_ceiling_depends_on_no_time(self, tmp_path, monkeypatch):
+        """Neither on the time of a step, nor on the environments.
+
+        The round that does not fit is left after fewer or more steps.
+        """
+        facts = []
+        for seconds, envs in ((100.0, 512), (0.0, 512), (0.0, 11)):
+            clock = itertools.count(step=seconds)
+            monkeypatch.setattr("fmugym.search.probe.perf_counter", clock.__next__)
+            folder = tmp_path / str(len(facts))
+            limits = {"rounds": None, "minutes": 1e9, "steps": 20_000, "envs": envs}
+            facts.append(searched(folder, **limits)[1] | {"steps": None})
+        assert facts[0] == facts[1] == facts[2]
 
     def test_a_ceiling_below_a_look_at_the_task_is_refused(self, tmp_path, monkeypatch):
         budget = Budget(monkeypatch)
@@ -1213,23 +1228,29 @@ HIDDEN = {"q_0": "pi", "theta_0": 0.5, "b": {"distribution": "uniform", "low": 0
 
 class TestProbe:
     @pytest.mark.parametrize("envs", [1, 3, 8])
-    def test_its_course_depends_on_no_time(self, envs, monkeypatch):
-        """Episodes differ after the first steps only, and a step seems to take 100 s."""
-        clock = itertools.count(step=100.0)
-        monkeypatch.setattr("fmugym.search.probe.perf_counter", lambda: next(clock))
-        probe = Probe.of(load(parameters=HIDDEN), envs)
-        assert (probe.is_same, probe.only_reward) == (False, None)
+    def test_what_it_finds_depends_on_no_time(self, envs, monkeypatch):
+        """Episodes differ after the first steps only; a step seems to take 100 s, or nothing."""
+        found = []
+        for seconds in (100.0, 0.0):
+            clock = itertools.count(step=seconds)
+            monkeypatch.setattr("fmugym.search.probe.perf_counter", clock.__next__)
+            found.append(Probe.of(load(parameters=HIDDEN), envs))
+        slow, fast = found
+        assert slow.seconds > fast.seconds
+        assert replace(slow, seconds=fast.seconds) == fast
+        assert (slow.is_same, slow.only_reward) == (False, None)
 
     def test_no_episode_is_stepped_beyond_an_end(self, monkeypatch):
-        ends, step = [], FMUVectorEnv.step
+        ends, counts, step = [], [], FMUVectorEnv.step
 
         def spied(envs, actions):
             result = step(envs, actions)
+            counts.append(envs.num_envs)
             ends.append(bool((result[2] | result[3]).any()))
             return result
 
         monkeypatch.setattr(FMUVectorEnv, "step", spied)
-        probe = Probe.of(load(), 8)
+        Probe.of(load(), 8)
         *before, _ = ends[: ends.index(True) + 1]
         assert not any(before)
-        assert probe.steps <= MOST_PROBED
+        assert sum(counts) <= MOST_PROBED

@@ -30,7 +30,7 @@ _TIMED: Final = 10
 the overhead of a call is for all of them."""
 
 MOST_PROBED: Final = _EPISODES * _STEPS + _MANY * _TIMED
-"""The steps of a probe, at most."""
+"""The steps of a probe, at most. As many count, since how many there are depends on the time."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,6 @@ class Probe:
         seconds: Real time of a step of one environment among many.
         only_reward: The reward of every step; None if it has changed, or an episode has ended by
             success or failure.
-        steps: How many it has taken to know that.
     """
 
     names: tuple[str, ...]
@@ -62,7 +61,6 @@ class Probe:
     is_same: bool
     seconds: float
     only_reward: float | None
-    steps: int
 
     @classmethod
     def of(cls, make_env: Callable[[], FMUEnv], envs: int = _EPISODES) -> Probe:
@@ -83,11 +81,10 @@ class Probe:
             limits = dict(getattr(env, "cost_limits", {}))
             document = document_of(env)
         with closing(FMUVectorEnv(make_env, min(envs, _EPISODES))) as many:
-            told, seconds, steps = _timed(many, _EPISODES, _STEPS)
+            told, seconds = _timed(many, _EPISODES, _STEPS)
         if seconds < _QUICK:
             with closing(FMUVectorEnv(make_env, min(envs, _MANY))) as many:
-                _, seconds, more = _timed(many, 1, _TIMED)
-            steps += more
+                _, seconds = _timed(many, 1, _TIMED)
         rewards, has_ended = np.unique(told[1:, :, 0]), told[:, :, 1].any()
         return cls(
             policy.names,
@@ -100,7 +97,6 @@ class Probe:
             is_same=bool((told == told[:, :1]).all()),
             seconds=seconds,
             only_reward=float(rewards[0]) if len(rewards) == 1 and not has_ended else None,
-            steps=steps,
         )
 
     @property
@@ -118,8 +114,8 @@ def document_of(env: Any) -> Mapping[str, Any]:
     return env.task.document if hasattr(env, "task") else {}
 
 
-def _timed(envs: FMUVectorEnv, episodes: int, most: int) -> tuple[FloatArray, float, int]:
-    """What ``_played`` tells of so many episodes, the seconds of a step, and how many there were.
+def _timed(envs: FMUVectorEnv, episodes: int, most: int) -> tuple[FloatArray, float]:
+    """What ``_played`` tells of so many episodes, and the seconds of a step.
 
     Few environments play several times, so that their number does not matter.
     """
@@ -129,7 +125,7 @@ def _timed(envs: FMUVectorEnv, episodes: int, most: int) -> tuple[FloatArray, fl
     seconds = (perf_counter() - begin) / steps
     shortest = min(map(len, played))
     told = np.concatenate([one[:shortest] for one in played], axis=1)
-    return told[:, :episodes], seconds, steps
+    return told[:, :episodes], seconds
 
 
 def _played(envs: FMUVectorEnv, first: int, most: int) -> FloatArray:

@@ -165,7 +165,7 @@ def _begun(quest: Quest) -> _Course:
         quest.seed,
     )
     quest.folder.mkdir(parents=True, exist_ok=True)
-    return _Course(made, probe, probe.steps)
+    return _Course(made, probe, MOST_PROBED)
 
 
 def _first_lines(probe: Probe, fixed: list[str], tunable: list[str], guesses: int) -> Iterator[str]:
