@@ -17,11 +17,11 @@ from fmugym import ConfigError
 from fmugym.baselines import PID, controller_of
 from fmugym.baselines.arena import MOST_STEPS, Arena, CeilingError, Outcome
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.entrants import merits_of
 from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
 from fmugym.search.agent import AGENT, Agent
-from fmugym.search.entrants import merits_of
 from fmugym.search.flattening import require_numbers, rows_of, width_of
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale

@@ -14,6 +14,7 @@ import numpy as np
 from fmugym.baselines.arena import MOST_STEPS, Arena
 from fmugym.baselines.base import Controller, FloatArray
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.entrants import Entrant
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -119,12 +120,20 @@ def tune(
     axes = Axes({name: _range(name, one) for name, one in given.items()})
     _check_names(make_controller, axes.ranges)
     seed = check_seed(seed) or 0
-    trials = _Trials(make_controller, axes, range(seed, seed + episodes), watch)
     cma = axes.search(candidates, np.random.default_rng(seed))
+    entrant = Entrant(cma, lambda rows: make_controller(**axes.numbers(rows)), episodes)
+    returns: list[float] = []
     with closing(Arena(make_env, candidates * episodes, most_steps)) as arena:
         for _ in range(rounds):
-            cma.tell(np.argsort(-trials.score(arena, cma.ask()), kind="stable"))
-    return trials.result()
+            _, reached = entrant.play(arena, range(seed, seed + episodes), ())
+            if reached > max(returns, default=-math.inf):
+                numbers = axes.numbers(entrant.leader[None])
+                best = {name: float(values[0]) for name, values in numbers.items()}
+            returns.append(reached)
+            found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
+            if watch is not None:
+                watch(found)
+    return found
 
 
 def _range(name: str, given: Any) -> Uniform | LogUniform:
@@ -143,40 +152,3 @@ def _check_names(make_controller: Callable[..., Controller], names: Collection[s
     for name in names:
         if name not in parameters:
             raise unknown_name("number in search", name, parameters)
-
-
-class _Trials:
-    """Lets candidates play, and remembers the best one."""
-
-    def __init__(
-        self,
-        make_controller: Callable[..., Controller],
-        axes: Axes,
-        seeds: range,
-        watch: Callable[[Tuning], None] | None,
-    ) -> None:
-        self._make_controller, self._axes, self._seeds = make_controller, axes, seeds
-        self._watch = watch
-        self._best, self._most = np.empty(len(axes.ranges)), -math.inf
-        self._returns: list[float] = []
-
-    def result(self) -> Tuning:
-        """The best candidate until now."""
-        numbers = self._axes.numbers(self._best[None])
-        parameters = {name: float(values[0]) for name, values in numbers.items()}
-        controller = self._make_controller(**parameters)
-        return Tuning(controller, parameters, self._most, tuple(self._returns))
-
-    def score(self, arena: Arena, places: FloatArray) -> FloatArray:
-        """The mean returns of candidates, shape (n,)."""
-        outcome = arena.play(
-            lambda rows: self._make_controller(**self._axes.numbers(rows)), places, self._seeds
-        )
-        returns: FloatArray = outcome.returns.mean(axis=1)
-        leader = int(returns.argmax())
-        self._returns.append(float(returns[leader]))
-        if returns[leader] > self._most:
-            self._best, self._most = places[leader].copy(), float(returns[leader])
-        if self._watch is not None:
-            self._watch(self.result())
-        return returns

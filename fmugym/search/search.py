@@ -12,10 +12,10 @@ from fmugym.baselines import Controller
 from fmugym.baselines.arena import Arena
 from fmugym.baselines.base import FloatArray
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
 from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
-from fmugym.search.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
 from fmugym.search.policy import CONSTANT, Form, Policy, Scale
 
 __all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]

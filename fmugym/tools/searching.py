@@ -15,12 +15,12 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
+from fmugym.baselines.entrants import NO_MERIT, Merit
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress import Advance, no_progress
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.agent import Agent
-from fmugym.search.entrants import NO_MERIT, Merit
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.probe import MOST_PROBED, Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search

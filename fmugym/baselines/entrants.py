@@ -53,6 +53,7 @@ class Entrant:
         episodes: How many each candidate plays in a round.
         quota: How many rounds it has in any case.
         rounds: How many it has had.
+        leader: The numbers of the best candidate of the last one, shape (n,).
         merit: That of the best candidate in validation.
         best: Its numbers, shape (n,).
         gained: The round in which it was found, or in which something was changed.
@@ -65,6 +66,7 @@ class Entrant:
     episodes: int
     quota: int = 0
     rounds: int = 0
+    leader: FloatArray = field(default_factory=lambda: np.empty(0))
     merit: Merit = NO_MERIT
     best: FloatArray = field(default_factory=lambda: np.empty(0))
     gained: int = 0
@@ -83,6 +85,7 @@ class Entrant:
         order = sorted(range(len(found)), key=merits.__getitem__, reverse=True)
         self.cma.tell(np.array(order))
         self.rounds += 1
+        self.leader = found[order[0]]
         self._note_agreement(outcome.returns)
         return merits[order[0]]
 
@@ -94,7 +97,7 @@ class Entrant:
         """
         if not 1 < returns.shape[1] < MOST_EPISODES:
             return
-        first, second = (_ranks(part.mean(axis=1)) for part in np.split(returns, 2, axis=1))
+        first, second = (_ranks(part.mean(axis=1)) for part in np.array_split(returns, 2, axis=1))
         size = math.sqrt((first @ first) * (second @ second))
         if size > 0:  # otherwise all have reached the same
             self.agreement += _FADE * (float(first @ second) / size - self.agreement)
