@@ -366,7 +366,7 @@ class _Run:
         return facts
 
     def judged(self, winner: Agent) -> tuple[Verdict, dict[str, Any]]:
-        """Write the winner, and let it play beside the others."""
+        """Let the winner play beside the others, and write what it has reached."""
         quest, probe, found = self._quest, self._course.probe, self._course.search
         if winner is found.baseline:
             quest.tell(
