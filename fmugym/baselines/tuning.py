@@ -126,10 +126,9 @@ def tune(
     with closing(Arena(make_env, candidates * episodes, most_steps)) as arena:
         for _ in range(rounds):
             _, reached = entrant.play(arena, range(seed, seed + episodes), ())
-            if reached > max(returns, default=-math.inf):
-                numbers = axes.numbers(entrant.leader[None])
-                best = {name: float(values[0]) for name, values in numbers.items()}
             returns.append(reached)
+            numbers = axes.numbers(entrant.leader[None])
+            best = {name: float(values[0]) for name, values in numbers.items()}
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
             if watch is not None:
                 watch(found)
