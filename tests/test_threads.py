@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import signal
+import sys
 import threading
 import time
 
@@ -213,6 +214,32 @@ def play_some(env):
     yield from (env.step(action)[0] for action in (0, 1, 1, 0, 0, 1))
 
 
+def interrupt(play, arguments):
+    """Call ``play`` with each of the arguments, and interrupt each call by a signal.
+
+    Meanwhile no coverage is measured: an interrupt could leave the lock of the tracer taken.
+    """
+
+    def ring(*_):
+        raise KeyboardInterrupt
+
+    before, trace = signal.signal(signal.SIGALRM, ring), sys.gettrace()
+    rng, interrupted = np.random.default_rng(0), 0
+    sys.settrace(None)
+    try:
+        for argument in arguments:
+            try:
+                signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-6, 4e-4)))
+                play(argument)
+            except KeyboardInterrupt:
+                interrupted += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        sys.settrace(trace)
+    assert interrupted == len(arguments)
+
+
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
 @WAYS
 @pytest.mark.parametrize("cls", [CartPoleEnv, Left])
@@ -221,25 +248,13 @@ def test_interrupts_leave_it_whole(hooks, cls):
     calls = quiet_methods(env, env.save_state())
     steps = [lambda: env.reset(seed=1), *[lambda: env.step(1)] * 5]
 
-    def ring(*_):
-        raise KeyboardInterrupt
+    def play(name):
+        for call in [calls[name], *steps] * MANY:
+            with contextlib.suppress(SimulationError):
+                call()
 
-    before = signal.signal(signal.SIGALRM, ring)
-    rng, interrupted = np.random.default_rng(0), 0
-    try:
-        for _ in range(300):
-            played = [calls[str(rng.choice(list(calls)))], *steps]
-            try:
-                signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-6, 4e-4)))
-                for call in played * MANY:
-                    with contextlib.suppress(SimulationError):
-                        call()
-            except KeyboardInterrupt:
-                interrupted += 1
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert interrupted == 300
+    names = np.random.default_rng(0).choice(list(calls), 300).tolist()
+    interrupt(play, names)
     require_whole(env)
 
 

@@ -7,7 +7,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from test_threads import MANY, run_together
+from test_threads import MANY, interrupt, run_together
 
 from fmugym import SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
@@ -123,21 +123,9 @@ def test_interrupts_leave_it_whole(hooks):
         lambda: envs.set_attr("force_mag", [9.0, 10.0, 11.0]),
     ]
 
-    def ring(*_):
-        raise KeyboardInterrupt
+    def play(call):
+        for _ in range(MANY):
+            call()
 
-    before = signal.signal(signal.SIGALRM, ring)
-    rng, interrupted = np.random.default_rng(0), 0
-    try:
-        for number in range(300):
-            try:
-                signal.setitimer(signal.ITIMER_REAL, float(rng.uniform(1e-6, 4e-4)))
-                for _ in range(MANY):
-                    calls[number % len(calls)]()
-            except KeyboardInterrupt:
-                interrupted += 1
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-    assert interrupted == 300
+    interrupt(play, calls * 100)
     require_whole(envs)
