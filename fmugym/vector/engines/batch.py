@@ -66,7 +66,7 @@ class BatchEngine(Engine):
 
     The pool does a step in one call, programs included. Python calls the hooks that have no program
     before or after it, once for all environments. The pool also starts episodes by itself, unless
-    there is something to do that only Python can: see ``_pool_starts``.
+    there is something to do that only Python can: see ``_settle_starts``.
 
     Args:
         env: The prototype, made with a pool of N instances.
@@ -85,7 +85,7 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._idle: MaskArray | None = None
-        self._foreign = np.zeros(num_envs, np.bool_)
+        self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
@@ -134,16 +134,16 @@ class BatchEngine(Engine):
         has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
         is_free = env.inside.warm_ups is None and not self._pool.is_attended
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
-        self._starts_at_ends = self._may_start and not self._left_after
+        self._settle_starts()
 
-    @property
-    def _pool_starts(self) -> bool:
-        """Whether the pool itself starts episodes, in its step or in a reset.
+    def _settle_starts(self) -> None:
+        """Decide whether the pool itself starts episodes, in its step or in a reset.
 
         Python does so where others step the FMUs, where it has to draw values or to set episode
         variables, where something goes with resets, and where constants are not those of the plan.
         """
-        return self._may_start and not self._any_foreign
+        self._pool_starts = self._may_start and not self._any_foreign
+        self._starts_at_ends = self._pool_starts and not self._left_after
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -277,6 +277,7 @@ class BatchEngine(Engine):
         """Note which environments have another plan's constants: from options, or an older plan."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
+        self._settle_starts()
         if self._parameters.keys() != self._known:
             self._known = set(self._parameters)
             self._compile_again()
@@ -533,14 +534,15 @@ class BatchEngine(Engine):
         """See ``Engine.step``."""
         if resting is not None:
             return self._step_around(actions, resting)
-        if self._left or (resetting is not None and not self._pool_starts):
+        in_python = resetting is not None and not self._pool_starts
+        if self._left or in_python:
             actions = self._checked_before(actions, resetting)
-        at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
+        at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
         self.has_moved = True  # unless the call refuses its arguments
         played: Played
         try:
-            if step is None or (resetting is not None and not self._pool_starts):
+            if step is None or in_python:
                 played = self._step_pool(actions, resetting)
             else:
                 played = step(actions, at_ends)
