@@ -379,29 +379,17 @@ class BatchEngine(Engine):
     ) -> None:
         """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
         env, pool = self.env, self._pool
+
+        def start(where: IndexArray) -> Readings:
+            mask = np.zeros(self._n, np.bool_)
+            mask[where] = True
+            self._reset_pool(mask, where, plan, values)
+            return some(Readings.of(env), where)
+
         rows = {name: self._row(name) for name in env.variables}
         self._forget(indices, plan)
-        left = indices.tolist()
-        while left:
-            found = warm_ups.find(pool, plan.model_variables, values, rows, left)
-            first = warm_ups.distinct(index for index in left if index not in found)
-            self._warm_up(warm_ups, np.array(first, np.intp), plan, values)
-            for variables, where in warm_ups.restore(pool, found):
-                self._place(variables, [v[..., None] for v in variables.values()], where)
-            left = [index for index in left if index not in found and index not in first]
+        warm_ups.begin(pool, plan.model_variables, values, rows, indices, start, self._place)
         env.previous_state[:, indices] = env.state[:, indices]
-
-    def _warm_up(
-        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
-    ) -> None:
-        """Reset FMUs and do their warm-ups."""
-        if not len(indices):
-            return
-        mask = np.zeros(self._n, np.bool_)
-        mask[indices] = True
-        self._reset_pool(mask, indices, plan, values)
-        written = warm_ups.run(self._pool, some(Readings.of(self.env), indices), indices)
-        self._place(written, written.values(), indices)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
@@ -430,15 +418,14 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env.inside.plan
-        self._place(plan.variable_starts, plan.variable_starts.values(), indices)
+        self._place(plan.variable_starts, indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
             rows = {n: results.environments_last(v) for n, v in plan.named(drawn).items()}
-            self._place(rows, rows.values(), indices)
+            self._place(rows, indices)
         if not default or self._any_foreign:
-            constants = plan.constant_parameters
-            self._place(constants, constants.values(), indices)
+            self._place(plan.constant_parameters, indices)
             self._note_foreign(indices, not default)
         if self._given:
             self._place_given(indices, plan)
@@ -449,10 +436,10 @@ class BatchEngine(Engine):
     def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
         constant = plan.constant_parameters.keys() - plan.told.keys()
         given = {name: self._given[name][indices] for name in self._given if name in constant}
-        self._place(given, given.values(), indices)
+        self._place(given, indices)
 
-    def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
-        for name, value in zip(names, values, strict=True):
+    def _place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
+        for name, value in values.items():
             self._row(name)[..., indices] = value
 
     def _row(self, name: str) -> FloatArray:
