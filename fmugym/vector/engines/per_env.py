@@ -224,11 +224,8 @@ class PerEnvEngine(Engine):
         try:
             for index in running:
                 env = self._envs[index]
-                read = env.inside.readings
-                before = read.action, read.previous_action, read.previous_state, read.inputs
-                befores.append((env, before))
                 env.inside.in_hooks = True
-                take_action(env, actions[index])
+                befores.append((env, take_action(env, actions[index])))
         except BaseException as error:
             for env, before in befores:
                 env.inside.readings.take_back(before)
