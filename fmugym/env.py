@@ -23,6 +23,7 @@ from fmugym.errors import (
 )
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
+from fmugym.pool.bundle import IndexArray
 from fmugym.pool.patience import failed_reset
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
@@ -32,6 +33,7 @@ from fmugym.task.episode import Episode, EpisodePlan
 from fmugym.task.interface import readable_named
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
+from fmugym.task.readings import Readings
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.starting import start_time_of
@@ -205,6 +207,7 @@ class FMUEnv(Constructed):
                 self._begin_episode(episode)
             else:
                 self._begin_with_warm_up(self.inside.warm_ups, pool, plan, episode)
+            self.inside.was_reset, self.inside.ended = True, False
             observation, info = first_observation(self)
             if not self.inside.has_chosen:
                 self._choose_player(pool)
@@ -227,22 +230,23 @@ class FMUEnv(Constructed):
         self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
     ) -> None:
         """Begin an episode with a warm-up, or in the state that an earlier one has led to."""
-        starts = episode.start_values
-        rows = {name: np.asarray(v)[..., None] for name, v in episode.variables.items()}
-        found = warm_ups.find(pool, plan.model_variables, starts, rows, [0])
-        if not found:
-            self._reset_pool(pool, plan, episode)
         self._begin_episode(episode)
-        if found:
-            ((variables, _),) = warm_ups.restore(pool, found)
-        else:
-            written = warm_ups.run(pool, rows_of_one(self), np.zeros(1, np.int64))
-            variables = {name: row[..., 0] for name, row in written.items()}
         read = self.inside.readings
-        read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in variables.items()})
+
+        def start(_: IndexArray) -> Readings:
+            self._reset_pool(pool, plan, episode)
+            self._read_outputs()
+            return rows_of_one(self)
+
+        def place(written: Mapping[str, Any], _: IndexArray) -> None:
+            values = {name: row[..., 0] for name, row in written.items()}
+            read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in values.items()})
+
+        rows, starts = rows_of_one(self).variables, episode.start_values
+        first = np.zeros(1, np.int64)
+        warm_ups.begin(pool, plan.model_variables, starts, rows, first, start, place)
         read.inputs = tuple(self.inside.input_row.tolist())
-        read.values = tuple(self.inside.output_row.tolist())
-        read.state = read.previous_state = read.values[: self.inside.output_count]
+        self._read_outputs()
 
     def _obstacle(self, pool: Pool) -> str | None:
         """What keeps the pool from calling hooks, whatever they compute."""
@@ -277,10 +281,14 @@ class FMUEnv(Constructed):
         given = episode.parameters.get
         read.inputs = tuple([given(name, start) for name, start in self.inside.start_inputs])
         read.done = read.after_end = False
+        self._read_outputs()
+        self.inside.pictured = None, 0.0
+
+    def _read_outputs(self) -> None:
+        """Let hooks read the outputs of an episode that has not stepped yet."""
+        read = self.inside.readings
         read.values = tuple(self.inside.output_row.tolist())
         read.state = read.previous_state = read.values[: self.inside.output_count]
-        self.inside.pictured = None, 0.0
-        self.inside.was_reset, self.inside.ended = True, False
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.

@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 from vector_tools import require_same_alone
+from zoo_tools import parameters, zoo_fmu
 
 import fmugym
 from fmugym import FMUVectorEnv
@@ -203,6 +204,25 @@ def test_a_saved_state_goes_on():
     env.restore_state(state)
     assert [env.step([0.5])[1] for _ in range(4)] == first
     env.close()
+
+
+def test_after_one_that_fails_there_is_no_episode(tmp_path):
+    task = {
+        "fmu": str(zoo_fmu(tmp_path, 2)),
+        "time_step": "500ms",
+        "variables": {"u": {"min": -1, "max": 1}, "y": {"min": -9, "max": 9}},
+        "parameters": parameters("status", "step", 2, status=3),
+        "agent": {"actions": ["u"], "observations": ["y"]},
+        "reward": "y",
+        "warm_up": {"period": "2s", "controller": 0.5},
+    }
+    env, envs = fmugym.load(task), FMUVectorEnv(partial(fmugym.load, task), 2)
+    for one, text in ((env, "the warm-up failed"), (envs, "environment 0: the warm-up failed")):
+        with pytest.raises(SimulationError, match=text):
+            one.reset(seed=0)
+        with pytest.raises(SimulationError, match="before the first reset"):
+            one.step(one.action_space.sample())
+        one.close()
 
 
 class TestCache:

@@ -55,12 +55,15 @@ def elements_of(space: spaces.Space[Any]) -> Collection[int] | None:
     return frozenset(elements) if len(elements) <= _MANY else elements  # a set is faster
 
 
-def take_action(env: Any, action: Any) -> None:
+def take_action(env: Any, action: Any) -> tuple[Any, Any, Any, Any]:
     """Let hooks make inputs of an action, and write them for the next step of the FMU.
 
     Args:
         env: A single environment.
         action: The action.
+
+    Returns:
+        What hooks have read before, for ``Readings.take_back``.
 
     Raises:
         ConfigError: If it cannot be used. Then nothing has happened.
@@ -80,6 +83,7 @@ def take_action(env: Any, action: Any) -> None:
             raise blaming from error
         raise
     inside.input_writer.write(read.inputs, inside.input_row)
+    return before
 
 
 def _require_usable(env: Any, action: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from threading import Lock
 from types import MappingProxyType
@@ -120,9 +120,47 @@ class WarmUps:
         self._keys: dict[int, bytes] = {}
         self._has_told = False
 
+    def begin(
+        self,
+        pool: Pool,
+        variables: Sequence[Variable],
+        values: FloatArray,
+        rows: Mapping[str, Any],
+        indices: IndexArray,
+        start: Callable[[IndexArray], Readings],
+        place: Callable[[Mapping[str, Any], IndexArray], None],
+    ) -> None:
+        """Bring new episodes to where their warm-ups lead; known states take the place of steps.
+
+        Args:
+            pool: The pool that the episodes begin in; ``pool.inputs`` then has the last inputs.
+            variables: The start variables of the episodes.
+            values: Their values, shape (P, N).
+            rows: The episode variables by name, environments on the last axis.
+            indices: The environments, shape (M,).
+            start: Resets the FMUs of some environments, and returns what their hooks read,
+                environments on the last axis.
+            place: Writes episode variables, by name and with environments on the last axis, of some
+                environments.
+
+        Raises:
+            SimulationError: If an FMU fails or refuses a state.
+            ConfigError: If an input does not fit its type.
+        """
+        left = indices.tolist()
+        while left:
+            found = self._find(pool, variables, values, rows, left)
+            first = self._distinct(index for index in left if index not in found)
+            if first:
+                where = np.array(first)
+                place(self._run(pool, start(where), where), where)
+            for written, where in self._restore(pool, found):
+                place(written, where)
+            left = [index for index in left if index not in found and index not in first]
+
     # States that are known
 
-    def find(
+    def _find(
         self,
         pool: Pool,
         variables: Sequence[Variable],
@@ -130,15 +168,7 @@ class WarmUps:
         rows: Mapping[str, Any],
         indices: Iterable[int],
     ) -> Found:
-        """Look for states that warm-ups of new episodes lead to.
-
-        Args:
-            pool: The pool that the episodes are going to begin in.
-            variables: The start variables of the episodes.
-            values: Their values, shape (P, N).
-            rows: The episode variables by name, environments on the last axis.
-            indices: The environments.
-        """
+        """Look for states that warm-ups of new episodes lead to."""
         self._keys = {}
         if not self._warm_up.caches or not self._can_keep(pool):
             return {}
@@ -155,7 +185,7 @@ class WarmUps:
                 found[index] = warmed
         return found
 
-    def distinct(self, indices: Iterable[int]) -> list[int]:
+    def _distinct(self, indices: Iterable[int]) -> list[int]:
         """Of environments without a known state, those whose warm-ups lead to different ones."""
         by_key = {self._keys.get(index, index): index for index in reversed(list(indices))}
         return sorted(by_key.values())
@@ -179,14 +209,11 @@ class WarmUps:
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
-    def restore(self, pool: Pool, found: Found) -> list[tuple[dict[str, Any], IndexArray]]:
+    def _restore(self, pool: Pool, found: Found) -> list[tuple[dict[str, Any], IndexArray]]:
         """Bring FMUs to states that were found.
 
         Returns:
             The episode variables that warm-ups have written, each time with the environments.
-
-        Raises:
-            SimulationError: If an FMU refuses.
         """
         groups: dict[bytes, list[int]] = {}
         for index, warmed in found.items():
@@ -203,7 +230,7 @@ class WarmUps:
             raise failed_reset(self._located(pool, index))
         pool.inputs[:, indices] = inputs[:, None]
         shapes = self._shapes.items()
-        return {name: p.reshape(shape) for (name, shape), p in zip(shapes, parts, strict=True)}
+        return {name: p.reshape(*n, 1) for (name, n), p in zip(shapes, parts, strict=True)}
 
     @property
     def _sizes(self) -> list[int]:
@@ -216,21 +243,8 @@ class WarmUps:
 
     # Warm-ups
 
-    def run(self, pool: Pool, readings: Readings, indices: IndexArray) -> Mapping[str, Any]:
-        """Do the warm-up of episodes that have just begun.
-
-        Args:
-            pool: The pool; ``pool.inputs`` then has the last inputs.
-            readings: What hooks of these episodes read, environments on the last axis.
-            indices: The environments, shape (M,).
-
-        Returns:
-            The episode variables that it has written, environments on the last axis.
-
-        Raises:
-            SimulationError: If an FMU fails.
-            ConfigError: If an input does not fit its type.
-        """
+    def _run(self, pool: Pool, readings: Readings, indices: IndexArray) -> Mapping[str, Any]:
+        """Do the warm-up of episodes that have just begun; return what variables it has written."""
         skip = np.ones(pool.num_instances, np.bool_)
         skip[indices] = False
         variables = self._play(pool, readings, indices, skip)

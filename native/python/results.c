@@ -205,14 +205,13 @@ bool results_copy_mask(const Results *r, PyObject *mask, const ResultArrays *a) 
 
 /* A dict that calls the function when it is read, which is rare. */
 static PyObject *told_late(const Results *r, const ResultArrays *a) {
+    PyObject *late = PyObject_CallNoArgs(r->late);
     PyObject *call = PyTuple_Pack(3, r->tell, a->arrays[DRAWN_ARRAY], a->arrays[MASK_ARRAY]);
-    PyObject *pending = PyDict_New(), *late = NULL;
 
-    if (pending != NULL && set_item(pending, r->unfilled, Py_XNewRef(call))) {
-        late = PyObject_CallFunctionObjArgs(r->late, pending, NULL);
+    if (late != NULL && !set_item(late, r->unfilled, Py_XNewRef(call))) {
+        Py_CLEAR(late);
     }
     Py_XDECREF(call);
-    Py_XDECREF(pending);
     return late;
 }
 

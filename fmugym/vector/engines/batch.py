@@ -66,7 +66,7 @@ class BatchEngine(Engine):
 
     The pool does a step in one call, programs included. Python calls the hooks that have no program
     before or after it, once for all environments. The pool also starts episodes by itself, unless
-    there is something to do that only Python can: see ``_pool_starts``.
+    there is something to do that only Python can: see ``_settle_starts``.
 
     Args:
         env: The prototype, made with a pool of N instances.
@@ -85,7 +85,7 @@ class BatchEngine(Engine):
         self._streams = EpisodeStreams(num_envs)
         self._limit = min(env.inside.step_limit, max_episode_steps or sys.maxsize)
         self._idle: MaskArray | None = None
-        self._foreign = np.zeros(num_envs, np.bool_)
+        self._foreign, self._any_foreign = np.zeros(num_envs, np.bool_), False
         env.inside.readings = batched(env, num_envs, self._pool.outputs, self._pool.inputs)
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
@@ -134,16 +134,16 @@ class BatchEngine(Engine):
         has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
         is_free = env.inside.warm_ups is None and not self._pool.is_attended
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
-        self._starts_at_ends = self._may_start and not self._left_after
+        self._settle_starts()
 
-    @property
-    def _pool_starts(self) -> bool:
-        """Whether the pool itself starts episodes, in its step or in a reset.
+    def _settle_starts(self) -> None:
+        """Decide whether the pool itself starts episodes, in its step or in a reset.
 
         Python does so where others step the FMUs, where it has to draw values or to set episode
         variables, where something goes with resets, and where constants are not those of the plan.
         """
-        return self._may_start and not self._any_foreign
+        self._pool_starts = self._may_start and not self._any_foreign
+        self._starts_at_ends = self._pool_starts and not self._left_after
 
     def set_parameter(self, name: str, values: npt.NDArray[Any]) -> None:
         """See ``Engine.set_parameter``."""
@@ -277,6 +277,7 @@ class BatchEngine(Engine):
         """Note which environments have another plan's constants: from options, or an older plan."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
+        self._settle_starts()
         if self._parameters.keys() != self._known:
             self._known = set(self._parameters)
             self._compile_again()
@@ -378,29 +379,17 @@ class BatchEngine(Engine):
     ) -> None:
         """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
         env, pool = self.env, self._pool
+
+        def start(where: IndexArray) -> Readings:
+            mask = np.zeros(self._n, np.bool_)
+            mask[where] = True
+            self._reset_pool(mask, where, plan, values)
+            return some(Readings.of(env), where)
+
         rows = {name: self._row(name) for name in env.variables}
         self._forget(indices, plan)
-        left = indices.tolist()
-        while left:
-            found = warm_ups.find(pool, plan.model_variables, values, rows, left)
-            first = warm_ups.distinct(index for index in left if index not in found)
-            self._warm_up(warm_ups, np.array(first, np.intp), plan, values)
-            for variables, where in warm_ups.restore(pool, found):
-                self._place(variables, [v[..., None] for v in variables.values()], where)
-            left = [index for index in left if index not in found and index not in first]
+        warm_ups.begin(pool, plan.model_variables, values, rows, indices, start, self._place)
         env.previous_state[:, indices] = env.state[:, indices]
-
-    def _warm_up(
-        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
-    ) -> None:
-        """Reset FMUs and do their warm-ups."""
-        if not len(indices):
-            return
-        mask = np.zeros(self._n, np.bool_)
-        mask[indices] = True
-        self._reset_pool(mask, indices, plan, values)
-        written = warm_ups.run(self._pool, some(Readings.of(self.env), indices), indices)
-        self._place(written, written.values(), indices)
 
     def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
@@ -429,15 +418,14 @@ class BatchEngine(Engine):
             The parameters in the order of the plan, shape (P, N).
         """
         default = plan is self.env.inside.plan
-        self._place(plan.variable_starts, plan.variable_starts.values(), indices)
+        self._place(plan.variable_starts, indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
             rows = {n: results.environments_last(v) for n, v in plan.named(drawn).items()}
-            self._place(rows, rows.values(), indices)
+            self._place(rows, indices)
         if not default or self._any_foreign:
-            constants = plan.constant_parameters
-            self._place(constants, constants.values(), indices)
+            self._place(plan.constant_parameters, indices)
             self._note_foreign(indices, not default)
         if self._given:
             self._place_given(indices, plan)
@@ -448,10 +436,10 @@ class BatchEngine(Engine):
     def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
         constant = plan.constant_parameters.keys() - plan.told.keys()
         given = {name: self._given[name][indices] for name in self._given if name in constant}
-        self._place(given, given.values(), indices)
+        self._place(given, indices)
 
-    def _place(self, names: Iterable[str], values: Iterable[Any], indices: IndexArray) -> None:
-        for name, value in zip(names, values, strict=True):
+    def _place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
+        for name, value in values.items():
             self._row(name)[..., indices] = value
 
     def _row(self, name: str) -> FloatArray:
@@ -533,14 +521,15 @@ class BatchEngine(Engine):
         """See ``Engine.step``."""
         if resting is not None:
             return self._step_around(actions, resting)
-        if self._left or (resetting is not None and not self._pool_starts):
+        in_python = resetting is not None and not self._pool_starts
+        if self._left or in_python:
             actions = self._checked_before(actions, resetting)
-        at_ends = self.starts_at_ends and self._starts_at_ends and not self._any_foreign
+        at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
         self.has_moved = True  # unless the call refuses its arguments
         played: Played
         try:
-            if step is None or (resetting is not None and not self._pool_starts):
+            if step is None or in_python:
                 played = self._step_pool(actions, resetting)
             else:
                 played = step(actions, at_ends)
