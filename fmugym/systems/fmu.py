@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import weakref
 from collections.abc import Iterable, Iterator
@@ -11,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fmugym.archive.bundled import is_bundled
-from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
 from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
@@ -88,9 +89,14 @@ class SystemFMU(FMU):
         self._folder: Path | None = None
         self._remove_folder = None
 
-    def again(self) -> SystemFMU:
-        """Open the same system once more."""
-        return SystemFMU(self.plan, probe_timeout=self.probe_timeout)
+    @property
+    def content(self) -> str:
+        """See ``FMU.content``."""
+        components = self.plan.components
+        named = tuple(replace(part, path=Path(part.path.name)) for part in components)
+        texts = [repr(replace(self.plan, components=named, file=None))]
+        texts += [file_digest(part.path) for part in components]
+        return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
     @property
     def bundled(self) -> bool:

@@ -33,11 +33,15 @@ _LINE_BUFFERED: Final = 1
 class Output:
     """The parent's ends of the pipes of one worker.
 
+    Args:
+        quiet: Whether what comes is only kept, and not passed on to the streams of this process.
+
     Attributes:
         writing_ends: For the worker: standard output and standard error.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
         self._streams: dict[int, int] = {}  # the descriptor of this process by the reading end
         self._lines: deque[bytes] = deque(maxlen=_LINES)
         self._unfinished = dict.fromkeys(_STREAMS, b"")
@@ -100,7 +104,8 @@ class Output:
             del self._streams[reading]
             return
         self._note(stream, data)
-        _write(stream, data)
+        if not self._quiet:
+            _write(stream, data)
 
     def _note(self, stream: int, data: bytes) -> None:
         *lines, rest = (self._unfinished[stream] + data).split(b"\n")
