@@ -1,7 +1,10 @@
 """Whether instances of an FMU disturb each other.
 
 The standard says that they do not. Even so, some FMUs keep part of their state in global variables
-of their library, or call functions that are not thread-safe.
+of their library, or call functions that are not thread-safe. Threads that step instances of such a
+library spoil each other's results so rarely that a comparison need not show it. So the data
+themselves are looked at while a lone instance steps, where Linux tells them. What only the loading
+or an initialization writes does not count; what is on the heap is for a comparison in threads.
 """
 
 from __future__ import annotations
@@ -11,16 +14,18 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from pathlib import Path
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from fmugym.pool.base import FloatArray
+from fmugym.archive.loadable import LoadableFMU
+from fmugym.pool.base import FloatArray, Pool
+from fmugym.pool.process.library_data import library_data
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.episodes import Starts, start, steps
-from fmugym.trial.inputs import inputs_of_two
+from fmugym.trial.inputs import inputs_of_two, moving_inputs
 from fmugym.trial.rehearsal import Rehearsal
-from fmugym.trial.shared_data import Steps, watch_steps
 from fmugym.trial.subject import Subject, TriedPool
 from fmugym.trial.verdict import FRUGAL, Neighbours, Verdict
 
@@ -42,6 +47,12 @@ _FEW_ROUNDS: Final = 2
 """
 
 
+_MOST_STEPS: Final = 1000
+_IDLE_CALLS: Final = 20
+_STEP_SECONDS: Final = 0.1
+"""The real time in seconds after which the search for data that steps share ends."""
+
+
 def need_of_several(rehearsal: Rehearsal, alone: Verdict) -> Neighbours:
     """Find the cheapest way to keep instances from disturbing each other.
 
@@ -58,19 +69,19 @@ def need_of_several(rehearsal: Rehearsal, alone: Verdict) -> Neighbours:
         return need
     subject, starts = rehearsal.subject, rehearsal.starts
     spec = _without(rehearsal.spec, alone.noisy)
-    unknown = Steps(Neighbours.INDEPENDENT, math.inf)
-    watch = partial(watch_steps, subject, spec, starts)
-    steps = subject.attempt(watch, refused=unknown, died=unknown, alone=True)
+    unknown = _Steps(Neighbours.INDEPENDENT, math.inf)
+    watch = partial(_watch_steps, subject, spec, starts)
+    seen = subject.attempt(watch, refused=unknown, died=unknown, alone=True)
     frugal = FRUGAL in alone.reasons
     in_threads = partial(
-        disturb_in_threads, subject, spec, starts, step_seconds=steps.seconds, frugal=frugal
+        disturb_in_threads, subject, spec, starts, step_seconds=seen.seconds, frugal=frugal
     )
-    if steps.need is Neighbours.INDEPENDENT:
+    if seen.need is Neighbours.INDEPENDENT:
         if not in_threads():
             return Neighbours.INDEPENDENT
         by_steps = in_threads(one_initialization=True)
         return Neighbours.ONE_THREAD if by_steps else Neighbours.ONE_INITIALIZATION
-    apart = steps.need is Neighbours.LIBRARIES and not (
+    apart = seen.need is Neighbours.LIBRARIES and not (
         rehearsal.is_disturbed(method, components, private_libraries=True)
         or in_threads(private_libraries=True)
     )
@@ -108,6 +119,77 @@ def need_in_turn(
         return Neighbours.INDEPENDENT
     copies = rehearsal.subject.can_copy_libraries and not disturbed(private_libraries=True)
     return Neighbours.LIBRARIES if copies else Neighbours.PROCESSES
+
+
+# Data that steps share
+
+
+class _Steps(NamedTuple):
+    """What the steps of a lone instance have shown.
+
+    Attributes:
+        need: What several instances need for the sake of the data of their library:
+            ``INDEPENDENT``, ``LIBRARIES``, or ``ONE_THREAD`` if copies would share the data, too.
+        seconds: The real time of the fastest step.
+    """
+
+    need: Neighbours
+    seconds: float
+
+
+def _watch_steps(subject: Subject, spec: PoolSpec, starts: Starts) -> _Steps:
+    """Step a lone instance for a while.
+
+    Args:
+        subject: The FMU.
+        spec: What to do at a reset and in a step.
+        starts: The start values of the instance; the first of each two.
+
+    Raises:
+        DeathError: If the process does not survive that.
+        FMULoadError: If the FMU cannot be loaded or instantiated.
+        LicenceError: If it gets no licence.
+    """
+    spec = spec.beginning_by(ResetMethod.RESET)
+    with subject.pool("the search for data that steps share", spec) as pool:
+        start(pool, starts, 0)
+        process = pool.processes()[0]
+        before = library_data(pool.fmu, process)
+        seconds = _step(pool, spec)
+        after = library_data(pool.fmu, process)
+        written = {place.library for place, sum_ in after.items() if sum_ != before.get(place)}
+        return _Steps(_need(written, pool.fmu), seconds)
+
+
+def _step(pool: Pool, spec: PoolSpec) -> float:
+    """Step until something fails or it takes too long; returns the time of the fastest step.
+
+    That is the time in the FMU, without that of a call which steps nothing.
+    """
+    nobody, fastest, idle = np.ones(1, np.bool_), _STEP_SECONDS, _STEP_SECONDS
+    for _ in range(_IDLE_CALLS):
+        begin = time.perf_counter()
+        pool.step(None, nobody)
+        now = time.perf_counter()
+        idle = min(idle, now - begin)
+    deadline = now + _STEP_SECONDS
+    for _ in steps(pool, moving_inputs(spec, _MOST_STEPS, 1.0)[:, :, None]):
+        begin, now = now, time.perf_counter()
+        fastest = min(fastest, now - begin)
+        if now > deadline:
+            break
+    return max(0.0, fastest - idle)
+
+
+def _need(written: set[Path], fmu: LoadableFMU) -> Neighbours:
+    """A copy has data of its own, but the loader gives all copies the same dependencies."""
+    if not written:
+        return Neighbours.INDEPENDENT
+    own = {part.extract().resolve() / part.library for part in fmu.parts or (fmu,)}
+    return Neighbours.LIBRARIES if written <= own else Neighbours.ONE_THREAD
+
+
+# Threads
 
 
 def disturb_in_threads(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -271,30 +271,31 @@ class Rehearsal:
             components: As for ``grade``.
             private_libraries: Whether each instance has a copy of the library.
         """
-        what = "copy of the library" if private_libraries else "instance"
-        opening = partial(
-            self._open,
-            f"the comparison with a second {what}",
-            method,
-            components,
-            private_libraries=private_libraries,
-        )
+        play = partial(self._play_beside, method, components, private_libraries)
 
         def compare() -> bool:
-            beside = self._runs(partial(opening, num_instances=2))
+            beside = play(2)
             if beside and all(map(self._is_as_fresh, beside)):
                 return False
-            alone = self._runs(opening)  # it may begin its later episodes in other ways
+            alone = play(1)  # it may begin its later episodes in other ways than a fresh one
             return len(alone) != len(beside) or any(map(self._differ, alone, beside))
 
         return self.subject.attempt(compare, refused=False, died=True)
 
-    def _runs(self, opening: Callable[[], AbstractContextManager[TriedPool]]) -> list[_Run]:
+    def _play_beside(
+        self,
+        method: ResetMethod,
+        components: tuple[ResetMethod, ...],
+        private_libraries: bool,
+        num_instances: int,
+    ) -> list[_Run]:
         """Play three episodes; none if the process dies, or the FMU refuses."""
-        lengths = (min(_MIDDLE, self._steps), _SHORT, _SHORT)
+        what = "copy of the library" if private_libraries else "instance"
+        stage = f"the comparison with a second {what}"
 
         def play() -> list[_Run]:
-            with opening() as pool:
+            with self._open(stage, method, components, num_instances, private_libraries) as pool:
+                lengths = (min(_MIDDLE, self._steps), _SHORT, _SHORT)
                 return [self._play(pool, 0, length) for length in lengths]
 
         return self.subject.attempt(play, refused=[], died=[])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -67,41 +68,6 @@ class DeathError(Exception):
         self.shows_memory_error = any(map(_MEMORY_ERROR.match, lines))
 
 
-class _Limits:
-    """How long calls may take: at first long, then as it follows from the calls before.
-
-    Args:
-        timeout: Seconds for a step that nothing is known of; ten times as long for a call that
-            makes or initializes instances.
-    """
-
-    def __init__(self, timeout: float) -> None:
-        self._timeout = timeout
-        self._longest: dict[str, float] = {}
-
-    def seconds(self, call: str) -> float:
-        """How long a call may take."""
-        most, longest = self._timeout * _factor(call), self._longest.get(_kind(call))
-        return most if longest is None else min(most, max(_LEAST, _EVENT * longest))
-
-    def call_timeout(self, call: str) -> float:
-        """The same as a time-out of a ``ProcessPool``."""
-        return self.seconds(call) / _factor(call)
-
-    def explained(self, call: str) -> str:
-        """How long a call may take, and why."""
-        seconds = self.seconds(call)
-        why = "ten times probe_timeout" if _factor(call) > 1 else "probe_timeout"
-        if seconds < self._timeout * _factor(call):
-            why = f"those before took up to {self._longest[_kind(call)]:.2g} s"
-        return f"{seconds:g} s ({why})"
-
-    def note(self, call: str, begin: float) -> None:
-        """Note a call that has begun at that time of ``time.perf_counter``."""
-        kind, seconds = _kind(call), time.perf_counter() - begin
-        self._longest[kind] = max(self._longest.get(kind, 0.0), seconds)
-
-
 def _kind(call: str) -> str:
     return STEP if call == FIRST_STEP else call
 
@@ -131,7 +97,7 @@ class Subject:
         self.is_harmful = False
         self.reasons: list[str] = []
         self.instances, self.initializations = 1, 0
-        self._limits = _Limits(fmu.probe_timeout or DEFAULT_PROBE_TIMEOUT)
+        self._longest: dict[str, float] = {}  # the seconds of calls
 
     @property
     def can_copy_libraries(self) -> bool:
@@ -164,7 +130,7 @@ class Subject:
             finally:
                 begin = time.perf_counter()
                 pool.close()
-                self._limits.note(CLOSING, begin)
+                self.note_call(CLOSING, begin)
                 self.initializations += pool.initializations
             pool.require_alive(CLOSING)
 
@@ -172,13 +138,41 @@ class Subject:
         begin = time.perf_counter()
         with licence_errors():
             try:
-                pool = TriedPool(self._limits, stage, *arguments, **options)
+                pool = TriedPool(self, stage, *arguments, **options)
             except WorkerError as error:
                 if error.loss is None:
                     raise
-                raise _death(OPENING, stage, error.loss, self._limits) from None
-        self._limits.note(OPENING, begin)
+                raise self.death(OPENING, stage, error.loss) from None
+        self.note_call(OPENING, begin)
         return pool
+
+    # Limits of time: at first long, then as it follows from the calls before.
+
+    def limit(self, call: str) -> tuple[float, str]:
+        """How many seconds a call may take, and why."""
+        timeout, factor = self.fmu.probe_timeout or DEFAULT_PROBE_TIMEOUT, _factor(call)
+        longest = self._longest.get(_kind(call), math.inf)
+        learnt = max(_LEAST, _EVENT * longest)
+        if learnt < timeout * factor:
+            return learnt, f"those before took up to {longest:.2g} s"
+        return timeout * factor, "probe_timeout" if factor == 1 else "ten times probe_timeout"
+
+    def call_timeout(self, call: str) -> float:
+        """The same as a time-out of a ``ProcessPool``."""
+        return self.limit(call)[0] / _factor(call)
+
+    def note_call(self, call: str, begin: float) -> None:
+        """Note a call that has begun at that time of ``time.perf_counter``."""
+        kind, seconds = _kind(call), time.perf_counter() - begin
+        self._longest[kind] = max(self._longest.get(kind, 0.0), seconds)
+
+    def death(self, call: str, stage: str, loss: Loss) -> DeathError:
+        """Say how a process has ended."""
+        how = loss.how.replace("ended with", "ended the process with", 1)
+        if loss.is_late:
+            seconds, why = self.limit(call)
+            how = f"did not come back within {seconds:g} s ({why})"
+        return DeathError(call, stage, how, loss.lines)
 
     def attempt(self, attempt: Callable[[], R], *, refused: R, died: R, alone: bool = False) -> R:
         """Try something.
@@ -227,9 +221,9 @@ class TriedPool(ProcessPool):
     """Instances on trial in one process.
 
     Args:
-        limits: How long calls may take.
+        subject: The FMU.
         stage: The part of the trial.
-        fmu: The FMU; closed with the pool.
+        fmu: Its files; closed with the pool.
         spec: What to do at each reset and step.
         num_instances: N.
         options: See ``ProcessPool``.
@@ -240,43 +234,34 @@ class TriedPool(ProcessPool):
 
     def __init__(
         self,
-        limits: _Limits,
+        subject: Subject,
         stage: str,
         fmu: FMU,
         spec: PoolSpec,
         num_instances: int,
-        threads: int = 1,
         **options: Any,
     ) -> None:
-        self.fmu, self._limits, self._stage = fmu, limits, stage
+        self.fmu, self._subject, self._stage = fmu, subject, stage
         self._next_step = FIRST_STEP
-        super().__init__(
-            fmu,
-            spec,
-            num_instances,
-            _SILENT,
-            workers=1,
-            threads=threads,
-            call_timeout=limits.call_timeout(OPENING),
-            closing_time=limits.seconds(CLOSING),
-            on_trial=True,
-            **options,
-        )
+        options = {"workers": 1, "threads": 1, "on_trial": True} | options
+        options["call_timeout"] = subject.call_timeout(OPENING)
+        options["closing_time"], _ = subject.limit(CLOSING)
+        super().__init__(fmu, spec, num_instances, _SILENT, **options)
 
     def require_alive(self, call: str) -> None:
         """Raise a ``DeathError`` if the process has not survived a call."""
         if self.losses:
-            raise _death(call, self._stage, self.losses[0], self._limits)
+            raise self._subject.death(call, self._stage, self.losses[0])
 
     def _ask(self, call: str, function: Callable[P, R], *args: P.args, **named: P.kwargs) -> R:
         """Limit the time of a call, and see whether the process survives it."""
-        self.limit_calls(self._limits.call_timeout(call))
+        self.limit_calls(self._subject.call_timeout(call))
         begin = time.perf_counter()
         try:
             return function(*args, **named)
         finally:
             self.require_alive(call)
-            self._limits.note(call, begin)
+            self._subject.note_call(call, begin)
 
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
@@ -303,10 +288,3 @@ class TriedPool(ProcessPool):
     ) -> StatusArray:
         """See ``Pool.restore_instances``."""
         return self._ask(STEP, super().restore_instances, bundle, sources, indices)
-
-
-def _death(call: str, stage: str, loss: Loss, limits: _Limits) -> DeathError:
-    how = loss.how.replace("ended with", "ended the process with", 1)
-    if loss.is_late:
-        how = f"did not come back within {limits.explained(call)}"
-    return DeathError(call, stage, how, loss.lines)

@@ -107,9 +107,9 @@ def compare(fmu: FMU, spec: PoolSpec, starts: Starts | None = None) -> Verdict:
     if known is not None:
         return known
     subject = Subject(fmu)
-    rehearsal = Rehearsal(subject, spec, starts or Starts())
 
     def need() -> Neighbours:
+        rehearsal = Rehearsal(subject, spec, starts or Starts())
         rehearsal.find_reference()
         return need_in_turn(rehearsal, ResetMethod.INSTANCE)
 
