@@ -17,7 +17,7 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray
 from fmugym.pool.health import Column
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Arrays, Memory
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.supervisor import (
     INSTANTIATION,
     Loss,
@@ -40,7 +40,6 @@ class Crew:
         fmu: The FMU; closed with the crew.
         setups: What each worker needs to know.
         memory: Shared with the workers; closed with the crew.
-        arrays: Those of all instances, in this memory.
         log: Gets the FMU's messages.
         call_timeout: How long a call may take, in seconds; infinite for ever.
         closing_time: How long workers may take to free their instances at the end, in seconds.
@@ -62,15 +61,14 @@ class Crew:
         fmu: FMU,
         setups: Sequence[Setup],
         memory: Memory,
-        arrays: Arrays,
         log: logging.Logger,
         call_timeout: float,
         closing_time: float,
     ) -> None:
         self.supervisors = [Supervisor(setup, memory, log) for setup in setups]
-        self.lost: MaskArray = np.zeros(len(arrays.statuses), np.bool_)
+        self.lost: MaskArray = np.zeros(len(memory.arrays.statuses), np.bool_)
         self.refusal = ""
-        self._arrays, self.call_timeout = arrays, call_timeout
+        self._arrays, self.call_timeout = memory.arrays, call_timeout
         self.note_lost()
         self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, closing_time)
         _crews.add(self)

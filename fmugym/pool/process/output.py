@@ -7,7 +7,6 @@ than a pipe holds waits for its parent.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
 import sys
@@ -17,7 +16,7 @@ from typing import Any, Final
 
 from fmugym.signals import Ignoring
 
-__all__ = ["Output", "print_line_by_line"]
+__all__ = ["Output"]
 
 _LINES: Final = 10
 _LINE_LENGTH: Final = 300
@@ -26,8 +25,6 @@ _LAST_CHUNKS: Final = 16
 """The most chunks that a pipe holds, on any system."""
 
 _STREAMS: Final = (1, 2)
-_LINE_BUFFERED: Final = 1
-"""``_IOLBF`` of glibc, musl and macOS."""
 
 
 class Output:
@@ -135,11 +132,3 @@ def _write(stream: int, data: bytes) -> None:
     with Ignoring(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
-
-
-def print_line_by_line() -> None:
-    """Flush C's output to a pipe after each line; a crash would lose what is buffered."""
-    library = ctypes.CDLL(None)
-    name = "__stdoutp" if sys.platform == "darwin" else "stdout"
-    stream = ctypes.c_void_p.in_dll(library, name)
-    library.setvbuf(stream, None, _LINE_BUFFERED, ctypes.c_size_t(0))

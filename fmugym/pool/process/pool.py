@@ -51,7 +51,7 @@ from fmugym.pool.process.requests import (
     request_write,
 )
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
 from fmugym.pool.saving import SavingPool
@@ -124,7 +124,7 @@ class ProcessPool(SavingPool):
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
             setup = Setup.of(fmu, spec, num_instances, log, private_libraries)
-            memory = _make_memory(size_for(spec, num_instances, self.workers))
+            memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
             raise
@@ -132,7 +132,7 @@ class ProcessPool(SavingPool):
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
-        arrays = make_arrays(memory, spec, num_instances)
+        arrays = memory.arrays
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
@@ -149,7 +149,7 @@ class ProcessPool(SavingPool):
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._crew = Crew(fmu, setups, memory, arrays, log, timeout, closing_time)
+        self._crew = Crew(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._crew)
 
     # The contract of Pool.
@@ -482,9 +482,9 @@ def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
             check_count(what, count)
 
 
-def _make_memory(size: int) -> Memory:
+def _make_memory(spec: PoolSpec, num_instances: int, workers: int) -> Memory:
     try:
-        return Memory(size)
+        return Memory(spec, num_instances, workers)
     except ordinary(OSError) as error:
         raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
 

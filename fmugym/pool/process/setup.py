@@ -18,7 +18,7 @@ from fmugym.pool.base import PoolSpec
 from fmugym.pool.form import Files, Writer, form_of_pool
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.process.launcher import Order
-from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
+from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving import keeps_records
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
@@ -185,7 +185,7 @@ class Setup:
         path = windows_path(Path("/proc", str(os.getpid()), "fd", str(memory.descriptor)))
         writer.text(os.fsencode(path if self.wine is not None else memory.tag))
         writer.integers(memory.size, self.num_instances, self.block.start)
-        *arrays, echo, bell = offsets_of(self.spec, self.num_instances, self.number)
+        *arrays, echo, bell = memory.offsets(self.number)
         writer.integers(*arrays, ECHO_SIZE, echo, bell)
 
 

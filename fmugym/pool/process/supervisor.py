@@ -28,7 +28,7 @@ from fmugym.pool.process.requests import (
     request_indices,
 )
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Memory, make_arrays, make_bell, make_echo
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.reports import loading_failed
 from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
@@ -144,9 +144,8 @@ class Supervisor:
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
-        place = setup.spec, setup.num_instances
-        self._echo = make_echo(memory, *place, setup.number)
-        self._progress = make_arrays(memory, *place).progress[setup.block]
+        self._echo = memory.echo(setup.number)
+        self._progress = memory.arrays.progress[setup.block]
         self._done = b""
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""
@@ -221,7 +220,7 @@ class Supervisor:
             raise
         output.release_writing_ends()
         self._output = output
-        bell = make_bell(self._memory, setup.spec, setup.num_instances, setup.number)
+        bell = self._memory.bell(setup.number)
         return process, Channel(end, process.sentinel, output, bell)
 
     def revive(self) -> None:
