@@ -35,11 +35,11 @@ _THREADS: Final = "the comparison of instances in two threads"
 _TURNS: Final = "the comparison of instances in two threads, initialized in turn"
 _COPIES: Final = "the comparison of copies of the library in two threads"
 
-_CALLS: Final = 10
-_CALL_SECONDS: Final = 2e-3
-_MOST_SUBSTEPS: Final = 1024
+_CALLS: Final = 4
+_CALL_SECONDS: Final = 8e-3
+_MOST_SUBSTEPS: Final = 2**15
 """How many calls an episode in threads makes, how long each takes if steps are quick, and the most
-steps that one makes then."""
+steps that one makes then. Threads meet although the machine has other work."""
 _THREAD_SECONDS: Final = 0.3
 """The real time in seconds after which a comparison in threads ends."""
 _FEW_ROUNDS: Final = 2
@@ -50,7 +50,9 @@ _FEW_ROUNDS: Final = 2
 _MOST_STEPS: Final = 1000
 _IDLE_CALLS: Final = 20
 _STEP_SECONDS: Final = 0.1
-"""The real time in seconds after which the search for data that steps share ends."""
+_WATCHED_SECONDS: Final = 1e-3
+"""The real time in seconds after which the search for data that steps share ends, and how long each
+of its calls takes if steps are quick: what comes and goes between processes is little of that."""
 
 
 def need_of_several(rehearsal: Rehearsal, alone: Verdict) -> Neighbours:
@@ -70,7 +72,8 @@ def need_of_several(rehearsal: Rehearsal, alone: Verdict) -> Neighbours:
     subject, starts = rehearsal.subject, rehearsal.starts
     spec = _without(rehearsal.spec, alone.noisy)
     unknown = _Steps(Neighbours.INDEPENDENT, math.inf)
-    watch = partial(_watch_steps, subject, spec, starts)
+    watched = _with_long_calls(spec, rehearsal.step_seconds, _WATCHED_SECONDS)
+    watch = partial(_watch_steps, subject, watched, starts, watched.substeps // spec.substeps)
     seen = subject.attempt(watch, refused=unknown, died=unknown, alone=True)
     frugal = FRUGAL in alone.reasons
     in_threads = partial(
@@ -137,13 +140,14 @@ class _Steps(NamedTuple):
     seconds: float
 
 
-def _watch_steps(subject: Subject, spec: PoolSpec, starts: Starts) -> _Steps:
+def _watch_steps(subject: Subject, spec: PoolSpec, starts: Starts, together: int) -> _Steps:
     """Step a lone instance for a while.
 
     Args:
         subject: The FMU.
         spec: What to do at a reset and in a step.
         starts: The start values of the instance; the first of each two.
+        together: How many steps a call makes.
 
     Raises:
         DeathError: If the process does not survive that.
@@ -155,14 +159,14 @@ def _watch_steps(subject: Subject, spec: PoolSpec, starts: Starts) -> _Steps:
         start(pool, starts, 0)
         process = pool.processes()[0]
         before = library_data(pool.fmu, process)
-        seconds = _step(pool, spec)
+        seconds = _step(pool, spec) / together
         after = library_data(pool.fmu, process)
         written = {place.library for place, sum_ in after.items() if sum_ != before.get(place)}
         return _Steps(_need(written, pool.fmu), seconds)
 
 
 def _step(pool: Pool, spec: PoolSpec) -> float:
-    """Step until something fails or it takes too long; returns the time of the fastest step.
+    """Step until something fails or it takes too long; returns the time of the fastest call.
 
     That is the time in the FMU, without that of a call which steps nothing.
     """
@@ -224,9 +228,10 @@ def disturb_in_threads(
         return False  # one thread steps all instances
     stage = _TURNS if one_initialization else _COPIES if private_libraries else _THREADS
     spec = replace(
-        _with_long_calls(spec, step_seconds),
+        _with_long_calls(spec, step_seconds, _CALL_SECONDS),
         reset_method=ResetMethod.INSTANCE,
         component_resets=(),
+        warm_up_steps=1,  # so that some instances are initialized while others step
         one_initialization=one_initialization,
     )
     open_pool = partial(subject.pool, stage, spec, 2, private_libraries=private_libraries)
@@ -253,20 +258,19 @@ def _rounds(frugal: bool) -> Iterator[None]:
         yield
 
 
-def _with_long_calls(spec: PoolSpec, step_seconds: float) -> PoolSpec:
+def _with_long_calls(spec: PoolSpec, step_seconds: float, call_seconds: float) -> PoolSpec:
     """Let each call take long enough for another thread, and its outputs tell of all its steps.
 
-    Powers of two leave the step size that the FMU sees alone. With a step in each reset, some
-    instances are initialized while others step.
+    Powers of two leave the step size that the FMU sees alone.
     """
-    wanted = _CALL_SECONDS / max(step_seconds, 1e-9)
+    wanted = call_seconds / max(step_seconds, 1e-9)
     factor = 2 ** int(math.log2(min(max(wanted, 1.0), _MOST_SUBSTEPS)))
     return replace(
         spec,
         time_step=spec.time_step * factor,
         substeps=spec.substeps * factor,
         samplings=tuple("last" if v.kind == "string" else "mean" for v in spec.outputs),
-        warm_up_steps=1,
+        warm_up_steps=0,
     )
 
 

@@ -41,6 +41,9 @@ _RESTORED: Final = 2
 _LONGEST: Final = 200
 """The most steps of a long episode."""
 
+_SURE: Final = 10
+"""The steps of which the fastest one tells how slow an FMU is; the first one may load its data."""
+
 _LONG_SECONDS: Final = 0.1
 """How long a long episode of a slow FMU takes in seconds, if all steps are as fast as the fastest
 one, which other work on the machine has not slowed down."""
@@ -102,6 +105,7 @@ class Rehearsal:
         spec: As given; but with a blind start if the FMU can only be played so.
         starts: As given; but equal ones are apart if the FMU can be played so.
         noisy: The names of the outputs that two fresh instances give differently, as far as known.
+        step_seconds: The real time of the fastest step of the reference; infinite before.
         is_frugal: Whether fewer episodes are played, because initializations are slow or need
             licences.
         fails_in_reading: Whether even a fresh instance cannot play an episode, because its outputs
@@ -113,6 +117,7 @@ class Rehearsal:
         self.noisy: tuple[str, ...] = ()
         self.fails_in_reading = False
         self.is_frugal = spec.licence_wait > 0.0
+        self.step_seconds = math.inf
         self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs), 2))
         self._references: list[_Run] = []
         self._tolerances, self._knows_noise = np.full(len(spec.outputs), _tolerance_of(spec)), False
@@ -224,10 +229,13 @@ class Rehearsal:
             rows.append(outputs[:, 0])
             before, now = now, time.perf_counter()
             fastest = min(fastest, now - before)
-            is_late = now > deadline and len(rows) > _MIDDLE
-            if measured and (is_late or len(rows) * fastest > _LONG_SECONDS):
+            is_late, is_slow = now > deadline, len(rows) * fastest > _LONG_SECONDS
+            least = _MIDDLE if not is_slow else 0 if is_late else _SURE
+            if measured and (is_late or is_slow) and len(rows) > least:
                 self._steps = len(rows) - 1
                 break
+        if measured:
+            self.step_seconds = fastest
         status = int(pool.statuses[0])
         if status <= WARNING_CODE:
             return _Run(np.array(rows), Status.OK)
