@@ -64,7 +64,7 @@ def _pool(stack: ExitStack) -> Run:
     fmu = fmugym.FMU(fmugym.bundled_fmu("CartPole"))
     outputs = tuple(map(fmu.variable, ("x", "x_dot", "phi", "phi_dot")))
     spec = PoolSpec((fmu.variable("f"),), outputs, 0.02, num_observed=4)
-    pool = make_pool(fmu, spec, SIZE, logging.getLogger(__name__), "native", threads=1)
+    pool = make_pool(fmu, spec, SIZE, logging.getLogger(__name__), backend="native", threads=1)
     stack.callback(pool.close)
     variables, mask = tuple(map(fmu.variable, START_VALUES)), np.ones(SIZE, np.bool_)
     values = itertools.cycle(np.random.default_rng(0).uniform(-0.05, 0.05, (16, 4, SIZE)))

@@ -14,11 +14,14 @@ from typing import Final
 
 from fmugym.signals import Ignoring
 
-__all__ = ["cache_folder", "is_own", "lasting_folder"]
+__all__ = ["cache_folder", "is_own", "lasting_folder", "read_file", "replace_file"]
 
 logger = logging.getLogger(__name__)
 
 _OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
+
+_READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+"""Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
 
 
 def cache_folder(*names: str) -> Path:
@@ -50,6 +53,41 @@ def lasting_folder(*names: str) -> Path:
     with Ignoring(OSError):
         return cache_folder(*names)
     return _private(Path(tempfile.gettempdir(), f"fmugym-{_user()}"), names)
+
+
+def read_file(path: Path, largest: int) -> bytes:
+    """Read a regular file: a pipe might never end, and a link may lead anywhere.
+
+    Args:
+        path: The file.
+        largest: The most bytes that it may have.
+
+    Raises:
+        OSError: If there is none, or it is another thing or too large.
+    """
+    handle = os.open(path, _READ)
+    with os.fdopen(handle, "rb") as file:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode) or status.st_size > largest:
+            raise OSError(f"{path} is no regular file of at most {largest} bytes")
+        return file.read(largest)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Replace a file atomically, because another process may be reading or writing it.
+
+    Raises:
+        OSError: If the system refuses.
+    """
+    handle, name = tempfile.mkstemp(dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.replace(name, path)
+    except BaseException:
+        with Ignoring(OSError):
+            os.unlink(name)
+        raise
 
 
 def is_own(path: Path) -> bool:

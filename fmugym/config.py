@@ -150,9 +150,9 @@ class Foreign(KnownArguments):
 
     probe_timeout: float | None = key(
         or_none(POSITIVE),
-        "Real seconds that a call of an unknown FMU may take in its "
-        "[trial](reliability.md#the-trial); an initialization may take ten times as long. `None`: "
-        "no trial.",
+        "Real seconds that the first step of an unknown FMU may take in its "
+        "[trial](reliability.md#the-trial); the first initialization may take ten times as long. "
+        "`None`: no trial.",
         DEFAULT_PROBE_TIMEOUT,
     )
     call_timeout: float | None = key(

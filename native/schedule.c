@@ -12,6 +12,7 @@ static const double QUICK = 10e3; /* calls this short may block other threads */
 static const double SMALLEST_CHUNK = 2e3;
 static const double LARGEST_CHUNK = 50e3;
 static const double WORTH_A_THREAD = 10e3; /* amount of work that justifies waking another thread */
+static const double LASTING = 1e6; /* an item this long is not for one thread after another */
 
 enum {
     STACK_VALUES = 8192,
@@ -176,6 +177,7 @@ static void run(Task *task, double cost, size_t first, size_t count) {
         .helpers = number_of_helpers(task, cost * (double)(count - first)),
         .smallest = at_least_one(SMALLEST_CHUNK / cost),
         .largest = at_least_one(LARGEST_CHUNK / cost),
+        .lasting = cost >= LASTING,
     };
     threads_run(&job);
 }

@@ -367,7 +367,7 @@ static void wait_for_chunks(Slot *slot, size_t count) {
 }
 
 /* Helpers that look for work join at once. The caller wakes sleeping ones after its first chunk,
- * when there may be no work left for them. */
+ * when there may be no work left for them; before it, if that lasts. */
 void threads_run(const Job *job) {
     Worker caller = {.helper = false};
     Slot *slot = job->helpers == 0 || job->count < 2 ? NULL : take_slot();
@@ -380,6 +380,9 @@ void threads_run(const Job *job) {
     atomic_add(&jobs, 1);
     start_helpers(job->helpers);
     open_slot(slot, job);
+    if (job->lasting) {
+        wake_some(slot);
+    }
     take_chunk(slot, 0, true, &caller);
     wake_some(slot);
     take_chunks(slot, 0, caller);

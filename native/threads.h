@@ -3,6 +3,7 @@
 #ifndef FMUGYM_THREADS_H
 #define FMUGYM_THREADS_H
 
+#include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
 
@@ -13,6 +14,7 @@ typedef struct {
     size_t helpers;  /* maximum number of threads in addition to the caller */
     size_t smallest; /* smallest chunk in items, at least 1 */
     size_t largest;
+    bool lasting; /* whether a single item takes much longer than to wake a helper */
 } Job;
 
 /* Works through all items on the calling thread and on free helpers. Returns when all items are

@@ -54,7 +54,7 @@ static void fail(Faulty *me, int fault) {
     } else if (fault == EXIT) {
         exit(0);
     } else if (fault == CLOSE) {
-        for (int descriptor = 3; descriptor < 100; descriptor++) {
+        for (int descriptor = 3; descriptor < 1024; descriptor++) { /* that of the worker, too */
             close(descriptor);
         }
     }

@@ -17,16 +17,17 @@ typedef struct {
     Logger logger;
 } Callbacks;
 
-enum { NUMBERS = 8, HARMLESS_STEPS = 15 };
+enum { NUMBERS = 8, HARMLESS_STEPS = 15, HARMLESS_RESETS = 2 };
 
 typedef struct {
     double values[2];
     char token[32];
     double *numbers; /* a block of memory of its own */
-    int steps;
+    int steps, resets;
 } Mortal;
 
 static int instances;
+static void *shared; /* memory of the first instance, which each one frees */
 
 static void fall_asleep(void) {
     const struct timespec hour = {3600, 0};
@@ -81,11 +82,15 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     Mortal *me = calloc(1, sizeof *me);
     snprintf(me->token, sizeof me->token, "%s", token);
     me->numbers = calloc(NUMBERS, sizeof *me->numbers);
+    shared = shared == NULL ? malloc(NUMBERS) : shared;
     return me;
 }
 
 void fmi2FreeInstance(Mortal *me) {
     do_as_told(me->token, "free");
+    if (strcmp(me->token, "free what is shared") == 0) {
+        free(shared);
+    }
     free(me->numbers);
     free(me);
 }
@@ -108,6 +113,9 @@ int fmi2DoStep(Mortal *me, double time, double step_size, int no_set_state) {
     do_as_told(me->token, "step");
     me->values[1] = me->values[0];
     me->steps++;
+    if (me->steps > HARMLESS_STEPS) {
+        do_as_told(me->token, "a later step");
+    }
     if (strcmp(me->token, "overrun later") == 0 && me->steps > HARMLESS_STEPS) {
         memset(me->numbers + NUMBERS, 1, 64);
     }
@@ -133,6 +141,9 @@ int fmi2Terminate(Mortal *me) {
 }
 
 int fmi2Reset(Mortal *me) {
+    if (++me->resets > HARMLESS_RESETS) {
+        do_as_told(me->token, "a later reset");
+    }
     me->values[0] = me->values[1] = 0.0;
     return 0;
 }

@@ -110,6 +110,17 @@ def processes_with(folder):
     return found
 
 
+def processes_of_session(leader):
+    """The numbers of the processes that live, or wait for their parent, in a session."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):  # it has ended
+                fields = (process / "stat").read_text().rpartition(")")[2].split()
+                found += [int(process.name)] if int(fields[3]) == leader else []
+    return found
+
+
 @contextlib.contextmanager
 def no_descriptors_left(left=0):
     """Let this process open no files, sockets or pipes, or only a few."""

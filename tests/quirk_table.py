@@ -109,6 +109,8 @@ QUIRKS = (
     ),
     Quirk("stops, reset keeps that", "keeps its wish to stop in a reset", "instance",
           log=BAD_RESET, versions=STATES),
+    Quirk("stops, slow at first", "does so, too, and takes long for its first step", "instance",
+          log=BAD_RESET, versions=STATES),
     Quirk("second reset fails", "returns Error in its second reset (a new instance replaces it)"),
     Quirk("second episode hangs", "hangs in the first step after a reset if parameters are set",
           "instance", log=BAD_RESET, probe_timeout=5.0),

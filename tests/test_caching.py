@@ -11,7 +11,7 @@ import fmugym
 from fmugym.archive import temporary
 from fmugym.caching import cache_folder, lasting_folder
 from fmugym.envs import CartPoleEnv
-from fmugym.trial.cache import recall, remember
+from fmugym.trial.known import recall, remember
 from fmugym.wine.program import wine_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Windows has no such owners and modes")

@@ -1,6 +1,7 @@
 """The documents: their Python runs, and their tables and quotations agree with the package."""
 
 import ast
+import dataclasses
 import inspect
 import re
 import subprocess
@@ -14,8 +15,8 @@ import pytest
 
 import fmugym
 import fmugym.lab
+from fmugym.pool.wishes import Wishes
 from fmugym.task.hooks import Hooks
-from fmugym.trial.opening import make_pool
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -176,9 +177,7 @@ def test_table_of_health_is_what_is_counted():
 def test_table_of_vector_arguments_has_every_argument():
     documented = set(rows_of(CONFIG, "Vector environments"))
     own = inspect.signature(fmugym.FMUVectorEnv.__init__).parameters
-    pool = inspect.signature(make_pool).parameters
-    pool_options = {name for name, p in pool.items() if p.kind is p.KEYWORD_ONLY} | {"backend"}
-    pool_options -= {"starts", "spare"}  # of the environment itself
+    pool_options = {wish.name for wish in dataclasses.fields(Wishes)}
     assert documented == set(own) - {"self", "make_env", "pool_options"} | pool_options
 
 

@@ -194,7 +194,7 @@ class TestRefusals:
         groups = tuple(Group((part.name,)) for part in components)
         system = SystemFMU(SystemPlan("both", components, groups=groups))
         with pytest.raises(ConfigError, match="a system"):
-            make_pool(system, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), "fmpy")
+            make_pool(system, PoolSpec((), (), 0.1), 1, logging.getLogger("test"), backend="fmpy")
 
     def test_of_snapshots(self):
         env = gym.make("fmugym/Pendulum-v0", backend="fmpy").unwrapped

@@ -10,16 +10,17 @@ import time
 
 import numpy as np
 import pytest
-from demanding_tools import DemandingEnv, expected_outputs, make_fmu
+from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
 from fmugym.errors import LicenceError
 from fmugym.pool.patience import speaks_of_licence
+from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.tools.cli import main
 from fmugym.trial import rehearsal
-from fmugym.trial.candidate import Candidate
+from fmugym.trial.episodes import Starts
 from fmugym.trial.known import known_verdict
-from fmugym.trial.neighbours import default_spec
+from fmugym.trial.subject import Subject
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -289,10 +290,12 @@ class TestInitializations:
 
     def test_slow_ones_are_measured(self, folder, seats, monkeypatch):
         monkeypatch.setattr(rehearsal, "_SLOW_INITIALIZATION", 0.0)
-        candidate = Candidate.of(fmugym.FMU(make_fmu(folder, "licensed")))
-        trial = rehearsal.Rehearsal(candidate, default_spec(candidate.open()), rehearsal.Starts())
+        fmu = fmugym.FMU(make_fmu(folder, "licensed"))
+        spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), STEP)
+        trial = rehearsal.Rehearsal(Subject(fmu), spec, Starts())
+        trial.find_reference()
         assert trial.is_frugal
-        assert trial.grade("restore") == "bitwise"
+        assert trial.grade(ResetMethod.RESTORE) == "bitwise"
 
     def test_trials_keep_to_the_limit_as_well(self, folder, seats):
         """The other environment needs a trial of its own; no more than one instance exists."""

@@ -37,6 +37,7 @@ JOBS = {
     "of two": (2, 2, 200),
     "of many": (4, 400, 5),
     "long": (3, 100, 20),
+    "lasting": (2, 2, 3000),
 }
 """The number of threads, that of instances, and the work of each in us."""
 
@@ -82,6 +83,12 @@ def test_the_caller_does_its_first_chunk_before_it_wakes_any_helper(counted, job
     """
     assert counted[job]["wakes"] > 0
     assert counted[job]["early_wakes"] <= counted[job]["rounds"] / 5
+
+
+def test_the_caller_wakes_a_helper_first_where_an_instance_takes_milliseconds(counted):
+    """Or else two of them would be stepped one after the other."""
+    lasting = counted["lasting"]
+    assert lasting["early_wakes"] >= 0.8 * lasting["rounds"]
 
 
 def test_a_long_job_wakes_no_more_helpers_than_there_are(counted):

@@ -22,8 +22,8 @@ from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.trial import opening
-from fmugym.trial.candidate import Candidate
-from fmugym.trial.neighbours import disturb_in_turn
+from fmugym.trial.trial import compare
+from fmugym.trial.verdict import Neighbours
 
 LOG = logging.getLogger("fmugym.test")
 HERE = Path(__file__).parent
@@ -526,6 +526,16 @@ class TestInitialStates:
 # Isolation
 
 
+def disturb(fmu, outputs=()):
+    """Whether two instances disturb each other; by default in any output."""
+    numeric = [v for v in fmu.description.variables.values() if v.numeric]
+    inputs = tuple(v for v in numeric if v.causality == "input")
+    outputs = outputs or tuple(v for v in numeric if v.causality == "output")
+
+    verdict = compare(fmu, PoolSpec(inputs, outputs, 0.1))
+    return verdict.neighbours is not Neighbours.INDEPENDENT
+
+
 class TestIsolation:
     def run(self, pool):
         pool.reset((), np.zeros((0, pool.num_instances)))
@@ -534,7 +544,7 @@ class TestIsolation:
         return outputs[0].tolist()
 
     def test_private_libraries(self, native, shared, temp_root):
-        assert self.run(native(shared, ["work"], ["total"], 3)) == [7, 8, 9]
+        assert self.run(native(shared, ["work"], ["total"], 3, threads=1)) == [7, 8, 9]
         pool = native(shared, ["work"], ["total"], 3, private_libraries=True, threads=2)
         assert self.run(pool) == [3, 3, 3]
         pool.close()
@@ -566,8 +576,8 @@ class TestIsolation:
         assert pool.reset((), np.zeros((0, 2)))[0].tolist() == [[1, 1]]
 
     def test_probe_finds_shared_globals(self, shared, busy, temp_root):
-        assert disturb_in_turn(Candidate.of(FMU(shared)))
-        assert not disturb_in_turn(Candidate.of(FMU(busy)))
+        assert disturb(FMU(shared))
+        assert not disturb(FMU(busy))
         assert list(temp_root.iterdir()) == []
 
     def test_vector_environments_give_private_libraries_by_themselves(self, shared, caplog):
@@ -593,14 +603,13 @@ class TestIsolation:
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
     def test_bundled_fmus_share_nothing(self, model, version):
-        assert not disturb_in_turn(Candidate.of(FMU(bundled_fmu(model, version))))
+        assert not disturb(FMU(bundled_fmu(model, version)))
 
     def test_probe_writes_all_types_of_inputs(self, probe):
         fmu = FMU(probe(3))
         outputs = tuple(map(fmu.variable, ("mix", "sum", "n_out", "on_out", "mode_out")))
-        inputs = tuple(map(fmu.variable, ("a", "n", "on", "mode", "free")))
-        assert not disturb_in_turn(Candidate.of(fmu), PoolSpec(inputs, outputs, 0.1))
-        assert disturb_in_turn(Candidate.of(fmu))  # it counts its instances
+        assert not disturb(fmu, outputs)
+        assert disturb(fmu)  # it counts its instances
 
 
 # Memory

@@ -12,9 +12,10 @@ import fmugym
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools.cli import main
-from fmugym.trial.candidate import Candidate
+from fmugym.trial.episodes import Starts
 from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import disturb_in_threads
+from fmugym.trial.subject import Subject
 from fmugym.trial.verdict import Neighbours
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
@@ -97,8 +98,8 @@ class TestGrades:
         path = make_fmu(folder, token)
         fmu = fmugym.FMU(path)
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), STEP)
-        candidate = Candidate.of(fmu)
-        disturb = functools.partial(disturb_in_threads, candidate, spec, step_seconds=1e-3)
+        subject = Subject(fmu)
+        disturb = functools.partial(disturb_in_threads, subject, spec, Starts(), step_seconds=1e-3)
         assert disturb() is at_once
         assert disturb(one_initialization=True) is in_turn
 

@@ -274,7 +274,7 @@ class TestConstruction:
     def test_unknown_backend(self, probe):
         fmu = FMU(probe(2))
         with pytest.raises(ConfigError, match="unknown backend 'natvie'; did you mean 'native'"):
-            opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG, "natvie")
+            opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG, backend="natvie")
 
 
 @engine_only

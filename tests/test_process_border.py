@@ -142,8 +142,8 @@ def test_opening_is_answered_by_nothing_else(deceived, monkeypatch):
 
 @linux_only
 def test_shared_memory_cannot_be_shrunk():
-    memory = Memory(8192)
+    memory = Memory(PoolSpec((), (), 1.0), 1, 1)
     with open(memory.descriptor, "r+b", closefd=False) as file, pytest.raises(PermissionError):
         file.truncate(1)
-    memory.map[8191] = 1
+    memory.map[memory.size - 1] = 1
     memory.close()

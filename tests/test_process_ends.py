@@ -16,6 +16,7 @@ from process_tools import (
     is_alive,
     linux_only,
     posix_only,
+    processes_of_session,
     processes_with,
     wait_until,
 )
@@ -122,6 +123,91 @@ print(*env.inside.pool.processes(), _guard().pid, flush=True)
 
 def program_that_ends(end):
     return INTERRUPTIBLE + PROGRAM + textwrap.dedent(end)
+
+
+KILLED = """
+import importlib, os, signal, sys
+import process_tools
+
+def kill_in(module, path, when, number):
+    *parts, name = path.split(".")
+    owner = importlib.import_module(module)
+    for part in parts:
+        owner = getattr(owner, part)
+    function, calls = getattr(owner, name), []
+
+    def call(*args, **options):
+        calls.append(name)
+        if when == "before" and len(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = function(*args, **options)
+        if len(calls) == number:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, name, call)
+
+kill_in(*sys.argv[2:5], int(sys.argv[5]))
+process_tools.FaultyEnv(sys.argv[1]).reset()
+"""
+"""Ends when a function is called for the n-th time, or has been called."""
+
+LAUNCHER, SUPERVISOR = "fmugym.pool.process.launcher", "fmugym.pool.process.supervisor"
+MOMENTS = {
+    "before it unpacks": ("zipfile", "ZipFile.extract", "before", 1),
+    "while it unpacks": ("zipfile", "ZipFile.extract", "after", 1),
+    "before the guard": ("subprocess", "Popen.__init__", "before", 1),
+    "start of the guard": ("subprocess", "Popen.__init__", "after", 1),
+    "before an order": ("socket", "send_fds", "before", 1),
+    "in the middle of an order": ("socket", "send_fds", "after", 1),
+    "start of a worker": (LAUNCHER, "_Guard.start", "after", 1),
+    "a worker is there": (LAUNCHER, "_GuardedProcess.confirm", "after", 1),
+    "instantiation": (SUPERVISOR, "Supervisor.finish_opening", "before", 1),
+    "end of it": (SUPERVISOR, "Supervisor.finish_opening", "after", 1),
+    "before the first reset": (SUPERVISOR, "Supervisor.reply", "before", 1),
+    "after the first reset": (SUPERVISOR, "Supervisor.reply", "after", 1),
+}
+MOMENTS_OF_TRIAL = {
+    **MOMENTS,
+    "first episode": (SUPERVISOR, "Supervisor.reply", "before", 20),
+    "start of the second worker": (LAUNCHER, "_Guard.start", "after", 2),
+    "rehearsal": ("fmugym.trial.rehearsal", "Rehearsal._worst_grade", "before", 1),
+    "end of a worker": (SUPERVISOR, "Supervisor.begin_closing", "after", 1),
+    "removal of its files": ("shutil", "rmtree", "before", 1),
+    "verdict": ("os", "replace", "after", 1),
+}
+
+
+class TestKilledInTheConstructor:
+    """The parent is killed; what it has in memory has no name and goes with the processes."""
+
+    @pytest.fixture(name="is_clean_after")
+    def fixture_is_clean_after(self, faulty, temp_root, tmp_path):
+        def is_clean_after(moment, probe):
+            program = subprocess.Popen(
+                [sys.executable, "-c", KILLED, faulty, *map(str, moment)],
+                env=os.environ
+                | {"PYTHONPATH": str(HERE), "FMUGYM_PROBE": probe}
+                | {"FMUGYM_CACHE_DIR": str(tmp_path / "cache")},
+                start_new_session=True,
+            )
+            assert program.wait() == -signal.SIGKILL
+            wait_until(lambda: not processes_of_session(program.pid))
+            sweep.cache_clear()
+            sweep()  # as the next process does that needs a folder
+            assert list(temp_root.iterdir()) == []
+
+        return is_clean_after
+
+    @linux_only
+    @pytest.mark.parametrize("moment", MOMENTS.values(), ids=MOMENTS)
+    def test_of_a_known_fmu(self, is_clean_after, moment):
+        is_clean_after(moment, "off")
+
+    @linux_only
+    @pytest.mark.parametrize("moment", MOMENTS_OF_TRIAL.values(), ids=MOMENTS_OF_TRIAL)
+    def test_of_an_unknown_fmu(self, is_clean_after, moment):
+        is_clean_after(moment, "on")
 
 
 class TestEndOfParent:

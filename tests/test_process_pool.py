@@ -290,7 +290,7 @@ class TestShortages:
             "Popen",
             lambda args, **options: popen([*args[:3], str(forking), *args[3:]], **options),
         )
-        launcher._cached_guard.cache_clear()
+        launcher._guards.clear()
         pool = make_pool(2)
         set_up(pool, faulty, ["crash", "none"], at=1)
         assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
@@ -301,7 +301,7 @@ class TestShortages:
         assert statuses.tolist() == [Status.OK] * 2
         assert outputs[0].tolist() == [0.5, 1.5]
         pool.close()
-        launcher._cached_guard.cache_clear()
+        launcher._guards.clear()
 
     def test_no_temporary_folder(self, make_pool, monkeypatch, tmp_path):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))

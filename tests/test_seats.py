@@ -12,9 +12,8 @@ from fmu_tools import grouped
 
 import fmugym
 from fmugym.errors import LicenceError
+from fmugym.pool.seats import taking
 from fmugym.pool.spec import PoolSpec
-from fmugym.trial.candidate import Candidate
-from fmugym.trial.seats import taking
 
 
 class SeatedEnv(fmugym.FMI2CSEnv):
@@ -137,13 +136,13 @@ def test_a_constructor_that_fails_returns_them():
 
 
 def test_threads_never_get_more_than_there_are():
-    candidate = Candidate.of(fmugym.FMU(fmugym.bundled_fmu("Pendulum")))
+    fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum"))
     spec = PoolSpec((), (), 0.1, max_instances=3)
     most, taken, lock = [0], [0], threading.Lock()
 
     def work():
         for _ in range(20):
-            with contextlib.suppress(LicenceError), taking(candidate, spec, 2, "a test"):
+            with contextlib.suppress(LicenceError), taking(fmu, spec, 2, "a test"):
                 with lock:
                     taken[0] += 2
                     most[0] = max(most[0], taken[0])

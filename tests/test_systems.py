@@ -471,13 +471,12 @@ class TestStates:
 def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
     """A trial plays it in a process of its own, and its verdict is kept by content."""
     monkeypatch.setenv("FMUGYM_CACHE", str(tmp_path))
-    from fmugym.trial.candidate import Candidate
     from fmugym.trial.known import known_verdict
     from fmugym.trial.trial import examine
 
     fmu = SystemFMU(masses([fmus[2], fmus[3]]))
     spec = PoolSpec((), (fmu.variable("first.y1"),), 0.1)
-    verdict = examine(Candidate.of(fmu), spec, several=True)
+    verdict = examine(fmu, spec, several=True)
     assert verdict.complete
     assert verdict.deterministic
     assert str(verdict.reset_method) == "restore"

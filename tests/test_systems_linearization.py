@@ -8,7 +8,6 @@ from pool_tools import open_pool, start
 from system_tools import linear_fmu
 
 from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
-from fmugym.trial import pools
 
 MASS, LENGTH, GRAVITY, FRICTION = 0.5, 0.4, 9.81, 0.03
 ANGLES = (0.3, -0.8)
@@ -90,7 +89,8 @@ def test_it_is_the_difference_quotient_of_houses_in_a_loop():
 
 def test_an_isolated_system_gives_the_same(monkeypatch):
     one = linearize(FMUSystem({"a": HOUSE}))
-    monkeypatch.setattr(pools, "local_pool", None)  # which would load it into this process
+    # That would load it into this process.
+    monkeypatch.setattr("fmugym.linearization.local_pool", None)
     other = linearize(FMUSystem({"a": Component(HOUSE, isolate=True)}))
     for name in ("A", "B", "f", "x0", "u0"):
         assert getattr(one, name).tobytes() == getattr(other, name).tobytes()

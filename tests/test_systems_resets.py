@@ -17,13 +17,11 @@ from pool_tools import open_pool, start, step
 
 from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
+from fmugym.pool.rungs import find_rungs
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.fmu import SystemFMU
 from fmugym.tools import cli
-from fmugym.trial.candidate import Candidate
-from fmugym.trial.rungs import find_rungs
 from fmugym.trial.trial import examine
-from fmugym.trial.verdict import Grade
 
 RESTORE, RESET, INSTANCE, LIBRARY, PROCESS = ResetMethod
 MIXES = list(itertools.product((RESTORE, RESET, INSTANCE), repeat=3))
@@ -183,16 +181,15 @@ class TestChoice:
         """Components begin anew by what they are good at, and by everything slower."""
         asked = []
 
-        def grade(methods):
+        def is_right(methods):
             asked.append(methods)
             order = list(ResetMethod)
-            good = all(
+            return all(
                 order.index(method) >= order.index(own)
                 for method, own in zip(methods, truth, strict=True)
             )
-            return Grade.BITWISE if good else Grade.WRONG
 
-        return find_rungs(offers, base, grade), asked
+        return find_rungs(offers, base, is_right), asked
 
     @pytest.mark.parametrize("truth", MIXES)
     def test_each_gets_its_own(self, truth):
@@ -207,10 +204,7 @@ class TestChoice:
         assert len(asked) == 1
 
     def test_what_is_wrong_together_is_not_used(self):
-        def grade(methods):
-            return Grade.BITWISE if list(methods).count(RESTORE) < 2 else Grade.WRONG
-
-        assert find_rungs(self.OFFERS, RESET, grade) == ()
+        assert find_rungs(self.OFFERS, RESET, lambda m: list(m).count(RESTORE) < 2) == ()
 
     def test_nothing_is_tried_without_a_choice(self):
         found, asked = self.find(((INSTANCE,),) * 2, INSTANCE, (INSTANCE,) * 2)
@@ -221,7 +215,7 @@ class TestChoice:
 def verdict_of(system):
     fmu = system.as_fmu()
     spec = PoolSpec((fmu.variable("a.u"),), tuple(map(fmu.variable, outputs_of(fmu))), 0.1)
-    return examine(Candidate.of(fmu), spec, several=False)
+    return examine(fmu, spec, several=False)
 
 
 class TestTrial:

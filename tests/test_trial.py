@@ -3,6 +3,7 @@
 import functools
 import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,13 +13,15 @@ import building
 import numpy as np
 import pytest
 from fmu_tools import PlainEnv, edited_fmu, grouped, library_name, write_fmu
+from process_tools import linux_only, processes_with, wait_until
 
 import fmugym
-from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
+from fmugym import FMU, ConfigError, FMULoadError
 from fmugym.caching import cache_folder
 from fmugym.pool import PoolSpec
-from fmugym.pool.process.last_words import OutputTail, describe_exit
-from fmugym.trial import attempt, trial
+from fmugym.pool.process import launcher
+from fmugym.pool.process.last_words import describe_exit
+from fmugym.trial import subject, trial
 from fmugym.trial.known import known_verdict
 from fmugym.trial.opening import make_pool
 
@@ -64,17 +67,20 @@ def trials(monkeypatch, tmp_path, temp_root, same_working_directory):
 
 @pytest.fixture
 def started(monkeypatch):
-    """The workers that are started."""
-    workers = []
+    """The trials that are started."""
+    subjects = []
 
-    class Popen(subprocess.Popen):
-        def __init__(self, *args, **kwargs):
-            super().__init__(*args, **kwargs)
-            if attempt._WORKER in self.args:  # a fixture may start a compiler
-                workers.append(self)
+    class Subject(trial.Subject):
+        def __init__(self, *args):
+            super().__init__(*args)
+            subjects.append(self)
 
-    monkeypatch.setattr(attempt.subprocess, "Popen", Popen)
-    return workers
+    monkeypatch.setattr(trial, "Subject", Subject)
+    return subjects
+
+
+def spec_of(fmu):
+    return PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
 
 
 def step_once(path, **config):
@@ -109,14 +115,22 @@ class TestDeath:
         with pytest.raises(FMULoadError, match=match):
             step_once(make_fmu(token))
 
-    def test_a_hang_ends_with_its_time(self, make_fmu, started):
+    @linux_only
+    def test_a_hang_ends_with_its_time(self, make_fmu, temp_root):
         match = r"in the first step it did not come back within 1\.5 s \(probe_timeout\)"
         with pytest.raises(FMULoadError, match=match):
             step_once(make_fmu("hang in step"), probe_timeout=1.5)
-        (worker,) = started
-        assert worker.returncode == -9
-        with pytest.raises(ProcessLookupError):
-            os.killpg(worker.pid, 0)
+        assert processes_with(temp_root) == []
+
+    @pytest.mark.parametrize("token", ["hang in a later step", "hang in a later reset"])
+    def test_a_hang_after_quick_calls_ends_soon(self, make_fmu, token, monkeypatch):
+        """Its limit follows from the calls before."""
+        monkeypatch.setattr(subject, "_LEAST", 1.0)
+        path, start = make_fmu(token), time.monotonic()
+        PlainEnv(path, CONFIG).close()
+        assert time.monotonic() - start < 40.0
+        (reason,) = known_verdict(FMU(path)).reasons
+        assert re.search(r"did not come back within [\d.]+ s \(those before took up to ", reason)
 
     def test_is_not_remembered(self, make_fmu, started):
         path = make_fmu("licence")
@@ -129,8 +143,9 @@ class TestDeath:
         with pytest.raises(FMULoadError, match="no licence for 5 seats"):
             fmugym.FMUVectorEnv(lambda: PlainEnv(make_fmu("licence"), CONFIG), 2)
 
-    def test_of_a_second_instance_asks_for_libraries_of_their_own(self, make_fmu, caplog):
-        path = make_fmu("lonely")
+    @pytest.mark.parametrize("token", ["lonely", "free what is shared"])
+    def test_of_a_second_instance_asks_for_libraries_of_their_own(self, make_fmu, caplog, token):
+        path = make_fmu(token)
         for _ in range(2):  # found out, then remembered
             envs = fmugym.FMUVectorEnv(lambda: PlainEnv(path, CONFIG), 2)
             assert "disturb each other" in caplog.text
@@ -167,16 +182,16 @@ def test_an_instance_that_damages_its_heap_later_runs_elsewhere(make_fmu):
 class TestIsolated:
     """Where the FMU runs in worker processes anyway, only a second instance is asked for."""
 
-    @pytest.mark.parametrize(("token", "tried"), [("lonely", 2), ("segfault in step", 2)])
+    @pytest.mark.parametrize(("token", "tried"), [("lonely", 1), ("segfault in step", 2)])
     def test_instances_that_want_a_process_each(self, make_fmu, started, token, tried):
         path = make_fmu(token)
         for _ in range(2):  # what one instance survives is remembered
             fmu = FMU(path)
-            spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), 0.1)
-            pool = make_pool(fmu, spec, 3, logging.getLogger("test"), isolation="process")
+            log = logging.getLogger("test")
+            pool = make_pool(fmu, spec_of(fmu), 3, log, isolation="process")
             assert len(set(pool.processes())) == 3
             pool.close()
-        assert sum("fmugym.trial.worker" in process.args for process in started) == tried
+        assert len(started) == tried
 
 
 class TestSurvival:
@@ -206,9 +221,9 @@ class TestSurvival:
     @pytest.mark.parametrize("token", ["noise", "deaf", "needy"])
     def test_whatever_it_says_closes_or_lacks(self, make_fmu, token):
         """What fails in order fails in the caller's process with its own message."""
-        path = make_fmu(token)
-        trial.meet(FMU(path))
-        assert len(list(cache_folder().iterdir())) == 1
+        fmu = FMU(make_fmu(token))
+        assert trial.examine(fmu, spec_of(fmu)).complete
+        assert known_verdict(fmu) is not None
 
     def test_a_refusal_is_the_callers_to_hear_each_time(self, make_fmu, started):
         path = make_fmu("refuse")
@@ -228,7 +243,6 @@ class TestSurvival:
 class TestExemptions:
     def test_bundled_fmus(self, started):
         fmugym.FMUVectorEnv(fmugym.envs.CartPoleEnv, 2).close()
-        trial.meet(FMU(bundled_fmu("Pendulum", "3.0")))
         assert started == []
 
     def test_by_argument(self, make_fmu, started):
@@ -259,14 +273,11 @@ class TestExemptions:
         assert started == []
 
     def test_where_no_worker_can_be_started(self, make_fmu, monkeypatch, caplog):
-        monkeypatch.setattr(sys, "executable", "/nowhere/python")
+        monkeypatch.setattr(launcher, "_guards", {})
+        monkeypatch.setattr(launcher.multiprocessing.spawn, "get_executable", lambda: "/nowhere")
         assert step_once(make_fmu()) == [1.0]
-        assert "Mortal.fmu could not be tried before: it found no Python to start" in caplog.text
-
-    def test_where_the_worker_fails_by_itself(self, make_fmu, monkeypatch, caplog):
-        monkeypatch.setattr(attempt, "_WORKER", "fmugym.absent")
-        assert step_once(make_fmu()) == [1.0]
-        assert "No module named fmugym.absent" in caplog.text
+        assert "Mortal.fmu could not be tried before: no worker process can be st" in caplog.text
+        assert "No such file or directory: '/nowhere'" in caplog.text
 
     @pytest.mark.parametrize("timeout", [0, -1.0, float("nan"), "1"])
     def test_of_no_other_value(self, make_fmu, timeout):
@@ -314,37 +325,15 @@ class TestLastWords:
     def test_how_a_process_ended(self, code, text):
         assert describe_exit(code) in text.split("|")
 
-    def test_a_tail_takes_no_more_memory_than_it_keeps(self, tmp_path):
-        path = tmp_path / "output"
-        path.write_bytes(b"x" * 10**7 + b"\n\n\xff\nlast\n")
-        lines = OutputTail(path.open("rb")).lines(timeout=60)
-        assert len(lines) == 10
-        assert max(map(len, lines)) == 300
-        assert lines[-2:] == ["\N{REPLACEMENT CHARACTER}", "last"]
 
-
-def test_a_worker_ends_by_itself_when_its_parent_was_killed(make_fmu, tmp_path):
-    """The trial's time goes on without the parent."""
-    options = f"{str(make_fmu('hang in step'))!r}, probe_timeout=2"
-    script = f"from fmugym import FMU; from fmugym.trial.trial import meet; meet(FMU({options}))"
-    parent = subprocess.Popen([sys.executable, "-c", script])
-    stage = wait_for(lambda: list((tmp_path / "temporary").glob("fmugym-probe-*/stage")))
-    wait_for(lambda: stage[0].read_text() == "the first step")
-    parent.kill()
-    parent.wait()
-    folder = stage[0].parent
-    wait_for(lambda: not workers_of(folder))
-    subprocess.run(["rm", "-r", *(tmp_path / "temporary").iterdir()], check=True)
-
-
-def workers_of(folder):
-    listing = subprocess.run(["ps", "-eo", "args"], capture_output=True, text=True, check=True)
-    return [line for line in listing.stdout.splitlines() if str(folder) in line]
-
-
-def wait_for(condition):
-    deadline = time.monotonic() + 30
-    while not (result := condition()):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-    return result
+@linux_only
+def test_a_worker_ends_within_a_second_when_its_parent_was_killed(make_fmu, temp_root):
+    program = "import sys, test_trial; test_trial.step_once(sys.argv[1])"
+    command = [sys.executable, "-c", program, make_fmu("hang in step")]
+    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(building.HERE)}) as parent:
+        try:
+            wait_until(lambda: processes_with(temp_root), 120.0)
+        finally:
+            parent.kill()
+        wait_until(lambda: not processes_with(temp_root), 1.0)
+    wait_until(lambda: not list(temp_root.iterdir()))

@@ -31,7 +31,7 @@ from fmugym.pool.process.channel import Channel
 from fmugym.pool.process.output import Output
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.requests import Request
-from fmugym.pool.process.shared_memory import Memory, make_bell, size_for
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools import cli
 from fmugym.trial import opening
@@ -219,9 +219,9 @@ class TestBell:
     def test_workers_have_bells_of_their_own(self, cart_pole, opened):
         fmu = FMU(cart_pole)
         spec = PoolSpec((), tuple(map(fmu.variable, ("x", "theta"))), time_step=0.05)
-        memory = opened(Memory(size_for(spec, 5, 3)))
+        memory = opened(Memory(spec, 5, 3))
         for number in range(3):
-            make_bell(memory, spec, 5, number)[0] += number + 1
+            memory.bell(number)[0] += number + 1
         everything = np.frombuffer(memory.map, np.uint64)
         assert sorted(everything[everything > 0]) == [1, 2, 3]
         fmu.close()

@@ -6,6 +6,9 @@ code that runs with all the rights of the process.
 
 from __future__ import annotations
 
+import copy
+import functools
+import hashlib
 import logging
 import math
 import os
@@ -32,7 +35,7 @@ from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.signals import ordinary
 from fmugym.wine.loader import can_run_windows, obstacle_to_wine
 
-__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU"]
+__all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU", "file_digest"]
 
 logger = logging.getLogger(__name__)
 
@@ -144,15 +147,15 @@ class FMU(LoadableFMU, KnownArguments):
         return source.again() if isinstance(source, FMU) else cls(source)
 
     def again(self) -> FMU:
-        """Open the same FMU once more, with a temporary folder of its own."""
-        return FMU(
-            self.path,
-            limits=self.limits,
-            preload=self.preload,
-            probe_timeout=self.probe_timeout,
-            interface=self.interface,
-            sizes=self.sizes,
-        )
+        """The same FMU once more, with a temporary folder of its own; it is not read again."""
+        other = copy.copy(self)
+        other._folder = other._remove_folder = None
+        return other
+
+    @property
+    def content(self) -> str:
+        """The SHA-256 of the file, or that of a system: of its plan and its files."""
+        return file_digest(self.path)
 
     def variable(self, name: str) -> Variable:
         """Look a variable up by name; see ``ModelDescription.variable``."""
@@ -313,6 +316,18 @@ class FMU(LoadableFMU, KnownArguments):
             _, remove, arguments, _ = alive
             remove(*arguments)
             finalizer.detach()  # not before: a signal may have interrupted the removal
+
+
+def file_digest(path: Path) -> str:
+    """The SHA-256 of a file; it is read again only when it has changed."""
+    status = path.stat()
+    return _digest(path, status.st_mtime_ns, status.st_size, status.st_ino)
+
+
+@functools.lru_cache(maxsize=256)
+def _digest(path: Path, *_: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _find_library(places: Sequence[str], wanted: str) -> tuple[str | None, list[str]]:

@@ -180,7 +180,7 @@ def fit_parameters(
             of Human Resources 50 (2015).
         drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
         max_evaluations: Largest number of evaluations of the optimization.
-        backend: See ``fmugym.trial.opening.make_pool``.
+        backend: See ``fmugym.pool.wishes.Wishes``.
 
     Returns:
         Values, standard errors, and the comparison of measurement and simulation.

@@ -41,7 +41,7 @@ class Simulator:
         fixed: Values of further parameters.
         num_sets: Largest number of sets.
         time_step: In seconds; None for the trajectories' median sampling interval.
-        backend: See ``fmugym.trial.opening.make_pool``.
+        backend: See ``fmugym.pool.wishes.Wishes``.
 
     Attributes:
         description: The FMU's model description.
@@ -76,7 +76,7 @@ class Simulator:
         self._variables = tuple([self._free[k] for k in self._start_rows] + constants)
         self._constants = [checked_value(v, fixed[v.name]) for v in constants]
         spec = PoolSpec(_inputs(fmu, self._inputs), _outputs(fmu, self.outputs), step)
-        self._pool = make_pool(fmu, spec, num_sets * len(trajectories), logger, backend)
+        self._pool = make_pool(fmu, spec, num_sets * len(trajectories), logger, backend=backend)
 
     def close(self) -> None:
         """Free all instances."""

@@ -19,11 +19,12 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
+from fmugym.pool.local import local_pool
+from fmugym.pool.patience import licence_errors
+from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.description import SystemDescription
 from fmugym.task.starting import checked_value, start_values
-from fmugym.trial.pools import trial_pool
-from fmugym.trial.trial import meet
 
 __all__ = ["LinearModel", "linearize"]
 
@@ -98,13 +99,20 @@ def linearize(
     x = _chosen(description, "continuous state", states, list(description.state_derivatives))
     u = _chosen(description, "continuous input", inputs, _inputs(description))
     start = _start_values(description, at or {})
-    meet(fmu)
     spec = PoolSpec((), (), 1.0, start_time=description.start_time)
-    with closing(trial_pool(fmu, spec, 1, logger, isolated=fmu.isolated)) as pool:
+    with closing(_open(fmu, spec)) as pool:
         pool.reset(tuple(start), np.array([list(start.values())], float).T)
         if pool.statuses[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         return _linear_model(pool, description, x, u)
+
+
+@licence_errors()
+def _open(fmu: FMU, spec: PoolSpec) -> Pool:
+    """An unknown FMU runs in a process of its own, which it may crash."""
+    if fmu.bundled and not fmu.isolated:
+        return local_pool(fmu, spec, 1, logger, threads=1)
+    return ProcessPool(fmu, spec, 1, logger, threads=1)
 
 
 def _require_derivatives(description: ModelDescription) -> None:

@@ -16,7 +16,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
 from fmugym.pool.patience import Patience, speaks_of_licence
-from fmugym.pool.progress import INITIALIZATION, STEP, announce, hears_calls, progress
+from fmugym.pool.progress import progress
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["Attendant", "AttendedPool"]
@@ -41,7 +41,7 @@ class Attendant:
     @classmethod
     def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> Attendant | None:
         """Make the attendant that a pool needs; None if it needs none."""
-        needed = spec.licence_wait or log.isEnabledFor(logging.INFO) or hears_calls()
+        needed = spec.licence_wait or log.isEnabledFor(logging.INFO)
         return cls(name, spec, log) if needed else None
 
     def reset(
@@ -73,10 +73,8 @@ class Attendant:
                 chosen = np.isin(np.arange(pool.num_instances), list(refused))
                 raise LicenceError(next(iter(refused.values())))
 
-        announce(INITIALIZATION)
         with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
             self._patience.call(attempt)
-        announce(STEP)
 
 
 def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:

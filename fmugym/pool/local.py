@@ -7,7 +7,6 @@ import logging
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.patience import licence_errors
-from fmugym.pool.progress import INITIALIZATION, STEP, announce
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import PoolSpec
 
@@ -38,7 +37,6 @@ def local_pool(
         LicenceError: If the FMU gets no licence.
         FMULoadError: If the FMU cannot be loaded or instantiated.
     """
-    announce(INITIALIZATION)  # an FMU may do all of its work when it is instantiated
     from fmugym.pool.native import NativePool
 
     pool = NativePool(
@@ -50,5 +48,4 @@ def local_pool(
         private_libraries=private_libraries,
     )
     pool.attend(Attendant.of(fmu.path.name, spec, log))
-    announce(STEP)
     return pool

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Final, TypeVar
 
+import numpy as np
+
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
@@ -61,13 +63,13 @@ def licence_errors() -> Iterator[None]:
 
 
 def require_licence(pool: Pool) -> None:
-    """Look at the first instance of a pool after a reset.
+    """Look at the instances of a pool after a reset.
 
     Raises:
-        LicenceError: If it got no licence.
+        LicenceError: If one of them got no licence.
     """
-    if pool.statuses[0] > WARNING_CODE:
-        failure = pool.failure(0)
+    for index in np.flatnonzero(pool.statuses > WARNING_CODE).tolist():
+        failure = pool.failure(index)
         if speaks_of_licence(failure):
             raise LicenceError(failure)
 

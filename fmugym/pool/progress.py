@@ -5,35 +5,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-__all__ = ["INITIALIZATION", "STEP", "announce", "hears_calls", "listen", "progress"]
-
-INITIALIZATION: Final = "initialization"
-STEP: Final = "a step"
+__all__ = ["progress"]
 
 _EVERY: Final = 10.0
 """Seconds between two messages."""
-
-_listeners: list[Callable[[str], None]] = []
-
-
-def listen(listener: Callable[[str], None]) -> None:
-    """Let a function hear of every call of this process that may take long, before it begins."""
-    _listeners.append(listener)
-
-
-def hears_calls() -> bool:
-    """Whether anyone listens to ``announce``."""
-    return bool(_listeners)
-
-
-def announce(call: str) -> None:
-    """Tell the listeners which call begins."""
-    for listener in _listeners:
-        listener(call)
 
 
 @contextmanager

@@ -9,12 +9,11 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import stat
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from fmugym.caching import read_file, replace_file
 from fmugym.pool.spec import PoolSpec
 from fmugym.signals import Ignoring, ordinary
 
@@ -30,9 +29,6 @@ _LARGEST: Final = 2**28
 
 _MAGIC: Final = b"fmugym initial state 2\n"
 _DIGEST: Final = hashlib.sha256().digest_size
-
-_READ: Final = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-"""Do not follow links, and do not wait for a pipe's writer; Windows has no such flags."""
 
 
 class StateFiles:
@@ -53,12 +49,7 @@ class StateFiles:
         """Read a state; None if there is none, or only a damaged one."""
         path = self.path(key)
         try:
-            handle = os.open(path, _READ)
-            with os.fdopen(handle, "rb") as file:
-                status = os.fstat(handle)
-                if not stat.S_ISREG(status.st_mode) or status.st_size > _LARGEST:
-                    return None
-                state = _parsed(file.read(_LARGEST))
+            state = _parsed(read_file(path, _LARGEST))
             os.utime(path)
         except ordinary(OSError):
             return None
@@ -70,7 +61,7 @@ class StateFiles:
             return
         try:
             self._prefix.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-            _write(self.path(key), _MAGIC + hashlib.sha256(state).digest() + state)
+            replace_file(self.path(key), _MAGIC + hashlib.sha256(state).digest() + state)
             _remove_old(self._prefix.parent)
         except ordinary(OSError) as error:
             logger.debug("no state is kept: %s", error)
@@ -81,19 +72,6 @@ def _parsed(content: bytes) -> bytes | None:
     digest, state = content[len(_MAGIC) : start], content[start:]
     is_sound = content[: len(_MAGIC)] == _MAGIC and hashlib.sha256(state).digest() == digest
     return state if is_sound else None
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Replace a file atomically, because another process may be reading or writing it."""
-    handle, name = tempfile.mkstemp(dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.replace(name, path)
-    except BaseException:
-        with Ignoring(OSError):
-            os.unlink(name)
-        raise
 
 
 def _remove_old(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import weakref
 from collections.abc import Iterable, Iterator
@@ -11,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 
 from fmugym.archive.bundled import is_bundled
-from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
 from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
@@ -20,36 +21,7 @@ from fmugym.systems.description import SystemDescription, describe_system
 from fmugym.systems.layout import Layout
 from fmugym.systems.plan import Component, SystemPlan
 
-__all__ = ["ExtractedSystem", "SystemFMU"]
-
-
-class ExtractedSystem(ExtractedFMU):
-    """A system whose FMUs are in a folder that somebody else owns.
-
-    Args:
-        path: Names the system in messages.
-        description: The description of the system.
-        folder: That of the component with the number i is ``folder/i``.
-    """
-
-    def __init__(self, path: Path, description: SystemDescription, folder: Path) -> None:
-        super().__init__(path, description, (), folder)
-        self._parts = _parts_in(folder, description)
-
-    @property
-    def parts(self) -> tuple[LoadableFMU, ...]:
-        """The FMUs of the components."""
-        return self._parts
-
-
-def _parts_in(
-    folder: Path, description: SystemDescription, *, in_wine: bool = False
-) -> tuple[LoadableFMU, ...]:
-    pairs = zip(description.plan.components, description.parts, strict=True)
-    return tuple(
-        ExtractedFMU(component.path, part, component.preload, folder / str(number), in_wine=in_wine)
-        for number, (component, part) in enumerate(pairs)
-    )
+__all__ = ["SystemFMU"]
 
 
 class SystemFMU(FMU):
@@ -88,9 +60,14 @@ class SystemFMU(FMU):
         self._folder: Path | None = None
         self._remove_folder = None
 
-    def again(self) -> SystemFMU:
-        """Open the same system once more."""
-        return SystemFMU(self.plan, probe_timeout=self.probe_timeout)
+    @property
+    def content(self) -> str:
+        """See ``FMU.content``."""
+        components = self.plan.components
+        named = tuple(replace(part, path=Path(part.path.name)) for part in components)
+        texts = [repr(replace(self.plan, components=named, file=None))]
+        texts += [file_digest(part.path) for part in components]
+        return hashlib.sha256("\n".join(texts).encode()).hexdigest()
 
     @property
     def bundled(self) -> bool:
@@ -100,8 +77,13 @@ class SystemFMU(FMU):
     @property
     def parts(self) -> tuple[LoadableFMU, ...]:
         """The FMUs of the components, extracted."""
-        assert isinstance(self.description, SystemDescription)
-        return _parts_in(self.extract(), self.description, in_wine=self.in_wine)
+        description, folder, in_wine = self.description, self.extract(), self.in_wine
+        assert isinstance(description, SystemDescription)
+        pairs = zip(self.plan.components, description.parts, strict=True)
+        return tuple(
+            ExtractedFMU(one.path, part, one.preload, folder / str(number), in_wine=in_wine)
+            for number, (one, part) in enumerate(pairs)
+        )
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:

@@ -165,7 +165,7 @@ class PoolOpening:
 
         Args:
             num_instances: N.
-            options: Passed to ``fmugym.trial.opening.make_pool``, before the config's own.
+            options: Wishes of ``fmugym.pool.wishes.Wishes``, before the config's own.
 
         Raises:
             ConfigError: If an argument is invalid.

@@ -16,7 +16,6 @@ from fmugym.archive.texts import numbers_of
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.signals import ordinary
-from fmugym.trial.candidate import Candidate, content_of
 
 if TYPE_CHECKING:
     from fmugym.task.construction import Constructed
@@ -275,8 +274,7 @@ def scope_of(env: Constructed) -> Scope:
 def _find_scope(env: Constructed) -> Scope:
     config, fmu = env.config, env.fmu.description
     scope = {
-        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} "
-        f"(SHA-256 {content_of(Candidate.of(env.fmu))})",
+        "FMU": f"{fmu.model_name} of FMI {fmu.fmi_version} (SHA-256 {env.fmu.content})",
         "action space": str(env.action_space),
     }
     names = [f.name for f in fields(config) if f.name not in _OPERATION]

@@ -11,20 +11,25 @@ from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["moving_inputs", "neighbour_inputs", "start_inputs"]
+__all__ = ["inputs_of_two", "moving_inputs"]
 
 _UNBOUNDED: Final = 1.0
 """How far a Real without limits moves to each side, in its unit."""
 
 
-def start_inputs(spec: PoolSpec) -> FloatArray:
-    """The start values of the inputs, clipped to their limits, shape (inputs,)."""
-    return np.array([_start(*pair) for pair in _with_limits(spec)], np.float64)
+def inputs_of_two(spec: PoolSpec, steps: int, amplitude: float) -> FloatArray:
+    """The inputs of two instances, different in every step; the second one's move all the way.
 
+    Args:
+        spec: Names the inputs.
+        steps: The number of steps.
+        amplitude: How far those of the first instance move.
 
-def neighbour_inputs(spec: PoolSpec) -> FloatArray:
-    """The inputs of an instance that may disturb another: the opposite end of each range."""
-    return np.array([_other(*pair) for pair in _with_limits(spec)], np.float64)
+    Returns:
+        Shape (steps, inputs, 2).
+    """
+    both = moving_inputs(spec, steps, amplitude), moving_inputs(spec, steps, 1.0, phase=steps)
+    return np.stack(both, axis=2)
 
 
 def moving_inputs(spec: PoolSpec, steps: int, amplitude: float, phase: float = 0.0) -> FloatArray:
@@ -75,15 +80,3 @@ def _moved(variable: Variable, limits: _Limits, swing: FloatArray) -> FloatArray
     down = start - limits[0] if math.isfinite(limits[0]) else room
     values = start + np.where(swing > 0.0, swing * up, swing * down)
     return np.rint(values) if variable.kind == "integer" else values
-
-
-def _other(variable: Variable, limits: _Limits) -> float:
-    start = _start(variable, limits)
-    if variable.kind == "boolean":
-        return 1.0 - start
-    if variable.items:
-        return float(next((v for _, v in variable.items if v != start), start))
-    for bound in (limits[1], limits[0]):
-        if math.isfinite(bound) and bound != start:
-            return bound if variable.kind == "real" else float(math.trunc(bound))
-    return start + 1.0

@@ -1,61 +1,145 @@
-"""What earlier trials of an FMU have shown, kept in the cache folder."""
+"""What an FMU is known by, and what earlier trials have shown, kept in the cache folder.
+
+If the folder cannot be read or written, nothing is kept, and no error is raised.
+"""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import logging
+import os
 from dataclasses import replace
-from typing import Any
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final
+
+import fmpy
 
 from fmugym.archive.fmu import FMU
-from fmugym.caching import cache_folder
+from fmugym.caching import cache_folder, read_file, replace_file
+from fmugym.errors import unknown_name
 from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.spec import PoolSpec
 from fmugym.signals import ordinary
-from fmugym.trial.cache import recall, remember
-from fmugym.trial.candidate import Candidate, content_key, verdict_key
 from fmugym.trial.verdict import Verdict
 
 __all__ = [
+    "content_key",
+    "is_exempt",
     "known_resuming",
     "known_verdict",
     "note_resuming",
+    "recall",
+    "remember",
     "state_files",
+    "verdict_key",
     "with_harm",
 ]
+
+logger = logging.getLogger(__name__)
+
+_LARGEST: Final = 2**20
+"""The largest size of a text in bytes."""
+
+
+def recall(key: str) -> str | None:
+    """Read the text that was kept under a key; None if there is none."""
+    try:
+        return read_file(cache_folder() / key, _LARGEST).decode()
+    except ordinary(OSError, ValueError):
+        return None
+
+
+def remember(key: str, text: str) -> None:
+    """Keep a text under a key, which is a file name."""
+    try:
+        replace_file(cache_folder() / key, text.encode())
+    except ordinary(OSError) as error:
+        logger.debug("nothing is remembered: %s", error)
 
 
 def known_verdict(fmu: FMU) -> Verdict | None:
     """The verdict of the last trial of an FMU on this machine; None if there was none."""
-    return Verdict.from_text(recall(content_key(Candidate.of(fmu))))
+    return Verdict.from_text(recall(content_key(fmu)))
 
 
-def state_files(fmu: FMU) -> str:
-    """Where states of an FMU are kept; see ``fmugym.pool.states``."""
-    try:
-        return str(cache_folder("states") / content_key(Candidate.of(fmu)))
-    except ordinary(OSError):  # there is no folder for caches
-        return ""
-
-
-def with_harm(verdict: Verdict, candidate: Candidate) -> Verdict:
+def with_harm(verdict: Verdict, fmu: FMU) -> Verdict:
     """Add the harm to its process that the FMU has done with any other config."""
-    known = Verdict.from_text(recall(content_key(candidate)))
+    known = known_verdict(fmu)
     if known is None or not known.isolate or verdict.isolate:
         return verdict
     reasons = dict.fromkeys((*verdict.reasons, *known.reasons))
     return replace(verdict, isolate=True, reasons=tuple(reasons))
 
 
-def known_resuming(candidate: Candidate, spec: Any, starts: Any) -> SaveMethod | None:
+def state_files(fmu: FMU) -> str:
+    """Where states of an FMU are kept; see ``fmugym.pool.states``."""
+    try:
+        return str(cache_folder("states") / content_key(fmu))
+    except ordinary(OSError):  # there is no folder for caches
+        return ""
+
+
+def known_resuming(fmu: FMU, spec: PoolSpec, starts: Any) -> SaveMethod | None:
     """How states in the middle of an episode can be saved; None if that was not tried."""
     try:
-        return SaveMethod(recall(_resuming_key(candidate, spec, starts)) or "")
+        return SaveMethod(recall(_resuming_key(fmu, spec, starts)) or "")
     except ValueError:
         return None
 
 
-def note_resuming(candidate: Candidate, spec: Any, starts: Any, method: SaveMethod) -> None:
+def note_resuming(fmu: FMU, spec: PoolSpec, starts: Any, method: SaveMethod) -> None:
     """Keep the result of a trial."""
-    remember(_resuming_key(candidate, spec, starts), str(method))
+    remember(_resuming_key(fmu, spec, starts), str(method))
 
 
-def _resuming_key(candidate: Candidate, spec: Any, starts: Any) -> str:
-    return f"{verdict_key(candidate, spec, starts)}-resuming"
+def _resuming_key(fmu: FMU, spec: PoolSpec, starts: Any) -> str:
+    return f"{verdict_key(fmu, spec, starts)}-resuming"
+
+
+# What an FMU is known by
+
+_ON: Final = ("on", "1", "yes", "true")
+_OFF: Final = ("off", "0", "no", "false")
+"""The values of ``FMUGYM_PROBE``; an empty one is none."""
+
+
+def is_exempt(fmu: FMU) -> bool:
+    """Whether to skip the trial: trials are turned off, or this package bundles the FMU.
+
+    Raises:
+        ConfigError: If the environment variable ``FMUGYM_PROBE`` has an unknown value.
+    """
+    return _trials_are_off() or fmu.probe_timeout is None or fmu.bundled
+
+
+def _trials_are_off() -> bool:
+    given = os.environ.get("FMUGYM_PROBE", "").strip().lower()
+    if given not in (*_ON, *_OFF, ""):
+        known = (*_ON, *_OFF)
+        raise unknown_name("value of the environment variable FMUGYM_PROBE", given, known)
+    return given in _OFF
+
+
+def verdict_key(fmu: FMU, spec: PoolSpec, starts: Any) -> str:
+    """The scope of a verdict on resets and neighbours."""
+    tried = replace(spec, max_instances=None, licence_wait=0.0)
+    return f"{content_key(fmu)}-{_digest(repr((tried, starts, fmu.preload)))}"
+
+
+def content_key(fmu: FMU) -> str:
+    """The scope of a verdict: content, interface, sizes, platform, and version of the package."""
+    scope = f"{fmu.content} {fmpy.platform_tuple} {_version()} {fmu.description.interface}"
+    return _digest(f"{scope} {sorted(fmu.sizes.items())}")
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@functools.cache
+def _version() -> str:
+    try:
+        return version("fmugym-toolbox")
+    except PackageNotFoundError:
+        return "unknown"

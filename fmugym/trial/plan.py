@@ -1,157 +1,157 @@
-"""How a pool is opened: the caller's demands, completed with the results of a trial."""
+"""How a pool is opened, and why: the caller's wishes, completed with the results of a trial."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMULoadError, unknown_name
+from fmugym.errors import printable
 from fmugym.pool.base import first_of
-from fmugym.pool.spec import ISOLATIONS, ResetMethod
-from fmugym.trial.candidate import Candidate
+from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.pool.wishes import Wishes
 from fmugym.trial.verdict import Grade, Neighbours, Verdict
-from fmugym.wine.prefix import Wine
 
 __all__ = ["Plan", "is_alone"]
+
+_FILES: Final = "each gets a process with a copy of the FMU's files"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How to open a pool: the caller's demands, completed with the results of a trial."""
+    """How a pool of the native engine is opened.
 
-    reset_method: str | None = None
-    threads: int | None = None
-    private_libraries: bool | None = None
-    isolation: str | None = None
-    workers: int | None = None
-    component_resets: tuple[ResetMethod, ...] = ()
-    one_initialization: bool = False
-    own_files: bool = False
-
-    def checked(self, fmu: FMU) -> Plan:
-        """Refuse unknown names; in Wine, refuse what is not possible there."""
-        if self.isolation not in (None, *ISOLATIONS):
-            raise unknown_name("isolation", self.isolation, ISOLATIONS)
-        if self.reset_method not in (None, *ResetMethod):
-            raise unknown_name("reset method", self.reset_method, list(map(str, ResetMethod)))
-        if not fmu.in_wine:
-            isolated = self.isolation is None and fmu.isolated
-            return replace(self, isolation="process") if isolated else self
-        _prepare_wine(fmu, self.private_libraries, self.isolation)
-        return replace(self, threads=1, private_libraries=None, isolation="process")
-
-    @property
-    def method(self) -> ResetMethod:
-        """How episodes begin."""
-        return ResetMethod(self.reset_method or ResetMethod.RESET)
-
-    @property
-    def has_own_workers(self) -> bool:
-        """Whether the caller has decided which instances share a process."""
-        return self.isolation == "process" and self.workers is not None
-
-    def completed(
-        self, fmu: FMU, verdict: Verdict, num_instances: int, log: logging.Logger
-    ) -> Plan:
-        """Decide what the caller has left open, and log every unusual choice."""
-        plan = self
-        if plan.reset_method is None:
-            method, components = verdict.reset_method, verdict.components
-            plan = replace(plan, reset_method=method, component_resets=components)
-            _tell_of_resets(fmu, verdict, log)
-        if plan.private_libraries is None and num_instances > 1 and not plan.has_own_workers:
-            if is_alone(fmu):
-                plan = plan._in_processes(fmu, num_instances, log)
-            else:
-                neighbours = verdict.neighbours or Neighbours.INDEPENDENT
-                plan = plan._apart(fmu, neighbours, num_instances, log)
-        if verdict.isolate and plan.isolation is None:
-            why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
-            log.warning("%s harms its process%s. It runs in worker processes", fmu.path.name, why)
-            plan = replace(plan, isolation="process")
-        return plan._with_means_of_reset(num_instances)
-
-    def _in_processes(self, fmu: FMU, num_instances: int, log: logging.Logger) -> Plan:
-        """Give each instance a process, as the FMU demands, unless the caller insists."""
-        if self.isolation == "none":
-            what = "isolation='none' keeps more in it all the same"
-            plan = self
-        else:
-            what = "each gets a process with a copy of the FMU's files"
-            plan = self._with_a_process_each(num_instances)
-        level = logging.INFO if self.isolation == "process" else logging.WARNING
-        log.log(level, "a process may have one instance of %s: %s", fmu.path.name, what)
-        return plan
-
-    def _with_a_process_each(self, num_instances: int) -> Plan:
-        workers = self.workers or num_instances
-        return replace(self, isolation="process", workers=workers, own_files=True)
-
-    def _apart(
-        self, fmu: FMU, neighbours: Neighbours, num_instances: int, log: logging.Logger
-    ) -> Plan:
-        if neighbours is Neighbours.INDEPENDENT:
-            return self
-        if neighbours is Neighbours.ONE_INITIALIZATION:
-            log.info("%s: its instances are initialized one at a time", fmu.path.name)
-            return replace(self, one_initialization=True)
-        plan, what = replace(self, threads=1), "all are stepped by one thread"
-        in_process = self.isolation == "none"
-        if neighbours is Neighbours.LIBRARIES and (in_process or self._can_copy_libraries):
-            plan, what = replace(self, private_libraries=True), "each gets a copy of the library"
-        elif neighbours is Neighbours.PROCESSES and in_process:
-            plan, what = self, "isolation='none' keeps them in one process all the same"
-        elif neighbours is not Neighbours.ONE_THREAD:
-            plan = self._with_a_process_each(num_instances)
-            what = "each gets a process with a copy of the FMU's files"
-        asked_for = self.isolation == "process"
-        level = logging.INFO if asked_for else logging.WARNING
-        log.log(level, "the instances of %s disturb each other: %s", fmu.path.name, what)
-        return plan
-
-    @property
-    def _can_copy_libraries(self) -> bool:
-        return self.isolation is None
-
-    def _with_means_of_reset(self, num_instances: int) -> Plan:
-        """Provide the private libraries or the processes that the reset method needs."""
-        method = self.method
-        reloads = ResetMethod.LIBRARY in (method, *self.component_resets)
-        if reloads and self.isolation == "process":
-            method = ResetMethod.PROCESS
-        elif reloads:
-            return replace(self, private_libraries=True)
-        if method is ResetMethod.PROCESS:
-            plan = replace(self, reset_method=method, component_resets=())
-            return replace(plan, isolation="process", workers=num_instances)
-        return replace(self, reset_method=method)
-
-
-def _prepare_wine(fmu: FMU, private_libraries: bool | None, isolation: str | None) -> None:
-    """Refuse what is not possible in Wine, and make ready what every worker needs.
-
-    Raises:
-        FMULoadError: If Wine or something else is missing, or a wish cannot be granted.
+    Attributes:
+        fmu: The FMU; closed with the pool.
+        num_instances: N.
+        spec: What to do at each reset and step.
+        how: The wishes, and what follows where they have left something open.
+        own_files: See ``ProcessPool``.
+        notes: Why, for the log, with the levels of these messages.
+        save_by: Finds out how states can be saved; it may take as long as a trial.
     """
-    wishes = {
-        "private_libraries": private_libraries,
-        "isolation='none'": isolation == "none",
-        "preload": fmu.preload,
-    }
-    refused = [wish for wish, is_given in wishes.items() if is_given]
-    try:
-        if refused:
-            raise FMULoadError(
-                f"{fmu.path.name} has libraries for Windows only, which run here in worker "
-                f"processes in Wine, but this leaves no choice for: {', '.join(refused)}"
+
+    fmu: FMU
+    num_instances: int
+    spec: PoolSpec
+    how: Wishes
+    own_files: bool = False
+    notes: tuple[tuple[int, str], ...] = ()
+    save_by: Callable[[], SaveMethod] = lambda: SaveMethod.REPLAY
+
+    def completed(self, verdict: Verdict) -> Plan:
+        """Decide by the verdict of a trial what the wishes leave open."""
+        spec = replace(self.spec, blind_start=verdict.blind_start)
+        wished = self.how.reset_method
+        plan = replace(self, spec=spec.beginning_by(ResetMethod(wished or verdict.reset_method)))
+        if wished is None:
+            plan = plan._with_resets(verdict)
+        if self.num_instances > 1 and not self.how.decides_who_shares:
+            plan = plan._with_neighbours(verdict.neighbours or Neighbours.INDEPENDENT)
+        if verdict.isolate and plan.how.isolation is None:
+            why = f": {verdict.reasons[-1]}" if verdict.reasons else ""
+            plan = plan._with(isolation="process")
+            plan = plan._noting(f"{plan._name} harms its process{why}. It runs in worker processes")
+        return plan._with_means_of_reset()._with_limits_of_reading(verdict)
+
+    @property
+    def is_isolated(self) -> bool:
+        """Whether the instances are in worker processes."""
+        return self.how.isolation == "process"
+
+    @property
+    def _name(self) -> str:
+        return self.fmu.path.name
+
+    def _with(self, **how: Any) -> Plan:
+        return replace(self, how=replace(self.how, **how))
+
+    def _noting(self, text: str, level: int = logging.WARNING) -> Plan:
+        return replace(self, notes=(*self.notes, (level, text)))
+
+    def _with_resets(self, verdict: Verdict) -> Plan:
+        """Begin episodes as the verdict says; note the methods that do not work correctly."""
+        plan = replace(self, spec=replace(self.spec, component_resets=verdict.components))
+        name, method = self._name, str(verdict.reset_method)
+        if not verdict.deterministic:
+            noisy = first_of(verdict.noisy)
+            text = f"{name} gives other values of {noisy} each time, even if it begins afresh"
+            plan = plan._noting(text, self._level_of("outputs"))
+        if verdict.resets.get(ResetMethod.RESET) in (Grade.WRONG, Grade.FAILS):
+            text = f"{name} does not begin anew when it is reset; episodes begin by the method "
+            plan = plan._noting(f"{text}{method!r} instead", self._level_of(method))
+        elif verdict.resets:
+            plan = plan._noting(f"{name}: episodes begin by the method {method!r}", logging.INFO)
+        for component, own in verdict.components_of(getattr(self.fmu, "plan", None)).items():
+            text = f"{name}: component {component!r} begins by the method {own!r}"
+            plan = plan._noting(text, logging.INFO)
+        return plan
+
+    def _level_of(self, subject: str) -> int:
+        """A program that makes many environments of an FMU is warned of each subject once."""
+        is_new = (self.fmu.path, subject) not in _warned
+        _warned.add((self.fmu.path, subject))
+        return logging.WARNING if is_new else logging.INFO
+
+    def _with_neighbours(self, neighbours: Neighbours) -> Plan:
+        """Keep instances from disturbing each other, unless the caller insists."""
+        insists = self.how.isolation == "none"
+        why = f"the instances of {self._name} disturb each other"
+        kept = "isolation='none' keeps them in one process all the same"
+        if is_alone(self.fmu):
+            why, neighbours = (
+                f"a process may have one instance of {self._name}",
+                Neighbours.PROCESSES,
             )
-        Wine.ready()
-    except BaseException:
-        fmu.close()
-        raise
+            kept = "isolation='none' keeps more in it all the same"
+        elif neighbours is Neighbours.INDEPENDENT:
+            return self
+        elif neighbours is Neighbours.ONE_INITIALIZATION:
+            plan = replace(self, spec=replace(self.spec, one_initialization=True))
+            text = f"{self._name}: its instances are initialized one at a time"
+            return plan._noting(text, logging.INFO)
+        if neighbours is Neighbours.ONE_THREAD:
+            plan, what = self._with(threads=1), "all are stepped by one thread"
+        elif neighbours is Neighbours.LIBRARIES and not self.is_isolated:
+            plan, what = self._with(private_libraries=True), "each gets a copy of the library"
+        elif insists:
+            plan, what = self, kept
+        else:
+            workers = self.how.workers or self.num_instances
+            plan = replace(self._with(isolation="process", workers=workers), own_files=True)
+            what = _FILES
+        return plan._noting(f"{why}: {what}", logging.INFO if self.is_isolated else logging.WARNING)
+
+    def _with_means_of_reset(self) -> Plan:
+        """Provide the private libraries or the processes that the reset method needs."""
+        if self.spec.reloads and not self.is_isolated:
+            return self._with(private_libraries=True)
+        if self.spec.reloads or self.spec.reset_method is ResetMethod.PROCESS:
+            plan = replace(self, spec=self.spec.beginning_by(ResetMethod.PROCESS))
+            return plan._with(isolation="process", workers=self.num_instances)
+        return self
+
+    def _with_limits_of_reading(self, verdict: Verdict) -> Plan:
+        """Note what cannot be read, or not at any time."""
+        plan = self
+        if verdict.blind_start:
+            plan = plan._noting(
+                f"{self._name} cannot be read before its first step: until then, its outputs have "
+                "the start values of the model description"
+            )
+        if verdict.unreadable:
+            names = printable(", ".join(verdict.unreadable))
+            plan = plan._noting(f"{self._name}: its trial could not read the output(s) {names}")
+        return plan
+
+    def saving_by(self, method: SaveMethod) -> Plan:
+        """The plan if it is known how states can be saved."""
+        spec = replace(self.spec, records=method is not SaveMethod.STATE)
+        return replace(self, spec=spec, save_by=lambda: method)
 
 
 def is_alone(fmu: FMU) -> bool:
@@ -160,29 +160,3 @@ def is_alone(fmu: FMU) -> bool:
 
 
 _warned: Final[set[tuple[Path, str]]] = set()
-
-
-def _level_of(fmu: FMU, subject: str) -> int:
-    """A program that makes many environments of an FMU is warned of each subject once."""
-    is_new = (fmu.path, subject) not in _warned
-    _warned.add((fmu.path, subject))
-    return logging.WARNING if is_new else logging.INFO
-
-
-def _tell_of_resets(fmu: FMU, verdict: Verdict, log: logging.Logger) -> None:
-    """Log the reset methods that the FMU offers but that do not work correctly."""
-    wrong = [m for m, g in verdict.resets.items() if g in (Grade.WRONG, Grade.FAILS)]
-    if not verdict.deterministic:
-        text = "%s gives other values of %s each time, even if it begins afresh"
-        log.log(_level_of(fmu, "outputs"), text, fmu.path.name, first_of(verdict.noisy))
-    if ResetMethod.RESET in wrong:
-        log.log(
-            _level_of(fmu, str(verdict.reset_method)),
-            "%s does not begin anew when it is reset; episodes begin by the method %r instead",
-            fmu.path.name,
-            str(verdict.reset_method),
-        )
-    elif verdict.resets:
-        log.info("%s: episodes begin by the method %r", fmu.path.name, str(verdict.reset_method))
-    for component, method in verdict.components_of(Candidate.of(fmu).plan).items():
-        log.info("%s: component %r begins by the method %r", fmu.path.name, component, method)

@@ -8,39 +8,48 @@ The inputs move, because that often is the only way to see that a reset forgets 
 
 from __future__ import annotations
 
-import logging
+import math
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
 
-from fmugym.archive.variable import Variable
-from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.attendant import AttendedPool
-from fmugym.pool.base import FloatArray, Pool
-from fmugym.pool.patience import require_licence
+from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.candidate import Candidate
-from fmugym.trial.inputs import moving_inputs
-from fmugym.trial.pools import trial_pool
+from fmugym.trial.episodes import Starts, start, steps
+from fmugym.trial.inputs import inputs_of_two
+from fmugym.trial.subject import Subject, TriedPool
 from fmugym.trial.verdict import Grade
 
-__all__ = ["Rehearsal", "Starts"]
+__all__ = ["Rehearsal"]
 
 _SHORT: Final = 3
 """The steps of a short episode."""
 
+_MIDDLE: Final = 30
+"""The most steps of an episode beside another instance, and the least of a long one, unless steps
+are slow."""
+
 _RESTORED: Final = 2
 """The number of the first episode that begins with a restored state."""
 
-_LONGEST: Final = 400
+_LONGEST: Final = 200
 """The most steps of a long episode."""
 
+_SURE: Final = 10
+"""The steps of which the fastest one tells how slow an FMU is; the first one may load its data."""
+
 _LONG_SECONDS: Final = 0.1
-"""The real time in seconds after which a long episode of a slow FMU ends."""
+"""How long a long episode of a slow FMU takes in seconds, if all steps are as fast as the fastest
+one, which other work on the machine has not slowed down."""
+
+_LONGEST_SECONDS: Final = 1.0
+"""The real time in seconds after which it ends, if it is not shorter than ``_MIDDLE``."""
 
 _SLOW_INITIALIZATION: Final = 2.0
 """The real time in seconds from which an initialization counts as slow."""
@@ -51,46 +60,18 @@ _AMPLITUDES: Final = (1.0, 0.1, 0.0)
 _RELATIVE_TOLERANCE: Final = 1e-4
 """The solver tolerance if neither the config nor the FMU gives one."""
 
-_NUDGE: Final = 0.01
-"""How far equal start values of two episodes are moved apart, as a fraction."""
-
 _PLAYED: Final = (Status.OK, Status.TERMINATED)
+
+_REHEARSED: Final = {
+    ResetMethod.RESTORE: "state restores",
+    ResetMethod.RESET: "resets",
+    ResetMethod.INSTANCE: "new instances",
+    ResetMethod.LIBRARY: "libraries loaded anew",
+}
+"""The reset methods, for messages."""
 
 _SLACK: Final = 10.0
 """By how many tolerances two runs of a solver may differ."""
-
-
-@dataclass(frozen=True)
-class Starts:
-    """Different start values of two episodes.
-
-    Attributes:
-        variables: The P variables that are set before initialization.
-        values: Their values, shape (P, 2).
-    """
-
-    variables: tuple[Variable, ...] = ()
-    values: tuple[tuple[float, float], ...] = ()
-
-    def column(self, index: int) -> FloatArray:
-        """The values of one episode, shape (P, 1)."""
-        return np.array(self.values, np.float64).reshape(-1, 2)[:, index : index + 1]
-
-    def apart(self) -> Starts:
-        """The same start values, but Reals that are equal in both episodes are one percent apart.
-
-        An attribute that is set later may change them, although the config does not.
-        """
-        pairs = zip(self.variables, self.values, strict=True)
-        return replace(self, values=tuple(_apart(variable, *pair) for variable, pair in pairs))
-
-
-def _apart(variable: Variable, first: float, second: float) -> tuple[float, float]:
-    if first != second or variable.kind != "real":
-        return first, second
-    distance = _NUDGE * (abs(first) or abs(variable.nominal or 1.0))
-    above, below = first + distance, first - distance
-    return first, above if above <= variable.maximum or below < variable.minimum else below
 
 
 @dataclass(frozen=True)
@@ -115,97 +96,150 @@ class Rehearsal:
     """Plays episodes of one FMU with different reset methods.
 
     Args:
-        candidate: The FMU.
+        subject: The FMU.
         spec: What to do at each reset and step.
         starts: The start values of two episodes.
 
     Attributes:
+        subject: As given.
+        spec: As given; but with a blind start if the FMU can only be played so.
+        starts: As given; but equal ones are apart if the FMU can be played so.
         noisy: The names of the outputs that two fresh instances give differently, as far as known.
+        step_seconds: The real time of the fastest step of the reference; infinite before.
         is_frugal: Whether fewer episodes are played, because initializations are slow or need
             licences.
-        reason: The FMU's message if even a fresh instance cannot play an episode, otherwise "".
+        fails_in_reading: Whether even a fresh instance cannot play an episode, because its outputs
+            cannot be read.
     """
 
-    def __init__(self, candidate: Candidate, spec: PoolSpec, starts: Starts) -> None:
-        self._candidate, self._starts = candidate, starts
-        self._spec = replace(spec, num_observed=0, leak_limit=None, fault_retries=0)
+    def __init__(self, subject: Subject, spec: PoolSpec, starts: Starts) -> None:
+        self.subject, self.spec, self.starts = subject, spec, starts
         self.noisy: tuple[str, ...] = ()
-        self.reason = ""
+        self.fails_in_reading = False
         self.is_frugal = spec.licence_wait > 0.0
-        self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs)))
+        self.step_seconds = math.inf
+        self._steps, self._inputs = 0, np.zeros((0, len(spec.inputs), 2))
         self._references: list[_Run] = []
         self._tolerances, self._knows_noise = np.full(len(spec.outputs), _tolerance_of(spec)), False
-        self._find_reference()
 
     @property
     def possible(self) -> bool:
         """Whether a fresh instance can play an episode, so that there is a reference."""
         return bool(self._references)
 
-    def _find_reference(self) -> None:
-        """Play the reference with inputs that move as far as the FMU tolerates."""
+    def find_reference(self) -> None:
+        """Play the reference with inputs that move as far as the FMU tolerates.
+
+        Raises:
+            DeathError: If the process of a fresh instance does not survive that.
+            LicenceError: If it gets no licence.
+            FMULoadError: If it cannot be made.
+        """
+        given = self.spec
+        for blind in (False, True):
+            self.spec = replace(given, blind_start=blind)
+            failure = self._find_reference()
+            self.fails_in_reading = "reading the outputs" in failure
+            if not self.fails_in_reading:
+                return
+        self.spec = given
+
+    def _find_reference(self) -> str:
+        """Play with inputs that move less and less; returns the failure that stays."""
         for amplitude in _AMPLITUDES:
-            self._inputs = moving_inputs(self._spec, _LONGEST, amplitude)
+            self._inputs = inputs_of_two(self.spec, _LONGEST, amplitude)
             self._steps = _LONGEST
             first = self._play_fresh(0, measured=True)
             if first.status in _PLAYED:
-                self._references = [first, self._play_with_other_starts()]
-                return
-            self.reason = first.failure
+                self._references = [first, self._play_with_other_starts(first)]
+                return ""
+            if len(first.rows) == 1:  # it has not been stepped
+                break
+        return first.failure
 
-    def _play_with_other_starts(self) -> _Run:
-        """Move equal start values apart, unless the FMU does not play with what comes out."""
-        given, self._starts = self._starts, self._starts.apart()
+    def step_once(self) -> None:
+        """Let a fresh instance do one step, and free it; it raises what ``find_reference`` does."""
+        with self._open("the first step", ResetMethod.RESET) as pool:
+            self._play(pool, 0, 1)
+
+    def _play_with_other_starts(self, first: _Run) -> _Run:
+        """Move equal start values apart, unless the FMU does not play with what comes out.
+
+        Args:
+            first: The episode with the first start values.
+        """
+        given, self.starts = self.starts, self.starts.apart()
+        if all(one == other for one, other in self.starts.values):
+            return first
         run = self._play_fresh(1)
-        if run.status in _PLAYED or self._starts == given:
+        if run.status in _PLAYED or self.starts == given:
             return run
-        self._starts = given
+        self.starts = given
         return self._play_fresh(1)
 
     def _compare_fresh_instances(self) -> None:
         """Find out, when an episode first differs, whether fresh instances differ as well."""
         self._knows_noise = True
+        first = self._references[0]
         again = self._play_fresh(0)
-        if not _same(again, self._references[0]):
-            noise = _difference(again.rows, self._references[0].rows)
-            names = [variable.name for variable in self._spec.outputs]
-            found = [name for name, own in zip(names, noise, strict=True) if own > 0.0]
-            self.noisy = tuple(found or names)
-            self._tolerances = np.maximum(self._tolerances, _SLACK * noise)
+        if _same(again, first):
+            return
+        noise = _difference(again.rows, first.rows)
+        names = [variable.name for variable in self.spec.outputs]
+        found = [name for name, own in zip(names, noise, strict=True) if own > 0.0]
+        self.noisy = tuple(found or names)
+        for run in self._play_afresh_in_one_process():
+            noise = np.where(noise > 0.0, np.maximum(noise, _difference(run.rows, first.rows)), 0.0)
+        self._tolerances = np.maximum(self._tolerances, _SLACK * noise)
 
-    def _play_fresh(self, start: int, *, measured: bool = False) -> _Run:
-        pool = self._open(ResetMethod.RESET)
-        try:
-            return self._play(pool, start, self._steps, measured=measured)
-        finally:
-            pool.close()
+    def _play_afresh_in_one_process(self) -> list[_Run]:
+        """Play the first episode twice; what differs each time may depend on a process's age."""
+        reloads = self.subject.can_copy_libraries
+        method = ResetMethod.LIBRARY if reloads else ResetMethod.INSTANCE
+        with self._open("the search for noise", method) as pool:
+            return [self._play(pool, 0, self._steps) for _ in range(2)]
 
-    def _open(self, method: ResetMethod, components: tuple[ResetMethod, ...] = ()) -> AttendedPool:
-        log = logging.getLogger(__name__)
-        spec = replace(self._spec, reset_method=method, component_resets=components)
-        return trial_pool(self._candidate.open(), spec, 1, log, private_libraries=spec.reloads)
+    def _play_fresh(self, index: int, *, measured: bool = False) -> _Run:
+        with self._open("the episode of a fresh instance", ResetMethod.RESET) as pool:
+            return self._play(pool, index, self._steps, measured=measured)
 
-    def _play(self, pool: Pool, start: int, steps: int, *, measured: bool = False) -> _Run:
-        """Play one episode; a measured one determines how many steps a long episode has."""
-        begin = time.perf_counter()
-        outputs, statuses = pool.reset(self._starts.variables, self._starts.column(start))
-        require_licence(pool)
+    def _open(
+        self,
+        stage: str,
+        method: ResetMethod,
+        components: tuple[ResetMethod, ...] = (),
+        num_instances: int = 1,
+        private_libraries: bool = False,
+    ) -> AbstractContextManager[TriedPool]:
+        spec = replace(self.spec, reset_method=method, component_resets=components)
+        private = private_libraries or spec.reloads
+        return self.subject.pool(stage, spec, num_instances, private_libraries=private)
+
+    def _play(self, pool: TriedPool, index: int, count: int, *, measured: bool = False) -> _Run:
+        """Play one episode; a measured one determines how many steps a long episode has.
+
+        A second instance gets other inputs and start values.
+        """
+        begin, instances = time.perf_counter(), range(pool.num_instances)
+        rows = [start(pool, self.starts, *[index ^ i for i in instances])[:, 0]]
         now = time.perf_counter()
-        deadline = now + _LONG_SECONDS
-        if measured and now - begin > _SLOW_INITIALIZATION:
-            self.is_frugal = True
-        rows = [outputs[:, 0].copy()]
-        for row in self._inputs[:steps]:
-            if statuses[0] > WARNING_CODE:
-                break
-            outputs, statuses = pool.step(row[:, None])
-            rows.append(outputs[:, 0].copy())
-            if measured and time.perf_counter() > deadline:
+        self.is_frugal |= measured and now - begin > _SLOW_INITIALIZATION
+        deadline, fastest = now + _LONGEST_SECONDS, math.inf
+        for outputs in steps(pool, self._inputs[:count, :, instances]):
+            rows.append(outputs[:, 0])
+            before, now = now, time.perf_counter()
+            fastest = min(fastest, now - before)
+            is_late, is_slow = now > deadline, len(rows) * fastest > _LONG_SECONDS
+            least = _MIDDLE if not is_slow else 0 if is_late else _SURE
+            if measured and (is_late or is_slow) and len(rows) > least:
                 self._steps = len(rows) - 1
                 break
-        if statuses[0] <= WARNING_CODE:
+        if measured:
+            self.step_seconds = fastest
+        status = int(pool.statuses[0])
+        if status <= WARNING_CODE:
             return _Run(np.array(rows), Status.OK)
-        return _Run(np.array(rows), int(statuses[0]), pool.failure(0))
+        return _Run(np.array(rows), status, pool.failure(0))
 
     def grade(self, method: ResetMethod, components: tuple[ResetMethod, ...] = ()) -> Grade:
         """Play several episodes with one instance and compare each with a fresh one.
@@ -217,19 +251,78 @@ class Rehearsal:
         Returns:
             The worst grade of all episodes.
         """
-        try:
-            pool = self._open(method, components)
-        except LicenceError:
-            raise
-        except FMUGymError:
-            return Grade.FAILS
-        try:
-            is_system = self._candidate.plan is not None
-            return self._worst_grade(pool, restores=is_system and method is ResetMethod.RESTORE)
-        finally:
-            pool.close()
+        stage = f"the rehearsal of {_REHEARSED[method]}"
+        if components:
+            stage = f"the rehearsal of resets by component ({', '.join(components)})"
+        is_system = bool(self.subject.fmu.description.components)
 
-    def _worst_grade(self, pool: AttendedPool, *, restores: bool = False) -> Grade:
+        def worst_grade() -> Grade:
+            with self._open(stage, method, components) as pool:
+                return self._worst_grade(pool, restores=is_system and method is ResetMethod.RESTORE)
+
+        return self.subject.attempt(worst_grade, refused=Grade.FAILS, died=Grade.FAILS)
+
+    def is_disturbed(
+        self,
+        method: ResetMethod,
+        components: tuple[ResetMethod, ...],
+        *,
+        private_libraries: bool = False,
+    ) -> bool:
+        """Compare an instance alone with one beside another that gets other values.
+
+        There are several episodes, since an instance may spoil the saved states of another. FMUs
+        may still share things outside their library: files, other libraries, licences.
+
+        Args:
+            method: As for ``grade``.
+            components: As for ``grade``.
+            private_libraries: Whether each instance has a copy of the library.
+        """
+        play = partial(self._play_beside, method, components, private_libraries)
+
+        def compare() -> bool:
+            beside = play(2)
+            if beside and all(map(self._is_as_fresh, beside)):
+                return False
+            alone = play(1)  # it may begin its later episodes in other ways than a fresh one
+            return len(alone) != len(beside) or any(map(self._differ, alone, beside))
+
+        return self.subject.attempt(compare, refused=False, died=True)
+
+    def _play_beside(
+        self,
+        method: ResetMethod,
+        components: tuple[ResetMethod, ...],
+        private_libraries: bool,
+        num_instances: int,
+    ) -> list[_Run]:
+        """Play three episodes; none if the process dies, or the FMU refuses."""
+        what = "copy of the library" if private_libraries else "instance"
+        stage = f"the comparison with a second {what}"
+
+        def play() -> list[_Run]:
+            with self._open(stage, method, components, num_instances, private_libraries) as pool:
+                lengths = (min(_MIDDLE, self._steps), _SHORT, _SHORT)
+                return [self._play(pool, 0, length) for length in lengths]
+
+        return self.subject.attempt(play, refused=[], died=[])
+
+    def _is_as_fresh(self, run: _Run) -> bool:
+        return _same(run, self._references[0].cut(len(run.rows) - 1))
+
+    def _differ(self, one: _Run, other: _Run) -> bool:
+        """Whether two runs differ in an output that fresh instances give alike."""
+        if _same(one, other):
+            return False
+        if not self._knows_noise:
+            self._compare_fresh_instances()
+        steady = [variable.name not in self.noisy for variable in self.spec.outputs]
+        kept = np.array(steady) | (not any(steady))
+        same = one.rows[:, kept].tobytes() == other.rows[:, kept].tobytes()
+        return not same or one.status != other.status
+
+    def _worst_grade(self, pool: TriedPool, *, restores: bool) -> Grade:
         """Grade episodes.
 
         Args:
@@ -238,16 +331,14 @@ class Rehearsal:
                 components that are not to blame can be restored all the same; of a single FMU, the
                 initialization that takes the place of a restore is as good as any.
         """
-        from fmugym import _native
-
         worst = Grade.BITWISE
-        for number, (start, steps) in enumerate(self._episodes()):
-            before = _native.initializations()
-            run = self._play(pool, start, steps)
-            is_new = _native.initializations() > before
+        for number, (index, count) in enumerate(self._episodes()):
+            before = pool.initializations
+            run = self._play(pool, index, count)
+            is_new = pool.initializations > before
             if restores and number == _RESTORED and is_new:
                 return Grade.WRONG
-            grade = self._compare(run, self._references[start].cut(steps))
+            grade = self._compare(run, self._references[index].cut(count))
             if grade in (Grade.WRONG, Grade.FAILS):
                 return grade
             worst = Grade.TOLERANCE if Grade.TOLERANCE in (grade, worst) else worst

@@ -1,76 +1,57 @@
-"""The first trial of an FMU, in a process that it may crash.
+"""The first trial of an FMU, in processes that it may crash.
 
-An FMU is native code: a fault in it ends the process that loads it. So a worker process
-(``fmugym.trial.worker``) loads, instantiates, initializes and steps an unknown FMU once before this
-process touches it. Success is cached by the file's content. Failures are not cached: a missing
-licence may return.
+An FMU is native code: a fault in it ends the process that loads it. So worker processes load,
+instantiate, initialize and step an unknown FMU before this process touches it. Success is cached by
+the file's content. Failures are not cached: a missing licence may return.
 
-A process protects from accidents but not from malice: the worker has all the rights of its user.
+A process protects from accidents but not from malice: a worker has all the rights of its user.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMULoadError, LicenceError
+from fmugym.errors import FMULoadError, LicenceError, SimulationError
 from fmugym.pool.patience import speaks_of_licence
-from fmugym.pool.spec import ResetMethod
-from fmugym.trial.attempt import Outcome, Request, Stage, run
-from fmugym.trial.cache import recall, remember
-from fmugym.trial.candidate import Candidate, content_key, verdict_key
-from fmugym.trial.known import known_verdict, with_harm
-from fmugym.trial.seats import taking
+from fmugym.pool.process.supervisor import WorkerError
+from fmugym.pool.rungs import find_rungs, offers_of
+from fmugym.pool.seats import taking
+from fmugym.pool.spec import PoolSpec, ResetMethod
+from fmugym.trial.episodes import Starts, start
+from fmugym.trial.known import content_key, recall, remember, verdict_key, with_harm
+from fmugym.trial.neighbours import need_in_turn, need_of_several
+from fmugym.trial.rehearsal import Rehearsal
+from fmugym.trial.subject import CLOSING, STEP, DeathError, Subject
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
-__all__ = ["examine", "meet"]
+__all__ = ["compare", "examine"]
 
 logger = logging.getLogger(__name__)
 
-_ALONE: Final = {
-    *("loading and instantiation", "initialization", "the first step", "closing"),
-    *(Stage.REFERENCE, Stage.SHARED_DATA),
-}
-"""The stages of a fresh instance. If a worker ends there only when memory is checked, the FMU
-writes to memory that it must not touch."""
-
-
-def meet(fmu: FMU) -> None:
-    """Make sure that a process has loaded and stepped an FMU and survived.
-
-    Every function that loads an FMU into this process calls this first.
-
-    Args:
-        fmu: The FMU; this does not extract it.
-
-    Raises:
-        FMULoadError: If the process did not survive. The text has the reason and the last lines.
-        LicenceError: If the FMU got no licence.
-    """
-    candidate = Candidate.of(fmu)
-    if not candidate.exempt and known_verdict(fmu) is None:
-        _examine(Request(candidate), must_survive=True)
+_MOST_UNREADABLE: Final = 5
+"""The most outputs that a verdict names because they cannot be read."""
 
 
 def examine(
-    candidate: Candidate,
-    spec: Any,
-    starts: Any = None,
+    fmu: FMU,
+    spec: PoolSpec,
+    starts: Starts | None = None,
     *,
     several: bool = False,
-    alone: bool = False,
     must_survive: bool = True,
 ) -> Verdict:
-    """Find out in worker processes how to treat an FMU; includes ``meet``.
+    """Find out in worker processes how to treat an FMU.
 
     Args:
-        candidate: The FMU, exempt or not.
-        spec: The ``PoolSpec`` to try it with.
-        starts: The ``Starts`` of two episodes, or None.
+        fmu: The FMU; this does not extract it.
+        spec: What to do at each reset and step.
+        starts: The start values of two episodes; by default those of the FMU.
         several: Whether to try several instances.
-        alone: Whether it is known that instances must not share a copy of the library.
         must_survive: Whether it is an error if a lone instance ends the process. If not, the
             verdict asks for isolation.
 
@@ -78,131 +59,170 @@ def examine(
         The verdict, from the cache if the same request was made before.
 
     Raises:
-        FMULoadError: As ``meet``, if ``must_survive``.
+        FMULoadError: If a process does not survive a single instance, and ``must_survive``. The
+            text has the reason and the last lines.
         LicenceError: If an instance got no licence.
     """
-    key = verdict_key(candidate, spec, starts)
+    key = verdict_key(fmu, spec, starts)
     known = Verdict.from_text(recall(key))
     if known is not None and (known.neighbours is not None or not several):
-        return with_harm(known, candidate)
-    request = Request(candidate, spec, starts, several, alone)
-    if known is not None and known.complete:
-        request = replace(request, known=known, check_memory=not known.isolate)
-    with taking(candidate, spec, 2 if several else 1, "a trial"):
-        found = _examine(request, must_survive)
-    if found.complete:
-        remember(key, found.to_text())
-    return found
-
-
-def _examine(request: Request, must_survive: bool) -> Verdict:
-    """Start workers until one finishes. Each skips the stages in which earlier ones crashed."""
-    name, notes = request.candidate.path.name, _Notes()
-    while True:
-        outcome = run(request)
-        if outcome.stage is None:
-            logger.warning("%s could not be tried before: it %s%s", name, outcome.end, outcome.said)
-            return Verdict()
-        notes.add(outcome)
-        _require_licence(name, outcome)
-        if "finished" in outcome.answer:
-            break
-        if outcome.stage in _ALONE and request.check_memory and outcome.shows_memory_error:
-            request = replace(request, check_memory=False)
-        elif "complete" not in outcome.answer:
-            return notes.died_alone(name, must_survive)
-        elif outcome.stage in request.skip:  # it dies outside the requested stages
-            break
-        else:
-            request = replace(request, skip=request.skip | {outcome.stage})
-    verdict = notes.verdict
-    if request.known is not None:
-        verdict = _completed(request.known, verdict)
-    verdict = with_harm(verdict, request.candidate)
+        return with_harm(known, fmu)
+    subject = Subject(fmu)
+    rehearsal = Rehearsal(subject, spec, starts or Starts())
+    with taking(fmu, spec, 2 if several else 1, "a trial"), _naming(subject):
+        verdict = _of_one(rehearsal, known or Verdict(), must_survive=must_survive)
+        if several and verdict.complete:
+            verdict = replace(verdict, neighbours=need_of_several(rehearsal, verdict))
+    verdict = replace(
+        verdict,
+        isolate=verdict.isolate or subject.is_harmful,
+        instances=subject.instances,
+        initializations=verdict.initializations + subject.initializations,
+        reasons=tuple(dict.fromkeys((*verdict.reasons, *subject.reasons))),
+    )
     logger.info(
         "%s was tried with %d instance(s) at once at most, and %d initialization(s) in all",
-        *(name, verdict.instances, verdict.initializations),
+        *(fmu.path.name, verdict.instances, verdict.initializations),
     )
+    verdict = with_harm(verdict, fmu)
     if verdict.complete:
-        remember(content_key(request.candidate), verdict.to_text())
+        remember(content_key(fmu), verdict.to_text())
+        remember(key, verdict.to_text())
     return verdict
 
 
-def _completed(known: Verdict, found: Verdict) -> Verdict:
-    """Add to a verdict what several instances need."""
-    return replace(
-        known,
-        neighbours=found.neighbours,
-        instances=found.instances,
-        initializations=known.initializations + found.initializations,
-        reasons=tuple(dict.fromkeys((*known.reasons, *found.reasons))),
-    )
+def compare(fmu: FMU, spec: PoolSpec, starts: Starts | None = None) -> Verdict:
+    """Find out whether instances disturb each other in turn, and no more.
 
-
-def _require_licence(name: str, outcome: Outcome) -> None:
-    """Give up if an instance got no licence: this tells nothing about the FMU itself.
+    Args:
+        fmu: An FMU that is exempt from trials.
+        spec: What to do at each reset and step.
+        starts: The start values of two instances; by default those of the FMU.
 
     Raises:
-        LicenceError: With the FMU's words.
+        LicenceError: If an instance got no licence.
     """
-    answer, said = outcome.answer, outcome.said
-    words = answer.get("refused", "")
-    if "finished" not in answer and "complete" in answer and speaks_of_licence(said):
-        words = f"it {outcome.end}{said}"
-    if words:
+    key = f"{verdict_key(fmu, spec, starts)}-in-turn"
+    known = Verdict.from_text(recall(key))
+    if known is not None:
+        return known
+    subject = Subject(fmu)
+
+    def need() -> Neighbours:
+        rehearsal = Rehearsal(subject, spec, starts or Starts())
+        rehearsal.find_reference()
+        return need_in_turn(rehearsal, ResetMethod.INSTANCE)
+
+    unknown = Neighbours.INDEPENDENT
+    with taking(fmu, spec, 2, "a trial"), _naming(subject):
+        found = Verdict(neighbours=subject.attempt(need, refused=unknown, died=unknown))
+    remember(key, found.to_text())
+    return found
+
+
+@contextmanager
+def _naming(subject: Subject) -> Iterator[None]:
+    """Name the FMU and what the trial has used if an instance gets no licence."""
+    try:
+        yield
+    except LicenceError as error:
         raise LicenceError(
-            f"{name} got no licence in its trial, which used {answer['instances']} "
-            f"instance(s) at once: {words}"
+            f"{subject.fmu.path.name} got no licence in its trial, which used "
+            f"{subject.instances} instance(s) at once: {error}"
+        ) from None
+
+
+def _of_one(rehearsal: Rehearsal, known: Verdict, *, must_survive: bool) -> Verdict:
+    """Find out what a lone instance shows, as far as that is not known."""
+    subject, name = rehearsal.subject, rehearsal.subject.fmu.path.name
+    subject.checks_heap &= not known.isolate
+    try:
+        _survive(rehearsal)
+        if known.complete:
+            return known
+        verdict = Verdict(complete=True, blind_start=rehearsal.spec.blind_start)
+        if rehearsal.possible:
+            return _with_resets(verdict, rehearsal)
+        return replace(verdict, unreadable=tuple(_unreadable(rehearsal)))
+    except DeathError as death:
+        if not must_survive:
+            subject.note(death, alone=True)
+            return Verdict(neighbours=Neighbours.PROCESSES)
+        text = (
+            f"{name} cannot be used: in {death.call} {death}. That was a trial in a process of its "
+            "own; probe_timeout=None turns it off"
         )
+        raise LicenceError(text) if speaks_of_licence(text) else FMULoadError(text) from None
+    except WorkerError as error:
+        logger.warning("%s could not be tried before: %s", name, error)
+        return Verdict()
+    except LicenceError:
+        raise
+    except FMULoadError:  # the process is alive, and the caller will get the error too
+        return Verdict()
 
 
-class _Notes:
-    """The findings of the workers of one trial."""
+def _survive(rehearsal: Rehearsal) -> None:
+    """Let fresh instances play, with checked heaps at first; note whether that does harm.
 
-    def __init__(self) -> None:
-        self._answer: dict[str, Any] = {}
-        self._deaths: list[Outcome] = []
-        self._initializations = 0
+    Raises:
+        DeathError: If a process does not even survive one step.
+    """
+    subject = rehearsal.subject
+    try:
+        rehearsal.find_reference()
+    except DeathError as death:
+        only_checked = subject.checks_heap and death.shows_memory_error
+        if death.call not in (STEP, CLOSING) and not only_checked:
+            raise
+        subject.note(death, alone=True)
+        if only_checked:  # it might live on without the checks
+            subject.checks_heap = False
+            _survive(rehearsal)
+        elif death.call == CLOSING:
+            rehearsal.step_once()
 
-    def add(self, outcome: Outcome) -> None:
-        """Record the answer of a worker, and how it ended if it did not finish."""
-        self._answer |= outcome.answer
-        self._initializations += int(outcome.answer.get("initializations", 0))
-        if "finished" not in outcome.answer:
-            self._deaths.append(outcome)
 
-    @property
-    def verdict(self) -> Verdict:
-        """The verdict as far as it is known."""
-        answer = self._answer
-        neighbours = answer.get("neighbours")
-        return Verdict(
-            complete=bool(answer.get("complete")),
-            noisy=tuple(answer.get("noisy", ())),
-            resets={ResetMethod(m): Grade(g) for m, g in answer.get("resets", {}).items()},
-            components=tuple(map(ResetMethod, answer.get("components", ()))),
-            neighbours=None if neighbours is None else Neighbours(neighbours),
-            instances=int(answer.get("instances", 1)),
-            initializations=self._initializations,
-            blind_start=bool(answer.get("blind_start")),
-            unreadable=tuple(answer.get("unreadable", ())),
-            isolate=any(death.stage in _ALONE for death in self._deaths),
-            reasons=(FRUGAL,) * bool(answer.get("frugal"))
-            + tuple(f"in {d.stage} it {d.end}{d.said}" for d in self._deaths),
-        )
+def _unreadable(rehearsal: Rehearsal) -> Iterator[str]:
+    """Find the first outputs that cannot be read after an initialization."""
+    if not rehearsal.fails_in_reading:
+        return
+    spec, left = replace(rehearsal.spec, outputs=(), samplings=()), _MOST_UNREADABLE
+    with rehearsal.subject.pool("the search for outputs that cannot be read", spec) as pool:
+        start(pool, rehearsal.starts, 0)
+        for variable in rehearsal.spec.outputs:
+            try:
+                pool.read((variable,))
+            except SimulationError:
+                yield variable.name
+                left -= 1
+                if not left:
+                    return
+                start(pool, rehearsal.starts, 0)
 
-    def died_alone(self, name: str, must_survive: bool) -> Verdict:
-        """Report that even a lone instance dies, or that it needs a separate process.
 
-        Raises:
-            FMULoadError: If ``must_survive``.
-            LicenceError: If it also speaks of a licence.
-        """
-        last = self._deaths[-1]
-        if must_survive:
-            text = (
-                f"{name} cannot be used: in {last.stage} it {last.end}{last.said}. That was a "
-                "trial in a process of its own; probe_timeout=None turns it off"
-            )
-            raise LicenceError(text) if speaks_of_licence(last.said) else FMULoadError(text)
-        return replace(self.verdict, isolate=True, neighbours=Neighbours.PROCESSES)
+def _with_resets(verdict: Verdict, rehearsal: Rehearsal) -> Verdict:
+    """Grade the reset methods, fastest first, until one is exact to the last bit."""
+    able = rehearsal.subject.fmu.description.capabilities.can_get_and_set_fmu_state
+    methods = [ResetMethod.RESTORE] if able else []
+    methods += [ResetMethod.RESET, ResetMethod.INSTANCE]
+    methods += [ResetMethod.LIBRARY] if rehearsal.subject.can_copy_libraries else []
+    grades: dict[ResetMethod, Grade] = {}
+    for method in methods:
+        grades[method] = rehearsal.grade(method)
+        if grades[method] is Grade.BITWISE:
+            break
+    frugal = (FRUGAL,) * rehearsal.is_frugal
+    verdict = replace(verdict, resets=grades, noisy=rehearsal.noisy, reasons=frugal)
+    return replace(verdict, components=_components(verdict, rehearsal))
+
+
+def _components(verdict: Verdict, rehearsal: Rehearsal) -> tuple[ResetMethod, ...]:
+    """Find a method for each component of a system that does not begin anew by restores."""
+    base, subject = verdict.reset_method, rehearsal.subject
+    parts = subject.fmu.description.components
+    tried = verdict.resets.get(base) is Grade.BITWISE and base is not ResetMethod.RESTORE
+    if not tried or rehearsal.is_frugal or not parts:
+        return ()
+    offers = [offers_of(part, reloads=subject.can_copy_libraries) for part in parts]
+    return find_rungs(offers, base, lambda found: rehearsal.grade(base, found) is Grade.BITWISE)

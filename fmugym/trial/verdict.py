@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
-from typing import Any, Final
+from typing import Final
 
 from fmugym.pool.spec import ResetMethod
 from fmugym.systems.plan import SystemPlan
 
 __all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 
-_FORMAT: Final = 6
+_FORMAT: Final = 7
 
 FRUGAL: Final = (
     "its initializations are slow or need licences, so no episode returned to earlier start values"
@@ -32,8 +32,6 @@ class Grade(StrEnum):
     """The outputs differ, or an episode ends too early."""
     FAILS = "fails"
     """The FMU returned an error or crashed its process."""
-    ABSENT = "absent"
-    """The FMU does not offer the reset method."""
 
 
 class Neighbours(StrEnum):
@@ -103,57 +101,27 @@ class Verdict:
 
     def to_text(self) -> str:
         """Write the verdict as JSON."""
-        return json.dumps(
-            {
-                "format": _FORMAT,
-                "complete": self.complete,
-                "noisy": list(self.noisy),
-                "resets": {str(method): str(grade) for method, grade in self.resets.items()},
-                "components": [str(method) for method in self.components],
-                "neighbours": None if self.neighbours is None else str(self.neighbours),
-                "isolate": self.isolate,
-                "blind_start": self.blind_start,
-                "unreadable": list(self.unreadable),
-                "instances": self.instances,
-                "initializations": self.initializations,
-                "reasons": list(self.reasons),
-            }
-        )
+        return json.dumps({"format": _FORMAT} | asdict(self))
 
     @classmethod
     def from_text(cls, text: str | None) -> Verdict | None:
         """Read a verdict; return None for any text that ``to_text`` would not write."""
         try:
-            return cls._from_data(json.loads(text or ""))
+            data = json.loads(text or "")
+            neighbours = data["neighbours"]
+            verdict = cls(
+                complete=bool(data["complete"]),
+                noisy=tuple(map(str, data["noisy"])),
+                resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
+                components=tuple(map(ResetMethod, data["components"])),
+                neighbours=None if neighbours is None else Neighbours(neighbours),
+                isolate=bool(data["isolate"]),
+                blind_start=bool(data["blind_start"]),
+                unreadable=tuple(map(str, data["unreadable"])),
+                instances=int(data["instances"]),
+                initializations=int(data["initializations"]),
+                reasons=tuple(map(str, data["reasons"])),
+            )
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return None
-
-    @classmethod
-    def _from_data(cls, data: dict[str, Any]) -> Verdict | None:
-        names = ("complete", "isolate", "blind_start")
-        flags = [data[name] for name in names]
-        reasons, unreadable, noisy = data["reasons"], data["unreadable"], data["noisy"]
-        if data["format"] != _FORMAT or not all(isinstance(flag, bool) for flag in flags):
-            return None
-        if data["instances"] not in (1, 2):
-            return None
-        if not all(map(_are_texts, (reasons, unreadable, noisy))):
-            return None
-        given = data["neighbours"]
-        return cls(
-            complete=flags[0],
-            noisy=tuple(noisy),
-            resets={ResetMethod(m): Grade(g) for m, g in data["resets"].items()},
-            components=tuple(map(ResetMethod, data["components"])),
-            neighbours=None if given is None else Neighbours(given),
-            isolate=flags[1],
-            blind_start=flags[2],
-            unreadable=tuple(unreadable),
-            instances=data["instances"],
-            initializations=int(data["initializations"]),
-            reasons=tuple(reasons),
-        )
-
-
-def _are_texts(data: Any) -> bool:
-    return isinstance(data, list) and all(isinstance(one, str) for one in data)
+        return verdict if verdict.to_text() == text else None

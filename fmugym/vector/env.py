@@ -71,7 +71,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             results. ``"compiled"`` has the native pool run hooks that can be traced,
             ``"array"`` calls them once for all environments, ``"per_env"`` one environment at a
             time; each is an error where it is not possible.
-        pool_options: Passed to ``fmugym.trial.opening.make_pool``: ``backend``, ``threads``,
+        pool_options: Wishes of ``fmugym.pool.wishes.Wishes``: ``backend``, ``threads``,
             ``private_libraries``, ``isolation``, ``workers``, ``call_timeout``.
 
     Attributes:

@@ -12,7 +12,21 @@
 #include <sys/prctl.h>
 #endif
 #if !defined _WIN32
+#include <fcntl.h>
 #include <unistd.h>
+
+enum { OUT_OF_REACH = 512 };
+
+/* Gives a file descriptor a number that FMUs do not close by mistake, if there are so many. */
+static int moved(int descriptor) {
+    const int copy = fcntl(descriptor, F_DUPFD_CLOEXEC, OUT_OF_REACH);
+
+    if (copy < 0) {
+        return descriptor;
+    }
+    close(descriptor);
+    return copy;
+}
 #endif
 
 static void open_channel(Channel *channel, long long descriptor) {
@@ -20,7 +34,7 @@ static void open_channel(Channel *channel, long long descriptor) {
     channel->input = channel->output = (void *)(uintptr_t)descriptor;
     channel->is_socket = true;
 #else
-    channel->socket = (int)descriptor;
+    channel->socket = moved((int)descriptor);
 #endif
 }
 

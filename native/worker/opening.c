@@ -175,6 +175,16 @@ static void take_over_outputs(Worker *w) {
     }
 }
 
+/* Unseeded random numbers are the same in all workers otherwise. */
+static void draw_other_numbers(int64_t seed) {
+    if (seed != 0) {
+        srand((unsigned)seed);
+#if !defined _WIN32
+        srand48((long)seed);
+#endif
+    }
+}
+
 /* Returns why it did not work, or NULL. */
 static const char *open_all(Worker *w, Reader *reader, char *error, size_t size) {
     const Block form = read_block(reader);
@@ -182,6 +192,7 @@ static const char *open_all(Worker *w, Reader *reader, char *error, size_t size)
 
     fault = fault == NULL ? opening_take(&w->opening, form.bytes, form.size) : fault;
     fault = fault == NULL ? open_shared(w, reader) : fault;
+    draw_other_numbers(read_integer(reader));
     fault = fault == NULL ? allocate(w) : fault;
     fault = fault == NULL ? load_all_before(reader, error, size) : fault;
     return fault == NULL ? reader->fault : fault;

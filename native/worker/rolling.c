@@ -20,8 +20,6 @@ struct Rolling {
     Row *rows; /* all */
     size_t number_of_rows;
     RowCopy *copies;
-    InputStart *input_starts; /* of episodes that have ended: nobody reads what they start with */
-    Draws draws;              /* none */
     uint8_t *ended;
 };
 
@@ -42,7 +40,6 @@ static void rolling_drop(Rolling *r) {
     free(r->others);
     free(r->rows);
     free(r->copies);
-    free(r->input_starts);
     free(r->ended);
     free(r);
 }
@@ -167,12 +164,10 @@ static void settle(Worker *w, Rolling *r) {
     play->judgement = r->judgement.program;
     play->source.statuses = w->statuses;
     play->input_rows = r->input_rows;
-    play->input_starts = r->input_starts = zeros(s->inputs->count * sizeof *r->input_starts);
     play->number_of_inputs = s->inputs->count;
     play->output_rows = w->output_values;
     play->kept_rows = r->kept;
     play->number_of_outputs = s->outputs->count;
-    play->draws = &r->draws;
     play->step_counts = w->shared.progress;
     play->ended = r->ended = zeros(s->count);
 }

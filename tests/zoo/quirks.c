@@ -212,6 +212,9 @@ int zoo_step(Animal *me, double step_size, bool no_set_state) {
     while (me->hangs) {
         sleep(1);
     }
+    if (is(me, "stops, slow at first") && me->values[CALLS] == 0.0) {
+        usleep(200000); /* as a library does that loads its data then */
+    }
     if (!me->stopped) {
         integrate(me, step_size);
         corrupt(me);
@@ -281,7 +284,7 @@ int zoo_reset(Animal *me) {
         me->values[GAIN] = before.values[GAIN];
     } else if (is(me, "reset keeps the time")) {
         me->values[CLOCK] = before.values[CLOCK];
-    } else if (is(me, "stops, reset keeps that")) {
+    } else if (is(me, "stops, reset keeps that") || is(me, "stops, slow at first")) {
         me->stopped = before.stopped;
     } else if (is(me, "reset frees twice")) {
         free(me->numbers);

@@ -7,7 +7,7 @@ import os
 import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -17,13 +17,18 @@ from fmugym.fmi.status import Status
 from fmugym.pool.base import MaskArray
 from fmugym.pool.health import Column
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Arrays, Memory
-from fmugym.pool.process.supervisor import INSTANTIATION, LostError, Supervisor, patience_with
+from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.process.supervisor import (
+    INSTANTIATION,
+    Loss,
+    LostError,
+    RefusedError,
+    Supervisor,
+    WorkerError,
+    patience_with,
+)
 
 __all__ = ["Crew"]
-
-_CLOSING_TIME: Final = 5.0
-"""How long workers may take to free their instances, in seconds."""
 
 _crews: weakref.WeakSet[Crew] = weakref.WeakSet()
 
@@ -35,11 +40,12 @@ class Crew:
         fmu: The FMU; closed with the crew.
         setups: What each worker needs to know.
         memory: Shared with the workers; closed with the crew.
-        arrays: Those of all instances, in this memory.
         log: Gets the FMU's messages.
         call_timeout: How long a call may take, in seconds; infinite for ever.
+        closing_time: How long workers may take to free their instances at the end, in seconds.
 
     Attributes:
+        call_timeout: As given; it may change from call to call.
         supervisors: One for each worker, in the order of the instances.
         lost: Which instances have no process, or were not reset since it started, shape (N,).
         any_lost: Whether there are any.
@@ -55,17 +61,16 @@ class Crew:
         fmu: FMU,
         setups: Sequence[Setup],
         memory: Memory,
-        arrays: Arrays,
         log: logging.Logger,
         call_timeout: float,
+        closing_time: float,
     ) -> None:
         self.supervisors = [Supervisor(setup, memory, log) for setup in setups]
-        self.lost: MaskArray = np.zeros(len(arrays.statuses), np.bool_)
+        self.lost: MaskArray = np.zeros(len(memory.arrays.statuses), np.bool_)
         self.refusal = ""
-        self._arrays, self._call_timeout = arrays, call_timeout
+        self._arrays, self.call_timeout = memory.arrays, call_timeout
         self.note_lost()
-        patience = min(_CLOSING_TIME, call_timeout)
-        self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, patience)
+        self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, closing_time)
         _crews.add(self)
         self._open()
 
@@ -78,15 +83,25 @@ class Crew:
                 supervisor.confirm()
             for supervisor in self.supervisors:
                 supervisor.finish_opening(self._deadline(INSTANTIATION))
+        except RefusedError as refusal:
+            self.close()
+            raise FMULoadError(str(refusal)) from None
         except LostError as lost:
             self.close()
-            raise FMULoadError(str(lost)) from None
+            error = WorkerError(str(lost))
+            error.loss = next(iter(self.losses), None)
+            raise error from None
         except BaseException:
             self.close()
             raise
 
+    @property
+    def losses(self) -> list[Loss]:
+        """How processes died or hung."""
+        return [loss for supervisor in self.supervisors for loss in supervisor.losses]
+
     def _deadline(self, doing: str) -> float:
-        return time.monotonic() + self._call_timeout * patience_with(doing)
+        return time.monotonic() + self.call_timeout * patience_with(doing)
 
     def run(
         self,

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import signal
-import threading
-from collections import deque
-from typing import BinaryIO, Final
+from typing import Final
 
 from fmugym.errors import printable
 
-__all__ = ["OutputTail", "describe_exit", "lines_of_echo"]
+__all__ = ["describe_exit", "lines_of_echo"]
 
 _LINES: Final = 10
-_LINE_LENGTH: Final = 300
 
 
 def describe_exit(return_code: int) -> str:
@@ -39,34 +36,3 @@ def lines_of_echo(memory: bytes) -> list[str]:
     """The last messages in memory that the C extension has echoed them to."""
     echo = memory.partition(b"\0")[0].decode(errors="replace")
     return [printable(line) for line in echo.splitlines()[-_LINES:]]
-
-
-class OutputTail:
-    """Reads a pipe to its end on a thread, and keeps only the last lines.
-
-    Args:
-        pipe: The reading end. It is closed when everything has been read.
-    """
-
-    def __init__(self, pipe: BinaryIO) -> None:
-        self._pipe = pipe
-        self._lines: deque[bytes] = deque(maxlen=_LINES)
-        self._thread = threading.Thread(target=self._read, name="fmugym-output", daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        with self._pipe:
-            # A line without an end comes in pieces of this length.
-            for line in iter(lambda: self._pipe.readline(_LINE_LENGTH), b""):
-                if line.strip():
-                    self._lines.append(line)
-
-    def lines(self, timeout: float = 1.0) -> list[str]:
-        """The last lines, made printable, once the pipe has ended.
-
-        Args:
-            timeout: Seconds to wait for the end. A process that the dead one has started may keep
-                the pipe open.
-        """
-        self._thread.join(timeout)
-        return [printable(line.decode(errors="replace").strip()) for line in tuple(self._lines)]

@@ -7,6 +7,7 @@ import functools
 import marshal
 import multiprocessing.spawn
 import os
+import re
 import select
 import signal
 import socket
@@ -17,7 +18,7 @@ import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
 from fmugym.pool.process import guard
 from fmugym.pool.process.shared_memory import Memory
@@ -35,12 +36,14 @@ class Order:
         directory: The working directory; the folder if it has been removed.
         environment: The environment variables.
         command: A program and its arguments; empty for a worker in a bare interpreter.
+        checks_heap: See ``ProcessPool``.
     """
 
     folder: Path
     directory: str
     environment: Mapping[str, str]
     command: Sequence[str] = ()
+    checks_heap: bool = False
 
     def packed(self) -> bytes:
         """The order as the guard takes it."""
@@ -105,10 +108,10 @@ def launch(end: socket.socket, memory: Memory, order: Order, pipes: Sequence[int
         return _LoneProcess(end, order)
     descriptors = end.fileno(), memory.descriptor, *pipes
     try:
-        return _guard().start(order, descriptors)
+        return _guard(order.checks_heap).start(order, descriptors)
     except ordinary(EOFError, BrokenPipeError, ConnectionResetError):  # it has ended
-        _cached_guard.cache_clear()
-        return _guard().start(order, descriptors)
+        _guards.pop(order.checks_heap, None)
+        return _guard(order.checks_heap).start(order, descriptors)
 
 
 def _command(number: int) -> list[str]:
@@ -122,14 +125,32 @@ def _command(number: int) -> list[str]:
     return [os.fsdecode(executable), "-I", "-S", *arguments]
 
 
-class _Guard:
-    """This end of the guard; a process has at most one."""
+@functools.cache
+def _heap_check() -> dict[str, str]:
+    """The variables by which glibc ends a process that has written beyond a block it frees."""
+    try:
+        maps = Path("/proc/self/maps").read_text()
+    except ordinary(OSError):
+        return {}
+    found = re.search(r"(/\S*)/libc\.so\.6$", maps, re.MULTILINE)
+    checker = Path(found[1]) / "libc_malloc_debug.so.0" if found else None
+    if checker is None or not checker.exists():
+        return {}
+    loaded = os.environ.get("LD_PRELOAD", "")
+    return {"LD_PRELOAD": f"{checker} {loaded}".strip(), "MALLOC_CHECK_": "3"}
 
-    def __init__(self) -> None:
+
+class _Guard:
+    """This end of the guard; a process has at most one, and one whose workers check their heaps."""
+
+    def __init__(self, checks_heap: bool) -> None:
         ours, theirs = socket.socketpair()
         with ours, theirs:
             process = subprocess.Popen(
-                _command(theirs.fileno()), stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()]
+                _command(theirs.fileno()),
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env=os.environ | (_heap_check() if checks_heap else {}),
             )
             self._requests = ours.detach()  # a socket would complain at the interpreter's end
         self.pid = process.pid
@@ -166,24 +187,23 @@ def _stop(requests: int, pid: int) -> None:
         os.waitpid(pid, 0)
 
 
-@functools.cache
-def _cached_guard() -> _Guard:
-    return _Guard()
-
+_guards: Final[dict[bool, _Guard]] = {}
+"""Those of this process: whether their workers check their heaps, and the guards."""
 
 _making = threading.Lock()
 
 
-def _guard() -> _Guard:
-    """Return the guard of this process; several threads may ask at the same time."""
+def _guard(checks_heap: bool = False) -> _Guard:
+    """Return a guard of this process; several threads may ask at the same time."""
     with _making:
-        return _cached_guard()
+        if checks_heap not in _guards:
+            _guards[checks_heap] = _Guard(checks_heap)
+        return _guards[checks_heap]
 
 
-def _forget_guard() -> None:
-    if _cached_guard.cache_info().currsize:
-        _cached_guard().forget()
-        _cached_guard.cache_clear()
+def _forget_guards() -> None:
+    while _guards:
+        _guards.popitem()[1].forget()
     _making.release()
 
 
@@ -191,7 +211,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(
         before=_making.acquire,
         after_in_parent=_making.release,
-        after_in_child=_forget_guard,
+        after_in_child=_forget_guards,
     )
 
 

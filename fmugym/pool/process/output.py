@@ -7,7 +7,6 @@ than a pipe holds waits for its parent.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import select
 import sys
@@ -17,7 +16,7 @@ from typing import Any, Final
 
 from fmugym.signals import Ignoring
 
-__all__ = ["Output", "print_line_by_line"]
+__all__ = ["Output"]
 
 _LINES: Final = 10
 _LINE_LENGTH: Final = 300
@@ -26,18 +25,20 @@ _LAST_CHUNKS: Final = 16
 """The most chunks that a pipe holds, on any system."""
 
 _STREAMS: Final = (1, 2)
-_LINE_BUFFERED: Final = 1
-"""``_IOLBF`` of glibc, musl and macOS."""
 
 
 class Output:
     """The parent's ends of the pipes of one worker.
 
+    Args:
+        quiet: Whether what comes is only kept, and not passed on to the streams of this process.
+
     Attributes:
         writing_ends: For the worker: standard output and standard error.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, quiet: bool = False) -> None:
+        self._quiet = quiet
         self._streams: dict[int, int] = {}  # the descriptor of this process by the reading end
         self._lines: deque[bytes] = deque(maxlen=_LINES)
         self._unfinished = dict.fromkeys(_STREAMS, b"")
@@ -100,7 +101,8 @@ class Output:
             del self._streams[reading]
             return
         self._note(stream, data)
-        _write(stream, data)
+        if not self._quiet:
+            _write(stream, data)
 
     def _note(self, stream: int, data: bytes) -> None:
         *lines, rest = (self._unfinished[stream] + data).split(b"\n")
@@ -130,11 +132,3 @@ def _write(stream: int, data: bytes) -> None:
     with Ignoring(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
-
-
-def print_line_by_line() -> None:
-    """Flush C's output to a pipe after each line; a crash would lose what is buffered."""
-    library = ctypes.CDLL(None)
-    name = "__stdoutp" if sys.platform == "darwin" else "stdout"
-    stream = ctypes.c_void_p.in_dll(library, name)
-    library.setvbuf(stream, None, _LINE_BUFFERED, ctypes.c_size_t(0))

@@ -13,7 +13,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -51,9 +51,9 @@ from fmugym.pool.process.requests import (
     request_write,
 )
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Memory, make_arrays, size_for
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
-from fmugym.pool.process.supervisor import ROLLOUT, Supervisor
+from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
 from fmugym.pool.saving import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
@@ -62,6 +62,8 @@ if TYPE_CHECKING:
     from fmugym.pool.process.rollouts import PlayOfWorkers, Rolled
 
 __all__ = ["ProcessPool"]
+
+_CLOSING_TIME: Final = 5.0
 
 
 class ProcessPool(SavingPool):
@@ -77,9 +79,16 @@ class ProcessPool(SavingPool):
         threads: The most threads in each of them; by default, together one for each processor.
         own_files: Whether each worker has a copy of the FMU's files, which is also its working
             directory.
+        private_libraries: See ``NativePool``.
         call_timeout: How long a call may take, in seconds of real time; a reset or an instantiation
             may take ten times as long. None for ever. A worker that takes longer is ended, unless
             a debugger holds it.
+        closing_time: How long workers may take to free their instances in ``close``, in seconds;
+            by default 5, or ``call_timeout`` if that is shorter.
+        checks_heap: Whether the C library ends workers that free memory beyond which an FMU has
+            written; only with glibc.
+        on_trial: Whether the FMU is only tried. Nothing of what it prints appears on the streams of
+            this process, and the random numbers of the C library differ from worker to worker.
 
     Attributes:
         workers: How many processes there are.
@@ -100,7 +109,11 @@ class ProcessPool(SavingPool):
         workers: int | None = None,
         threads: int | None = None,
         own_files: bool = False,
+        private_libraries: bool = False,
         call_timeout: float | None = DEFAULT_CALL_TIMEOUT,
+        closing_time: float | None = None,
+        checks_heap: bool = False,
+        on_trial: bool = False,
     ) -> None:
         self.num_instances = num_instances
         self._spec = spec
@@ -110,8 +123,8 @@ class ProcessPool(SavingPool):
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
-            setup = Setup.of(fmu, spec, num_instances, log)
-            memory = _make_memory(size_for(spec, num_instances, self.workers))
+            setup = Setup.of(fmu, spec, num_instances, log, private_libraries)
+            memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
             raise
@@ -119,17 +132,24 @@ class ProcessPool(SavingPool):
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
-        arrays = make_arrays(memory, spec, num_instances)
+        arrays = memory.arrays
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
         threads = threads or max(1, available_processors() // self.workers)
-        setup = replace(setup, threads=threads, own_files=own_files)
+        setup = replace(
+            setup,
+            threads=threads,
+            own_files=own_files,
+            checks_heap=checks_heap,
+            on_trial=on_trial,
+        )
         self._setup, self._arrays = setup, arrays
         self._plays, self._play = 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
-        self._crew = Crew(fmu, setups, memory, arrays, log, timeout)
+        closing_time = closing_time or min(_CLOSING_TIME, timeout)
+        self._crew = Crew(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._crew)
 
     # The contract of Pool.
@@ -419,6 +439,20 @@ class ProcessPool(SavingPool):
             finally:
                 self._return_seats()
 
+    @property
+    def initializations(self) -> int:
+        """How many initializations the workers have begun."""
+        return sum(supervisor.initializations for supervisor in self._crew.supervisors)
+
+    @property
+    def losses(self) -> list[Loss]:
+        """How worker processes died or hung, in the order of the workers."""
+        return self._crew.losses
+
+    def limit_calls(self, call_timeout: float) -> None:
+        """Let the next calls take so long; see ``call_timeout``."""
+        self._crew.call_timeout = call_timeout
+
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""
         return [supervisor.pid for supervisor in self._crew.supervisors]
@@ -448,9 +482,9 @@ def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:
             check_count(what, count)
 
 
-def _make_memory(size: int) -> Memory:
+def _make_memory(spec: PoolSpec, num_instances: int, workers: int) -> Memory:
     try:
-        return Memory(size)
+        return Memory(spec, num_instances, workers)
     except ordinary(OSError) as error:
         raise FMULoadError(f"no memory can be shared with worker processes: {error}") from None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import shutil
@@ -15,8 +16,9 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.form import Files, Writer, form_of_pool
+from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.process.launcher import Order
-from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory, offsets_of
+from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving import keeps_records
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
@@ -24,6 +26,9 @@ from fmugym.wine.loader import windows_path
 from fmugym.wine.prefix import Wine
 
 __all__ = ["Setup"]
+
+_seeds: Final = itertools.count(1)
+"""Of the random numbers of the C library, each for a worker on trial."""
 
 _COPIES: Final = "copies-for-workers"
 """The folder within the FMU's one that has the copies."""
@@ -48,6 +53,9 @@ class Setup:
         threads: See ``NativePool``.
         own_files: Whether the worker has a copy of the folder, which is also its working
             directory, because instances would share files otherwise.
+        private_libraries: Whether ``files`` has a library for each of the N instances.
+        checks_heap: See ``ProcessPool``.
+        on_trial: See ``ProcessPool``.
         wine: What the worker needs to run in Wine; None for one of this system.
     """
 
@@ -64,16 +72,28 @@ class Setup:
     number: int = 0
     threads: int = 1
     own_files: bool = False
+    private_libraries: bool = False
+    checks_heap: bool = False
+    on_trial: bool = False
     wine: Wine | None = None
 
     @classmethod
-    def of(cls, fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger) -> Setup:
+    def of(
+        cls,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        log: logging.Logger,
+        private_libraries: bool = False,
+    ) -> Setup:
         """Extract an FMU, and say what a worker for all of its instances needs to know."""
         folder = fmu.extract()
+        copies = copy_libraries(fmu, folder, num_instances) if private_libraries else None
         return cls(
             fmu=fmu,
             folder=folder,
-            files=_files_of(fmu, folder),
+            files=_files_of(fmu, folder) if copies is None else Files.here(fmu, folder, copies),
+            private_libraries=private_libraries,
             before=_libraries_before(fmu, folder),
             spec=spec.fitting(fmu.description),
             num_instances=num_instances,
@@ -120,13 +140,14 @@ class Setup:
             files=_files_of(self.fmu, folder),
             before=_libraries_before(self.fmu, folder),
             directory=directory,
+            private_libraries=False,  # the process has one instance
         )
 
     def order(self) -> Order:
         """What to start."""
         directory = self.directory or str(self.folder)
         if self.wine is None:
-            return Order(self.folder, directory, self.environment)
+            return Order(self.folder, directory, self.environment, checks_heap=self.checks_heap)
         environment = self.wine.environment(self.environment)
         return Order(self.folder, directory, environment, self.wine.command)
 
@@ -137,24 +158,34 @@ class Setup:
             form_of_pool(
                 self.description,
                 self.spec,
-                self.files,
+                self._files_of_block(),
                 self.count,
                 self.threads,
+                private_libraries=self.private_libraries,
                 logging=self.logs_all,
                 records=keeps_records(self.description, self.spec),
             )
         )
         self._write_memory(writer, memory)
+        writer.integers(next(_seeds) if self.on_trial else 0)
         writer.texts([name.encode() for name, _ in self.before])
         writer.texts([os.fsencode(path) for _, path in self.before])
         return writer.form()
+
+    def _files_of_block(self) -> Files:
+        """The libraries of the worker's own instances, if each has one."""
+        if not self.private_libraries:
+            return self.files
+        parts = len(self.files.paths) // self.num_instances
+        block = slice(parts * self.block.start, parts * self.block.stop)
+        return replace(self.files, paths=self.files.paths[block])
 
     def _write_memory(self, writer: Writer, memory: Memory) -> None:
         """Name the memory on Windows, and in Wine by this process's descriptor of it."""
         path = windows_path(Path("/proc", str(os.getpid()), "fd", str(memory.descriptor)))
         writer.text(os.fsencode(path if self.wine is not None else memory.tag))
         writer.integers(memory.size, self.num_instances, self.block.start)
-        *arrays, echo, bell = offsets_of(self.spec, self.num_instances, self.number)
+        *arrays, echo, bell = memory.offsets(self.number)
         writer.integers(*arrays, ECHO_SIZE, echo, bell)
 
 

@@ -6,6 +6,7 @@ process ends. Nothing has to be unlinked, and nothing can be left behind.
 
 from __future__ import annotations
 
+import itertools
 import math
 import mmap
 import os
@@ -23,23 +24,16 @@ from fmugym.pool.health import HEALTH_COUNTS, HealthArray
 if sys.platform == "linux":
     import fcntl
 
-__all__ = [
-    "ECHO_SIZE",
-    "Arrays",
-    "Memory",
-    "make_arrays",
-    "make_bell",
-    "make_echo",
-    "offsets_of",
-    "size_for",
-]
+__all__ = ["ECHO_SIZE", "Arrays", "Memory"]
 
 _ALIGNMENT: Final = 64
 """The alignment of each array, in bytes: a cache line."""
 
-
 ECHO_SIZE: Final = 4096
 """Bytes for the last words of a worker's FMUs."""
+
+_OWN_SIZE: Final = ECHO_SIZE + _ALIGNMENT
+"""Bytes for a worker: its echo, and its bell."""
 
 _BELL: Final = np.dtype(np.uint64)
 
@@ -64,18 +58,6 @@ class Arrays(NamedTuple):
     counts: HealthArray
     progress: npt.NDArray[np.int64]
 
-    def block(self, columns: slice) -> Arrays:
-        """Return the parts that belong to some of the instances."""
-        return Arrays(
-            self.inputs[:, columns],
-            self.outputs[:, columns],
-            self.observations[columns],
-            self.statuses[columns],
-            self.mask[columns],
-            self.counts[columns],
-            self.progress[columns],
-        )
-
 
 def _layout(spec: PoolSpec, count: int) -> list[tuple[tuple[int, ...], Any]]:
     return [
@@ -94,51 +76,13 @@ def _padded_size(shape: tuple[int, ...], dtype: Any) -> int:
     return int(-(-size // _ALIGNMENT) * _ALIGNMENT)
 
 
-def size_for(spec: PoolSpec, count: int, workers: int) -> int:
-    """Return the bytes that a pool of ``count`` instances needs."""
-    return offsets_of(spec, count, workers)[-2]
-
-
-def make_arrays(memory: Memory, spec: PoolSpec, count: int) -> Arrays:
-    """Place the arrays of a pool of ``count`` instances in memory, which they keep alive."""
-    arrays: list[Any] = [
-        np.ndarray(shape, dtype, memory.map, offset)
-        for (shape, dtype), offset in zip(
-            _layout(spec, count), offsets_of(spec, count), strict=False
-        )
-    ]
-    return Arrays(*arrays)
-
-
-def offsets_of(spec: PoolSpec, count: int, worker: int = 0) -> list[int]:
-    """Where the arrays begin, in the order of ``Arrays``, and then what belongs to a worker.
-
-    That is ``ECHO_SIZE`` bytes for its last words, and its bell.
-    """
-    offsets = [0]
-    for row in _layout(spec, count):
-        offsets.append(offsets[-1] + _padded_size(*row))
-    offsets[-1] += worker * (ECHO_SIZE + _ALIGNMENT)
-    return [*offsets, offsets[-1] + ECHO_SIZE]
-
-
-def make_echo(memory: Memory, spec: PoolSpec, count: int, worker: int) -> npt.NDArray[np.uint8]:
-    """Return where a worker's FMUs leave their last words, a text that ends with a zero byte."""
-    return np.ndarray(ECHO_SIZE, np.uint8, memory.map, offsets_of(spec, count, worker)[-2])
-
-
-def make_bell(memory: Memory, spec: PoolSpec, count: int, worker: int) -> memoryview:
-    """Return the count of the messages to a worker, as the only element of a view."""
-    return np.ndarray(1, _BELL, memory.map, offsets_of(spec, count, worker)[-1]).data
-
-
 class Memory:
-    """Shared memory, filled with zeros.
+    """What a pool and its workers share, filled with zeros.
 
     Args:
-        size: In bytes, not 0.
-        descriptor: The file descriptor of memory that another process has made.
-        tag: Its name instead, on Windows, which frees the name together with the memory.
+        spec: Names the inputs and outputs.
+        count: N.
+        workers: How many there are.
 
     Raises:
         OSError: If the system refuses.
@@ -146,19 +90,39 @@ class Memory:
     Attributes:
         size: In bytes.
         descriptor: The file descriptor; -1 on Windows.
-        tag: The name on Windows.
+        tag: The name on Windows, which frees it together with the memory.
         map: The memory itself.
+        arrays: Those of all instances.
     """
 
-    def __init__(self, size: int, descriptor: int = -1, tag: str = "") -> None:
-        self.size = size
-        self.descriptor, self.tag = descriptor, tag
+    def __init__(self, spec: PoolSpec, count: int, workers: int) -> None:
+        layout = _layout(spec, count)
+        sizes = [_padded_size(*row) for row in layout]
+        *self._offsets, self._end = itertools.accumulate(sizes, initial=0)
+        self.size = self._end + workers * _OWN_SIZE
+        self.descriptor, self.tag = -1, ""
         if sys.platform == "win32":
-            self.tag = tag or f"fmugym-{os.getpid()}-{secrets.token_hex(8)}"
-            self.map = mmap.mmap(-1, size, self.tag)
+            self.tag = f"fmugym-{os.getpid()}-{secrets.token_hex(8)}"
+            self.map = mmap.mmap(-1, self.size, self.tag)
         else:
-            self.descriptor = _anonymous_file(size) if descriptor < 0 else descriptor
-            self.map = mmap.mmap(self.descriptor, size)
+            self.descriptor = _anonymous_file(self.size)
+            self.map = mmap.mmap(self.descriptor, self.size)
+        places = zip(layout, self._offsets, strict=True)
+        arrays = [np.ndarray(*row, self.map, offset) for row, offset in places]
+        self.arrays = Arrays(*arrays)
+
+    def offsets(self, worker: int) -> list[int]:
+        """Where the arrays begin, in the order of ``Arrays``, and then a worker's echo and bell."""
+        echo = self._end + worker * _OWN_SIZE
+        return [*self._offsets, echo, echo + ECHO_SIZE]
+
+    def echo(self, worker: int) -> npt.NDArray[np.uint8]:
+        """Where a worker's FMUs leave their last words, a text that ends with a zero byte."""
+        return np.ndarray(ECHO_SIZE, np.uint8, self.map, self.offsets(worker)[-2])
+
+    def bell(self, worker: int) -> memoryview:
+        """The count of the messages to a worker, as the only element of a view."""
+        return np.ndarray(1, _BELL, self.map, self.offsets(worker)[-1]).data
 
     def close(self) -> None:
         """Close the file descriptor; the mapped memory stays as long as it is in use."""

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Final, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn
 
 from fmugym.errors import FMULoadError, SimulationError, printable
 from fmugym.fmi.words import as_messages, quoted
@@ -28,12 +28,21 @@ from fmugym.pool.process.requests import (
     request_indices,
 )
 from fmugym.pool.process.setup import Setup
-from fmugym.pool.process.shared_memory import Memory, make_arrays, make_bell, make_echo
+from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.reports import loading_failed
 from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["INSTANTIATION", "ROLLOUT", "LostError", "Supervisor", "patience_with"]
+__all__ = [
+    "INSTANTIATION",
+    "ROLLOUT",
+    "Loss",
+    "LostError",
+    "RefusedError",
+    "Supervisor",
+    "WorkerError",
+    "patience_with",
+]
 
 INSTANTIATION: Final = "the instantiation"
 ROLLOUT: Final = "a rollout"
@@ -67,6 +76,34 @@ class LostError(Exception):
     """The worker and all of its instances are lost; the text is the cause."""
 
 
+class RefusedError(LostError):
+    """The FMU could not be loaded or instantiated; its process is in order."""
+
+
+class Loss(NamedTuple):
+    """How a process died or hung.
+
+    Attributes:
+        how: What it did: ``"ended with signal SIGSEGV"``, for example.
+        is_late: Whether it was ended because it did not answer in time.
+        lines: The last messages of its FMU, and what it printed last.
+    """
+
+    how: str
+    is_late: bool
+    lines: list[str]
+
+
+class WorkerError(FMULoadError):
+    """A worker could not be started, or did not survive the instantiation.
+
+    Attributes:
+        loss: How it died or hung; None if it could not be started.
+    """
+
+    loss: Loss | None = None
+
+
 class Supervisor:
     """Runs one worker, in one process after another.
 
@@ -85,10 +122,9 @@ class Supervisor:
         released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
-        initializations: How many initializations all workers of this process have begun.
+        initializations: How many initializations its processes have begun.
+        losses: How processes died or hung, in their order.
     """
-
-    initializations: ClassVar[int] = 0
 
     def __init__(
         self,
@@ -99,6 +135,8 @@ class Supervisor:
         self.block = setup.block
         self.generation = 0
         self.reason = ""
+        self.losses: list[Loss] = []
+        self.initializations = 0
         self.growth = 0
         self.is_new = True
         self.known: set[int] = set()
@@ -106,13 +144,12 @@ class Supervisor:
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
         self._setup, self._log, self._memory = setup, log, memory
-        place = setup.spec, setup.num_instances
-        self._echo = make_echo(memory, *place, setup.number)
-        self._progress = make_arrays(memory, *place).progress[setup.block]
+        self._echo = memory.echo(setup.number)
+        self._progress = memory.arrays.progress[setup.block]
         self._done = b""
         self._read: Callable[[Reader], Any] | None = None
         self._content = b""
-        self._output = Output()
+        self._output = Output(setup.on_trial)
         self._deaths = 0
         self._process: Process | None = None
         self._opening = self._busy = False
@@ -172,7 +209,7 @@ class Supervisor:
 
     def _launch(self, setup: Setup) -> tuple[Process, Channel]:
         end, other_end = socket.socketpair()
-        output = Output()
+        output = Output(setup.on_trial)
         try:
             with other_end:
                 output.open()
@@ -183,7 +220,7 @@ class Supervisor:
             raise
         output.release_writing_ends()
         self._output = output
-        bell = make_bell(self._memory, setup.spec, setup.num_instances, setup.number)
+        bell = self._memory.bell(setup.number)
         return process, Channel(end, process.sentinel, output, bell)
 
     def revive(self) -> None:
@@ -359,7 +396,7 @@ class Supervisor:
         self._opening = False
         if isinstance(result, Exception):
             self.bury(f"{self._why_not_loaded(result.args[0])}{self.printed}")
-            raise LostError(self.reason) from result
+            raise RefusedError(self.reason)
 
     def _why_not_loaded(self, text: str) -> str:
         """Say which libraries are missing, or else what the worker has said."""
@@ -385,8 +422,7 @@ class Supervisor:
                 except ordinary(EOFError, OSError):
                     self._explain_death(doing)
                 except DamagedError as error:
-                    what = f"worker process {self.pid} has sent what is no answer in {doing}"
-                    self._end(what, error)
+                    self._end(f"has sent what is no answer in {doing}", error)
             if result is not None:
                 return result[0]
             if time.monotonic() >= deadline and not _is_debugged(self.pid):
@@ -416,7 +452,7 @@ class Supervisor:
         """Read the answer to a reset."""
         self.growth, count = reader.integer(), reader.integer()
         reader.end()
-        Supervisor.initializations += max(0, count - self._initializations)
+        self.initializations += max(0, count - self._initializations)
         self._initializations = count
 
     def failure_in(self, reader: Reader, index: int) -> str:
@@ -442,8 +478,8 @@ class Supervisor:
             self._process.kill()
             self._process.exit_status(_LONGEST_KILL)
         status = status if self._fault is None else self._fault
-        self._output.drain()
         how = "closed its connection" if status is None else f"ended with {describe_exit(status)}"
+        self._note_loss(how)
         self._forget_process(self._cause(f"worker process {pid} {how} in {doing}"))
         raise LostError(self.reason)
 
@@ -460,21 +496,24 @@ class Supervisor:
         """End a worker that is late; messages that it has not sent yet are lost."""
         factor = "ten times " if patience_with(doing) > 1 else ""
         seconds = time.monotonic() - self._asked
-        what = (
-            f"worker process {self.pid} took longer than {factor}call_timeout for {doing} and was "
-            f"ended after {seconds:.3g} s"
-        )
-        self._end(what)
+        how = f"took longer than {factor}call_timeout for {doing} and was ended after"
+        self._end(f"{how} {seconds:.3g} s", is_late=True)
 
-    def _end(self, what: str, error: Exception | None = None) -> NoReturn:
+    def _end(self, how: str, error: Exception | None = None, *, is_late: bool = False) -> NoReturn:
         """End a worker that lives, but is of no use."""
-        self._output.drain()
-        self.bury(self._cause(what))
+        self._note_loss(how, is_late)
+        self.bury(self._cause(f"worker process {self.pid} {how}"))
         raise LostError(self.reason) from error
 
+    def _note_loss(self, how: str, is_late: bool = False) -> None:
+        self._output.drain()
+        self.losses.append(Loss(how, is_late, self._last_messages() + self._output.lines()))
+
+    def _last_messages(self) -> list[str]:
+        return lines_of_echo(self._echo.tobytes()) or list(self._tail)
+
     def _cause(self, text: str) -> str:
-        lines = lines_of_echo(self._echo.tobytes()) or list(self._tail)
-        said = quoted(as_messages(lines))
+        said = quoted(as_messages(self._last_messages()))
         return printable(f"{self._name}: {text}{said}{self.printed}")
 
 

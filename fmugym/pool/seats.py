@@ -14,9 +14,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
+from fmugym.archive.fmu import FMU
 from fmugym.errors import LicenceError
 from fmugym.pool.spec import PoolSpec
-from fmugym.trial.candidate import Candidate, content_of
 
 __all__ = ["Claim", "take", "taking"]
 
@@ -44,30 +44,30 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_claims.clear)
 
 
-def take(candidate: Candidate, spec: PoolSpec, count: int, purpose: str) -> Claim | None:
+def take(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Claim:
     """Take seats of an FMU.
 
     Args:
-        candidate: The FMU.
+        fmu: The FMU.
         spec: Says how many seats there are.
         count: How many to take.
         purpose: What for, for the messages that others get.
 
     Returns:
-        The seats; None if their number is not limited.
+        The seats; they need not be released if their number is not limited.
 
     Raises:
         LicenceError: If there are not so many left; the text tells what they are taken for.
     """
     if spec.max_instances is None:
-        return None
-    content = content_of(candidate)
+        return Claim("", count, purpose)
+    content = fmu.content
     if sum(claim.seats for claim in _taken(content)) + count > spec.max_instances:
         gc.collect()  # environments that nobody uses any more still have their seats
     with _lock:
         taken = _taken(content)
         if sum(claim.seats for claim in taken) + count > spec.max_instances:
-            name, most = candidate.path.name, spec.max_instances
+            name, most = fmu.path.name, spec.max_instances
             raise LicenceError(_refusal(name, most, count, purpose, taken))
         claim = Claim(content, count, purpose)
         _claims.add(claim)
@@ -88,11 +88,10 @@ def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim])
 
 
 @contextlib.contextmanager
-def taking(candidate: Candidate, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
+def taking(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
     """Take seats for this context, if they are limited; see ``take``."""
-    claim = take(candidate, spec, count, purpose)
+    claim = take(fmu, spec, count, purpose)
     try:
         yield
     finally:
-        if claim is not None:
-            claim.release()
+        claim.release()

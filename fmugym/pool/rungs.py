@@ -7,7 +7,6 @@ from typing import Final
 
 from fmugym.archive.description import ModelDescription
 from fmugym.pool.spec import ResetMethod
-from fmugym.trial.verdict import Grade
 
 __all__ = ["find_rungs", "offers_of"]
 
@@ -32,7 +31,7 @@ def offers_of(component: ModelDescription, *, reloads: bool) -> list[ResetMethod
 def find_rungs(
     offers: Sequence[Sequence[ResetMethod]],
     base: ResetMethod,
-    grade: Callable[[Rungs], Grade],
+    is_right: Callable[[Rungs], bool],
 ) -> Rungs:
     """Find the fastest reset method of each component with which the system begins anew.
 
@@ -42,7 +41,7 @@ def find_rungs(
     Args:
         offers: For each component, the methods that it offers, the fastest first.
         base: The method with which the system begins anew as a whole.
-        grade: Plays episodes with a method for each component.
+        is_right: Whether the system begins anew with a method for each component, bit by bit.
 
     Returns:
         A method for each component; empty if none can begin by a faster one than ``base``.
@@ -51,11 +50,11 @@ def find_rungs(
     fast = tuple(own[0] for own in offers)
     if all(map(_is_no_faster, fast, slow)):
         return ()
-    if grade(fast) is Grade.BITWISE:
+    if is_right(fast):
         return fast
-    found = tuple(_fastest(slow, index, own, grade) for index, own in enumerate(offers))
+    found = tuple(_fastest(slow, index, own, is_right) for index, own in enumerate(offers))
     changes = sum(one is not other for one, other in zip(found, slow, strict=True))
-    good = changes == 1 or (changes > 1 and grade(found) is Grade.BITWISE)
+    good = changes == 1 or (changes > 1 and is_right(found))
     return found if good else ()
 
 
@@ -76,10 +75,10 @@ def _fastest(
     slow: Rungs,
     index: int,
     offers: Sequence[ResetMethod],
-    grade: Callable[[Rungs], Grade],
+    is_right: Callable[[Rungs], bool],
 ) -> ResetMethod:
     for rungs in _faster(slow, index, offers):
-        if grade(rungs) is Grade.BITWISE:
+        if is_right(rungs):
             return rungs[index]
     return slow[index]
 

@@ -1,0 +1,60 @@
+"""The choice among the ways to step an FMU: the native engine, FMPy, or an object of the caller."""
+
+from __future__ import annotations
+
+import logging
+from typing import Final
+
+from fmugym.archive.fmu import FMU
+from fmugym.errors import ConfigError, FMULoadError, unknown_name
+from fmugym.pool.backend.by_fmpy import fmpy_pool
+from fmugym.pool.backend.pool import BackendPool
+from fmugym.pool.base import Pool
+from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
+from fmugym.pool.spec import PoolSpec
+from fmugym.pool.wishes import Wishes
+from fmugym.retired import warn_of_gone
+
+__all__ = ["pool_of_backend"]
+
+_NAMES: Final = ("auto", "fmpy", "fmu", "native", "python")
+
+
+def pool_of_backend(
+    fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger, wishes: Wishes
+) -> Pool | None:
+    """Make the pool of a backend; None if the native engine shall step the FMU.
+
+    Args:
+        fmu: The FMU; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        log: The logger that gets the FMU's messages.
+        wishes: Name the backend.
+
+    Raises:
+        ConfigError: If the backend is unknown, or cannot do what the spec says.
+        FMULoadError: If the backend is not available, or the FMU cannot be loaded.
+    """
+    if isinstance(wishes.backend, str):
+        if not _steps_by_fmpy(wishes.backend):
+            return None
+        method, isolation = wishes.reset_method, wishes.isolation
+        return fmpy_pool(fmu, spec, num_instances, log, reset_method=method, isolation=isolation)
+    if spec.fault_retries:
+        fmu.close()
+        raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
+    return BackendPool(fmu, spec, num_instances, wishes.backend)
+
+
+def _steps_by_fmpy(backend: str) -> bool:
+    if backend not in _NAMES:
+        raise unknown_name("backend", backend, _NAMES)
+    if backend == "native" and not has_native_pool():
+        raise FMULoadError(f"the native pool is not there: {HOW_TO_BUILD}")
+    if backend == "python":
+        warn_of_gone("backend='python' means 'fmpy' now: say so")
+    if backend in ("auto", "fmu") and not has_native_pool():
+        warn_of_slow_path()
+        return True
+    return backend in ("fmpy", "python")

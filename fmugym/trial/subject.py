@@ -1,0 +1,290 @@
+"""An unknown FMU on trial: its instances are in worker processes, whose deaths are findings."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final, ParamSpec, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
+from fmugym.archive.variable import Variable
+from fmugym.errors import FMUGymError, LicenceError
+from fmugym.fmi.words import as_messages, quoted
+from fmugym.pool.base import FloatArray, MaskArray, StatusArray
+from fmugym.pool.bundle import Bundle, IndexArray
+from fmugym.pool.patience import licence_errors, speaks_of_licence
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.process.supervisor import Loss, WorkerError
+from fmugym.pool.progress import progress
+from fmugym.pool.spec import INITIALIZATION_FACTOR, PoolSpec
+
+__all__ = ["CLOSING", "STEP", "DeathError", "Subject", "TriedPool"]
+
+logger = logging.getLogger(__name__)
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+OPENING: Final = "loading and instantiation"
+INITIALIZATION: Final = "initialization"
+FIRST_STEP: Final = "the first step"
+STEP: Final = "a step"
+CLOSING: Final = "closing"
+"""What an FMU does when it dies."""
+
+_LEAST: Final = 5.0
+"""Seconds that every call may take."""
+
+_EVENT: Final = 100
+"""How many times as long as the calls before a call may take; an event may cost that much."""
+
+_MEMORY_ERROR: Final = re.compile(r"(free|malloc|realloc|calloc|memalign|munmap_chunk)\w*\(\)")
+"""How glibc begins its messages about memory errors."""
+
+_SILENT: Final = logging.Logger("fmugym.trial", logging.CRITICAL + 1)
+"""Takes the messages of FMUs; the last ones explain deaths."""
+
+
+class DeathError(Exception):
+    """A process has not survived a call of the FMU; the text says how it ended.
+
+    Args:
+        call: What the FMU did.
+        stage: The part of the trial.
+        how: How the process ended.
+        lines: What it said last.
+    """
+
+    def __init__(self, call: str, stage: str, how: str, lines: list[str]) -> None:
+        super().__init__(f"it {how}{quoted(as_messages(lines), 'its last lines')}")
+        self.call, self.stage = call, stage
+        self.shows_memory_error = any(map(_MEMORY_ERROR.match, lines))
+
+
+def _kind(call: str) -> str:
+    return STEP if call == FIRST_STEP else call
+
+
+def _factor(call: str) -> int:
+    return INITIALIZATION_FACTOR if call in (OPENING, INITIALIZATION) else 1
+
+
+class Subject:
+    """An FMU on trial.
+
+    Args:
+        fmu: The FMU.
+
+    Attributes:
+        fmu: As given.
+        checks_heap: Whether the C library looks for memory errors.
+        is_harmful: Whether a lone instance has harmed its process.
+        reasons: How processes have ended, a sentence each.
+        instances: How many instances there were at once at most.
+        initializations: How many initializations there were.
+    """
+
+    def __init__(self, fmu: FMU) -> None:
+        self.fmu = fmu
+        self.checks_heap = not self.fmu.in_wine
+        self.is_harmful = False
+        self.reasons: list[str] = []
+        self.instances, self.initializations = 1, 0
+        self._longest: dict[str, float] = {}  # the seconds of calls
+
+    @property
+    def can_copy_libraries(self) -> bool:
+        """Whether instances can have private copies of the library, or load it anew."""
+        return not self.fmu.in_wine
+
+    @contextmanager
+    def pool(
+        self, stage: str, spec: PoolSpec, num_instances: int = 1, **options: Any
+    ) -> Iterator[TriedPool]:
+        """Make instances in a new process, with a fresh copy of the FMU's files.
+
+        Args:
+            stage: The part of the trial.
+            spec: What to do at each reset and step.
+            num_instances: N.
+            options: See ``ProcessPool``.
+
+        Raises:
+            DeathError: If the process does not survive all calls, closing included.
+            LicenceError: If the FMU gets no licence.
+            FMULoadError: If the FMU refuses in order, or no process can be started.
+        """
+        self.instances = max(self.instances, num_instances)
+        with progress(logger, f"{self.fmu.path.name}: the trial, in {stage},"):
+            options |= {"checks_heap": self.checks_heap}
+            pool = self._open(stage, self.fmu.again(), spec, num_instances, **options)
+            try:
+                yield pool
+            finally:
+                begin = time.perf_counter()
+                pool.close()
+                self.note_call(CLOSING, begin)
+                self.initializations += pool.initializations
+            pool.require_alive(CLOSING)
+
+    def _open(self, stage: str, *arguments: Any, **options: Any) -> TriedPool:
+        begin = time.perf_counter()
+        with licence_errors():
+            try:
+                pool = TriedPool(self, stage, *arguments, **options)
+            except WorkerError as error:
+                if error.loss is None:
+                    raise
+                raise self.death(OPENING, stage, error.loss) from None
+        self.note_call(OPENING, begin)
+        return pool
+
+    # Limits of time: at first long, then as it follows from the calls before.
+
+    def limit(self, call: str) -> tuple[float, str]:
+        """How many seconds a call may take, and why."""
+        timeout, factor = self.fmu.probe_timeout or DEFAULT_PROBE_TIMEOUT, _factor(call)
+        longest = self._longest.get(_kind(call), math.inf)
+        learnt = max(_LEAST, _EVENT * longest)
+        if learnt < timeout * factor:
+            return learnt, f"those before took up to {longest:.2g} s"
+        return timeout * factor, "probe_timeout" if factor == 1 else "ten times probe_timeout"
+
+    def call_timeout(self, call: str) -> float:
+        """The same as a time-out of a ``ProcessPool``."""
+        return self.limit(call)[0] / _factor(call)
+
+    def note_call(self, call: str, begin: float) -> None:
+        """Note a call that has begun at that time of ``time.perf_counter``."""
+        kind, seconds = _kind(call), time.perf_counter() - begin
+        self._longest[kind] = max(self._longest.get(kind, 0.0), seconds)
+
+    def death(self, call: str, stage: str, loss: Loss) -> DeathError:
+        """Say how a process has ended."""
+        how = loss.how.replace("ended with", "ended the process with", 1)
+        if loss.is_late:
+            seconds, why = self.limit(call)
+            how = f"did not come back within {seconds:g} s ({why})"
+        return DeathError(call, stage, how, loss.lines)
+
+    def attempt(self, attempt: Callable[[], R], *, refused: R, died: R, alone: bool = False) -> R:
+        """Try something.
+
+        Args:
+            attempt: It.
+            refused: What is true if the FMU returns errors.
+            died: What is true if its process dies.
+            alone: Whether the process has nothing but a fresh instance.
+
+        Returns:
+            What it finds, or one of these.
+
+        Raises:
+            LicenceError: If the FMU gets no licence, which tells nothing of it.
+        """
+        try:
+            return attempt()
+        except LicenceError:
+            raise
+        except FMUGymError:
+            return refused
+        except DeathError as death:
+            self.note(death, alone=alone)
+            return died
+
+    def note(self, death: DeathError, *, alone: bool = False) -> None:
+        """Note how a process has ended.
+
+        Args:
+            death: How.
+            alone: Whether it had nothing but a fresh instance.
+
+        Raises:
+            LicenceError: If it got no licence, which tells nothing of the FMU.
+        """
+        is_quick = alone and death.call != STEP  # or else the call does not tell how far it came
+        reason = f"in {death.call if is_quick else death.stage} {death}"
+        if speaks_of_licence(reason):
+            raise LicenceError(reason)
+        self.reasons.append(reason)
+        self.is_harmful |= alone
+
+
+class TriedPool(ProcessPool):
+    """Instances on trial in one process.
+
+    Args:
+        subject: The FMU.
+        stage: The part of the trial.
+        fmu: Its files; closed with the pool.
+        spec: What to do at each reset and step.
+        num_instances: N.
+        options: See ``ProcessPool``.
+
+    Attributes:
+        fmu: As given.
+    """
+
+    def __init__(
+        self,
+        subject: Subject,
+        stage: str,
+        fmu: FMU,
+        spec: PoolSpec,
+        num_instances: int,
+        **options: Any,
+    ) -> None:
+        self.fmu, self._subject, self._stage = fmu, subject, stage
+        self._next_step = FIRST_STEP
+        options = {"workers": 1, "threads": 1, "on_trial": True} | options
+        options["call_timeout"] = subject.call_timeout(OPENING)
+        options["closing_time"], _ = subject.limit(CLOSING)
+        super().__init__(fmu, spec, num_instances, _SILENT, **options)
+
+    def require_alive(self, call: str) -> None:
+        """Raise a ``DeathError`` if the process has not survived a call."""
+        if self.losses:
+            raise self._subject.death(call, self._stage, self.losses[0])
+
+    def _ask(self, call: str, function: Callable[P, R], *args: P.args, **named: P.kwargs) -> R:
+        """Limit the time of a call, and see whether the process survives it."""
+        self.limit_calls(self._subject.call_timeout(call))
+        begin = time.perf_counter()
+        try:
+            return function(*args, **named)
+        finally:
+            self.require_alive(call)
+            self._subject.note_call(call, begin)
+
+    def reset(
+        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.reset``."""
+        return self._ask(INITIALIZATION, super().reset, variables, values, mask)
+
+    def step(
+        self,
+        inputs: FloatArray | None = None,
+        skip: MaskArray | None = None,
+        observations: npt.NDArray[np.float32] | None = None,
+    ) -> tuple[FloatArray, StatusArray]:
+        """See ``Pool.step``."""
+        call, self._next_step = self._next_step, STEP
+        return self._ask(call, super().step, inputs, skip, observations)
+
+    def save_instances(self, indices: IndexArray) -> Bundle:
+        """See ``Pool.save_instances``."""
+        return self._ask(STEP, super().save_instances, indices)
+
+    def restore_instances(
+        self, bundle: Bundle, sources: IndexArray, indices: IndexArray
+    ) -> StatusArray:
+        """See ``Pool.restore_instances``."""
+        return self._ask(STEP, super().restore_instances, bundle, sources, indices)
