@@ -26,7 +26,7 @@ __all__ = [
     "PoolSpec",
     "StatusArray",
     "available_processors",
-    "names_of",
+    "naming",
 ]
 
 FloatArray = npt.NDArray[np.float64]
@@ -283,9 +283,10 @@ class Pool(ABC):
         return {}
 
 
-def names_of(variables: tuple[Variable, ...]) -> str:
-    """The names of variables for a message."""
-    return first_of([variable.name for variable in variables])
+def naming(failure: str, variables: tuple[Variable, ...]) -> str:
+    """The words of a failure to read variables, with their names."""
+    names = first_of([variable.name for variable in variables])
+    return failure.replace("reading variables", f"reading {names}", 1)
 
 
 def first_of(names: Sequence[str]) -> str:

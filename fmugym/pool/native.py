@@ -31,7 +31,7 @@ from fmugym.pool.base import (
     PoolSpec,
     StatusArray,
     available_processors,
-    names_of,
+    naming,
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.callbacks import Receiver
@@ -214,8 +214,7 @@ class NativePool(SavingPool):
         values = np.empty((len(variables), self.num_instances))
         failed = self._open_pool().read(self._access(variables), values)
         if failed >= 0:
-            reading = f"reading {names_of(variables)}"
-            raise SimulationError(self.failure(failed).replace("reading variables", reading, 1))
+            raise SimulationError(naming(self.failure(failed), variables))
         return values
 
     def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:

@@ -6,7 +6,7 @@ import csv
 import json
 import pickle
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -24,7 +24,7 @@ from fmugym.search.agent import Agent
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.probe import MOST_PROBED, Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search
-from fmugym.signals import ordinary
+from fmugym.signals import Ignoring, ordinary
 from fmugym.tools.judging import Verdict, judge
 from fmugym.training.agents import FACTS
 from fmugym.training.diary import EVALUATIONS
@@ -128,7 +128,7 @@ def search(quest: Quest, *, resume: bool = False) -> tuple[Verdict, dict[str, An
         run.tell_the_plan()
         return run.judged(run.winner())
     finally:
-        with suppress(OSError):  # something was found, so that the folder is not empty
+        with Ignoring(OSError):  # something was found, so that the folder is not empty
             quest.folder.rmdir()
 
 

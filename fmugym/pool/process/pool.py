@@ -32,6 +32,7 @@ from fmugym.pool.base import (
     PoolSpec,
     StatusArray,
     available_processors,
+    naming,
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.derivatives import Question, Variables, differentiated
@@ -400,7 +401,10 @@ class ProcessPool(SavingPool):
         """See ``Pool.read``."""
         self._gives_texts |= any(variable.kind == "string" for variable in variables)
         content = request_listing(variables, self._version)
-        found = self._asked("reading variables", Request.READ, content, (len(variables),))
+        try:
+            found = self._asked("reading variables", Request.READ, content, (len(variables),))
+        except SimulationError as error:
+            raise SimulationError(naming(str(error), variables)) from None
         return np.concatenate(found, axis=1)
 
     def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
