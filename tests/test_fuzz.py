@@ -1,21 +1,40 @@
-"""A short form of ``python tests/fuzz.py``; the full one is in tests/README.md."""
+"""Short forms of programs that make odd values; tests/README.md has the full ones."""
 
 import contextlib
 import time
 
 import fuzz
 import fuzz_driver
+import fuzz_face
+import fuzz_identification
+import fuzz_lab
+import fuzz_rendering
+import pytest
 from fuzz_driver import Case, CaseError
 
+import fmugym
 from fmugym import ConfigError
+from fmugym.lab import service
+
+ODD = {
+    fuzz: (400, 20),
+    fuzz_face: (700, 50),
+    fuzz_identification: (400, 10),
+    fuzz_lab: (300, 20),
+    fuzz_rendering: (300, 5),
+}
+"""By program: how many cases, and how many are accepted, and refused, at least."""
 
 
-def test_broken_fmus_raise_nothing_but_our_own_errors(same_working_directory):
-    tally = fuzz_driver.run(fuzz.program, 400, seed="tests")
+@pytest.mark.parametrize("module", ODD, ids=lambda module: module.__name__)
+def test_what_is_odd_raises_nothing_but_our_own_errors(module, same_working_directory):
+    count, least = ODD[module]
+    tally = fuzz_driver.run(module.program, count, seed="tests")
     assert tally.failures == []
-    assert tally.total("accepted") + tally.total("refused") == 400
-    assert min(tally.total("accepted"), tally.total("refused")) > 20
-    assert {kind for kind, _ in tally.counts} == set(fuzz.KINDS)
+    assert tally.total("accepted") + tally.total("refused") == count
+    assert min(tally.total("accepted"), tally.total("refused")) > least
+    if module in (fuzz, fuzz_face):
+        assert len({kind for kind, _ in tally.counts}) == len(module.KINDS)
 
 
 def test_a_failure_is_reported(monkeypatch):
@@ -28,6 +47,22 @@ def test_a_failure_is_reported(monkeypatch):
     first, last = fuzz_driver.run(fuzz.program, 1, seed="tests").failures
     assert "left ['trace']" in first
     assert last == "left ['trace'] at the end"
+
+
+def test_a_failure_of_the_face_is_reported(monkeypatch):
+    monkeypatch.setattr(fmugym.env, "check_seed", lambda seed: 1 / 0)
+    failures = fuzz_driver.run(fuzz_face.program, 40, seed="tests").failures
+    assert any("ZeroDivisionError" in failure for failure in failures)
+    monkeypatch.undo()
+    monkeypatch.setattr(fmugym.archive.fmu, "remove_folder", lambda folder, process: None)
+    failures = fuzz_driver.run(fuzz_face.program, 60, seed="tests").failures
+    assert any(": left ['" in failure for failure in failures)
+
+
+def test_a_failure_of_the_lab_is_reported(monkeypatch):
+    monkeypatch.setattr(service, "text_of", lambda kind, token: token.strip())
+    failures = fuzz_driver.run(fuzz_lab.program, 60, seed="tests").failures
+    assert any("AttributeError" in failure for failure in failures)
 
 
 class TestDriver:
