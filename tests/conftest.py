@@ -16,6 +16,7 @@ import pytest
 import tiers
 import wine_tools
 
+import fmugym
 from fmugym.tools.cli import main
 from fmugym.wine.prefix import Wine
 
@@ -87,6 +88,12 @@ def opened():
     """Have things closed after the test."""
     with contextlib.ExitStack() as stack:
         yield lambda thing: stack.enter_context(contextlib.closing(thing))
+
+
+@pytest.fixture
+def load(opened):
+    """Make environments of declared tasks that are closed after the test."""
+    return lambda *arguments, **options: opened(fmugym.load(*arguments, **options))
 
 
 @pytest.fixture

@@ -108,10 +108,9 @@ class TestLimits:
     def test_the_nearest_level_is_written_or_the_lower_one_of_two(self, value, level):
         assert set(self.inputs("levels", Constant([value]))) == {level}
 
-    def test_spaces(self):
-        env = fmugym.load(formed(TASKS["levels"]), physical=True)
+    def test_spaces(self, load):
+        env = load(formed(TASKS["levels"]), physical=True)
         assert env.action_space == fmugym.load(formed(HOUSE), physical=True).action_space
-        env.close()
 
 
 @pytest.mark.parametrize("kind", ["levels", "late change", "least times"])
