@@ -14,6 +14,7 @@ WEIGHT = 0.06 * 9.81 * 0.1  # N m
 INERTIA = 0.06 * 0.1**2  # kg m^2
 ENCODER_STEP = 2 * math.pi / 2**17  # rad
 LAG = 0.00375  # s
+AT_ONCE = {"get_time": (0.0, 0.0), "set_time": (0.0, 0.0)}
 
 
 def make_lab(preset="ideal", **arguments):
@@ -166,7 +167,7 @@ class TestStartPosition:
         assert 0.43 * (asked - q) == pytest.approx(WEIGHT * math.sin(q), abs=1e-4)
 
     def test_homing_takes_its_time(self):
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             experiment(lab, preparation_time=0.5)
             assert lab.clock.time() == pytest.approx(1.5)
 
@@ -175,7 +176,7 @@ class TestStartPosition:
 def fixture_readings():
     """Position, velocity and torque of a hardware cell that hangs, one row a new sample."""
     rows = []
-    with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+    with make_lab("hardware", **AT_ONCE) as lab:
         client, token = experiment(lab)
         for _ in range(10_000):
             lab.clock.advance(0.002)
@@ -196,7 +197,7 @@ class TestReadings:
 
     def test_elbow_has_the_worse_sensor(self):
         rows, angles = [], []
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab, "DoublePendulum", initial_position=[1.0, 0.0])
             for _ in range(3000):
                 lab.clock.advance(0.005)
@@ -215,13 +216,13 @@ class TestReadings:
 
     def test_share_of_stale_repeats_is_the_measured_one(self):
         """In the public swings of 10 s, 44.1 to 44.7 % of the rows at 1 kHz repeat the last."""
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 10.0, 0.001, "get_velocity")
         assert np.mean(np.diff(velocity) == 0.0) == pytest.approx(0.445, abs=0.015)
 
     def test_new_samples_come_after_one_or_two_milliseconds(self):
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 5.0, 0.0005, "get_velocity")
         gaps = np.diff(np.flatnonzero(np.diff(velocity)))
