@@ -146,7 +146,6 @@ SLOW_TESTS = (
     "test_cli_playing.py::TestRecord::test_a_report",
     "test_cli_playing.py::TestInterruption",
     "test_cli_playing.py::TestRecord::test_several",
-    "test_cli_playing.py::test_wrong_names",
     "test_cli_signals.py::TestEnd::test_is_not",
     "test_cli_signals.py::TestEnd::test_of_simulate",
     "test_cli_signals.py::TestEnd::test_while",
