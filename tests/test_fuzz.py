@@ -12,9 +12,7 @@ import fuzz_rendering
 import pytest
 from fuzz_driver import Case, CaseError
 
-import fmugym
 from fmugym import ConfigError
-from fmugym.lab import service
 
 ODD = {
     fuzz: (400, 20),
@@ -47,22 +45,6 @@ def test_a_failure_is_reported(monkeypatch):
     first, last = fuzz_driver.run(fuzz.program, 1, seed="tests").failures
     assert "left ['trace']" in first
     assert last == "left ['trace'] at the end"
-
-
-def test_a_failure_of_the_face_is_reported(monkeypatch):
-    monkeypatch.setattr(fmugym.env, "check_seed", lambda seed: 1 / 0)
-    failures = fuzz_driver.run(fuzz_face.program, 40, seed="tests").failures
-    assert any("ZeroDivisionError" in failure for failure in failures)
-    monkeypatch.undo()
-    monkeypatch.setattr(fmugym.archive.fmu, "remove_folder", lambda folder, process: None)
-    failures = fuzz_driver.run(fuzz_face.program, 60, seed="tests").failures
-    assert any(": left ['" in failure for failure in failures)
-
-
-def test_a_failure_of_the_lab_is_reported(monkeypatch):
-    monkeypatch.setattr(service, "text_of", lambda kind, token: token.strip())
-    failures = fuzz_driver.run(fuzz_lab.program, 60, seed="tests").failures
-    assert any("AttributeError" in failure for failure in failures)
 
 
 class TestDriver:
