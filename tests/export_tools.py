@@ -211,11 +211,12 @@ class Runner:
 
     def begin(self, **parameters):
         """Begin an episode."""
-        starts = self.facts["memory"] | parameters
         self.memory = {
             name: np.repeat(np.array(start, self._kinds[name])[None], self._count, axis=0)
-            for name, start in starts.items()
+            for name, start in self.facts["memory"].items()
         }
+        for name, value in parameters.items():
+            self.memory[name][:] = value
 
     def steps(self, measurements):
         """The actions for measurements of shape (N, m)."""
