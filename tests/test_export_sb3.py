@@ -13,7 +13,6 @@ from test_export import Filtered
 from fmugym import ConfigError
 from fmugym.export import Scaling, agent_of, network_of
 from fmugym.export.policies import network_of_model
-from fmugym.tools.cli import main
 
 sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra 'sb3'")
 torch = pytest.importorskip("torch", reason="needs PyTorch")
@@ -207,54 +206,48 @@ class Pretend(gymnasium.Env):
 class TestCommand:
     """``fmugym export``."""
 
-    def test_from_training_to_c(self, tmp_path, capsys):
-        task, folder = str(EXAMPLES / "cart_pole.toml"), tmp_path / "trained"
-        options = [
-            "--algorithm",
-            "PPO",
-            "--steps",
-            "256",
-            "--envs",
-            "2",
-            "--episodes",
-            "1",
-            "n_steps=64",
-        ]
-        assert main(["train", task, "--output", str(folder), *options]) == 0
-        capsys.readouterr()
-        output = tmp_path / "agent.c"
-        command = ["export", str(folder), "--task", task, "--output", str(output)]
-        assert main([*command, "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
+    def test_from_training_to_c(self, tmp_path, cli):
+        task, folder, output = EXAMPLES / "cart_pole.toml", tmp_path / "agent", tmp_path / "agent.c"
+        options = "--steps", "256", "--envs", "2", "--episodes", "1", "n_steps=64"
+        code, *_ = cli("train", task, "--output", folder, "--algorithm", "PPO", *options)
+        assert code == 0
+        command = "export", folder, "--task", task, "--output", output
+        code, out, _ = cli(*command, "--json")
+        facts = json.loads(out)
+        assert code == 0
         assert facts["files"] == [str(tmp_path / "agent.h"), str(output)]
         assert [one["name"] for one in facts["measurements"]] == ["x", "x_dot", "phi", "phi_dot"]
         assert facts["actions"] == [{"name": "f", "unit": "N"}]
         assert facts["sample_time"] == 0.02
-        assert main(command) == 1  # the files are there
-        assert "agent.c exists" in capsys.readouterr().err
+        code, _, err = cli(*command)
+        assert (code, "agent.c exists" in err) == (1, True)  # the files are there
 
-    def test_to_an_fmu(self, tmp_path, capsys):
-        env = made("House")
-        model_of("PPO", env).save(tmp_path / "model.zip")
-        env.close()
-        output = tmp_path / "heater.fmu"
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/House-v0"]
-        assert main([*command, "--output", str(output), "--fmi", "3.0", "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
-        assert [one["name"] for one in facts["parameters"]] == ["clock"]
-        assert validate_fmu(str(output)) == []
-        assert main(["info", str(output)]) == 0
-        assert "heater" in capsys.readouterr().out
+    @pytest.fixture
+    def export(self, tmp_path, cli):
+        """Export an untrained model; it, the exit code, and what the command printed."""
 
-    def test_to_onnx(self, tmp_path, capsys):
+        def command(env_id, output, *options, algorithm="PPO"):
+            env = made(env_id)
+            model = model_of(algorithm, env)
+            model.save(tmp_path / "model.zip")
+            env.close()
+            arguments = "--task", f"fmugym/{env_id}-v0", "--output", tmp_path / output
+            return model, *cli("export", tmp_path / "model.zip", *arguments, *options)
+
+        return command
+
+    def test_to_an_fmu(self, export, tmp_path, cli):
+        _, code, out, _ = export("House", "heater.fmu", "--fmi", "3.0", "--json")
+        assert code == 0
+        assert [one["name"] for one in json.loads(out)["parameters"]] == ["clock"]
+        assert validate_fmu(str(tmp_path / "heater.fmu")) == []
+        code, out, _ = cli("info", tmp_path / "heater.fmu")
+        assert (code, "heater" in out) == (0, True)
+
+    def test_to_onnx(self, export, tmp_path):
         runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
-        env = made("CartPole")
-        model = model_of("PPO", env)
-        model.save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
-        assert main([*command, "--output", str(tmp_path / "agent.onnx")]) == 0
-        assert "action f N" in capsys.readouterr().out
+        model, code, out, _ = export("CartPole", "agent.onnx")
+        assert (code, "action f N" in out) == (0, True)
         session = runtime.InferenceSession(str(tmp_path / "agent.onnx"))
         seen = np.random.default_rng(0).normal(size=(100, 4))
         count = np.zeros(100, np.int64)
@@ -262,20 +255,11 @@ class TestCommand:
         best, _ = model.predict(seen.astype(np.float32), deterministic=True)
         assert actions[:, 0].tolist() == np.where(best, 10.0, -10.0).tolist()
 
-    def test_of_a_model_file(self, tmp_path, capsys):
-        env = made("Pendulum")
-        model_of("SAC", env).save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/Pendulum-v0"]
-        command += ["--output", str(tmp_path / "swing.c")]
-        assert main([*command, "--algorithm", "SAC"]) == 0
-        assert "action tau N.m" in capsys.readouterr().out
+    def test_of_another_algorithm(self, export):
+        _, code, out, _ = export("Pendulum", "swing.c", "--algorithm", "SAC", algorithm="SAC")
+        assert (code, "action tau N.m" in out) == (0, True)
 
     @pytest.mark.parametrize(("output", "fact"), [("a-b.c", "'a-b'"), ("no/agent.c", "no folder")])
-    def test_mistakes(self, output, fact, tmp_path, capsys):
-        env = made("CartPole")
-        model_of("PPO", env).save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
-        assert main([*command, "--output", str(tmp_path / output)]) == 1
-        assert fact in capsys.readouterr().err
+    def test_mistakes(self, output, fact, export):
+        _, code, _, err = export("CartPole", output)
+        assert (code, fact in err) == (1, True)
