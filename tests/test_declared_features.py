@@ -380,6 +380,7 @@ TWICE = BASE | {
         "history": {"of": ["angle", "q"], "length": "0.5s"},
     },
     "reward": "angle + turned + q_dot - previous(angle)",
+    "truncated": "time >= 3",
 }
 
 
