@@ -4,16 +4,20 @@ import collections
 import contextlib
 import functools
 import gc
+import importlib
 import os
 import sys
 import tempfile
 
 import building
+import example_tools
 import fmu_tools
 import pytest
 import tiers
 import wine_tools
 
+import fmugym
+from fmugym.tools.cli import main
 from fmugym.wine.prefix import Wine
 
 # The processes of a test run share a folder: the first one makes it, and removes it.
@@ -87,6 +91,12 @@ def opened():
 
 
 @pytest.fixture
+def load(opened):
+    """Make environments of declared tasks that are closed after the test."""
+    return lambda *arguments, **options: opened(fmugym.load(*arguments, **options))
+
+
+@pytest.fixture
 def make_env(probe, opened):
     """Make environments over the probe that are closed after the test."""
 
@@ -95,6 +105,24 @@ def make_env(probe, opened):
         return opened(cls(path or probe(version), config, render_mode=render_mode))
 
     return make
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """Import an example by its name, as a program beside it does."""
+    monkeypatch.syspath_prepend(str(example_tools.EXAMPLES))
+    return importlib.import_module
+
+
+@pytest.fixture
+def cli(capsys):
+    """Call the command line; its exit code, and what it printed to both streams."""
+
+    def call(*arguments):
+        code = main(list(map(str, arguments)))
+        return code, *capsys.readouterr()
+
+    return call
 
 
 @pytest.fixture

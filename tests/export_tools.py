@@ -2,19 +2,21 @@
 
 import ctypes
 import itertools
+import json
 import shutil
 import subprocess
 import sys
 from contextlib import contextmanager
 from types import SimpleNamespace
 
+import gymnasium
 import numpy as np
 import pytest
 from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from gymnasium import spaces
 
-from fmugym.export import Activation, Layer, Network, Scaling, write_c
+from fmugym.export import Activation, Layer, Network, Scaling, write_c, write_onnx
 
 FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
 COMPILERS = {"C99": ["cc", "-std=c99"], "C++": ["c++", "-std=c++11", "-x", "c++"]}
@@ -68,22 +70,68 @@ TIMES = {
 """When its episodes begin."""
 
 
-def largest_difference(env, network, logic, step, steps):
-    """The largest difference of inputs while the environment's own agent acts.
+def made(env_id):
+    """A registered environment without wrappers."""
+    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
 
-    ``step`` takes the measurements, and returns the actions of the exported agent.
+
+def differences(env, act, logic, step, steps, plant=None):
+    """Let the exported agent act beside the environment's own one, until the episode ends.
+
+    Args:
+        env: An environment that has been reset. It may have a wrapper.
+        act: The environment's agent: from an observation to an action.
+        logic: What the exported agent measures and writes.
+        step: The exported agent: from measurements to actions.
+        steps: How many, at most.
+        plant: What the exported agent controls; without it, it measures the environment.
+
+    Returns:
+        The largest differences of measurements and of inputs, and the number of steps.
     """
-    observation, worst = env._get_observation(), 0.0
-    for _ in range(steps):
-        actions = step([env.out[one.name] for one in logic.measurements])
-        action = network.action(np.ravel(observation))
-        is_discrete = isinstance(env.action_space, spaces.Discrete)
-        observation, _, terminated, *_ = env.step(int(action[0]) if is_discrete else action)
-        inputs = dict(zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True))
-        worst = max(worst, np.abs(actions - np.array([inputs[v.name] for v in logic.inputs])).max())
-        if terminated:
+    outer, env = env, env.unwrapped
+    measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
+    interface, worst = env.inside.interface, np.zeros(2)
+    observation = env._get_observation()
+    for count in range(steps):
+        seen = [env.out[name] for name in measured]
+        own = plant.read(measured) if plant else seen
+        actions = step(own)
+        action = act(observation)
+        if isinstance(outer.action_space, spaces.Discrete):
+            action = int(np.ravel(action)[0])
+        observation, _, terminated, truncated, _ = outer.step(action)
+        inputs = dict(zip([v.name for v in interface.inputs], env.inputs, strict=True))
+        pairs = (own, seen), (actions, [inputs[name] for name in written])
+        worst = np.maximum(worst, [np.abs(np.subtract(*pair)).max() for pair in pairs])
+        if plant:
+            inputs |= dict(zip(written, actions, strict=True))
+            plant.write(list(inputs), list(inputs.values()))
+            plant.step(count * interface.time_step)
+        if terminated or truncated:
             break
-    return worst
+    return *worst, count + 1
+
+
+def acting(network):
+    """A network as an agent of an environment."""
+    return lambda observation: network.action(np.ravel(observation))
+
+
+def closed_loop(env, act, agent, folder, steps=1000, seed=0, language="C99"):
+    """The ``differences`` in an episode with a plant in FMPy and the exported agent."""
+    controller = exported(agent, folder, language)
+    env.reset(seed=seed)
+    controller.begin(**drawn_in(env.unwrapped, agent.logic))
+    with plant_of(env.unwrapped, folder) as plant:
+        return differences(env, act, agent.logic, controller.step, steps, plant)
+
+
+def exported(agent, folder, language="C99"):
+    """An agent in a language, which takes samples: ``COMPILERS`` has some, ``"ONNX"`` is one."""
+    if language != "ONNX":
+        return compiled(agent, folder, language)
+    return Runner(write_onnx(agent, folder / "agent.onnx"))
 
 
 def drawn_in(env, logic):
@@ -145,6 +193,42 @@ class CompiledAgent:
         if self._step(self._state, numbers, self._actions):
             return None
         return list(self._actions)
+
+
+class Runner:
+    """Takes samples with ONNX Runtime, as a user would."""
+
+    def __init__(self, path, count=1):
+        runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
+        self.session = runtime.InferenceSession(str(path))
+        facts = self.session.get_modelmeta().custom_metadata_map
+        self.facts = {name: json.loads(value) for name, value in facts.items()}
+        types = {"tensor(double)": np.float64, "tensor(float)": np.float32}
+        types["tensor(int64)"] = np.int64
+        self._kinds = {one.name: types[one.type] for one in self.session.get_inputs()}
+        self._count = count
+        self.begin()
+
+    def begin(self, **parameters):
+        """Begin an episode."""
+        self.memory = {
+            name: np.repeat(np.array(start, self._kinds[name])[None], self._count, axis=0)
+            for name, start in self.facts["memory"].items()
+        }
+        for name, value in parameters.items():
+            self.memory[name][:] = value
+
+    def steps(self, measurements):
+        """The actions for measurements of shape (N, m)."""
+        names = ["actions", *(f"next_{name}" for name in self.memory)]
+        inputs = {"measurements": np.asarray(measurements, np.float64), **self.memory}
+        actions, *memory = self.session.run(names, inputs)
+        self.memory = dict(zip(self.memory, memory, strict=True))
+        return actions
+
+    def step(self, measurements):
+        """The actions for those of one plant."""
+        return self.steps([measurements])[0]
 
 
 @contextmanager
@@ -212,3 +296,20 @@ def arguments_of(ufunc, dtype):
     if name == "arccosh":
         first = abs(first) + 1.1
     return [part.astype(dtype) for part in (first, second)[: ufunc.nin]]
+
+
+ACTIVATIONS = [
+    *map(Activation, ["tanh", "relu", "sigmoid", "silu"]),
+    Activation("leaky_relu", (0.02,)),
+    Activation("elu", (0.7,)),
+    Activation("softplus", (1.5, 20.0)),
+    Activation("clamp", (-0.5, 0.25)),
+]
+"""Each kind of a layer's activation."""
+
+
+def network_with(activation, env, squashed):
+    """A network whose first layer has an activation."""
+    first, *rest = network_for(env, squashed=squashed).layers
+    layers = Layer(first.weights, first.bias, (activation,)), *rest
+    return Network(layers, env.action_space, squashed=squashed)

@@ -254,3 +254,15 @@ def probe_config(**changes):
     """A config for the probe: one input, its integral as output."""
     config = {"model_input_names": "a", "model_output_names": ["sum", "mix"], "time_step": 0.1}
     return grouped(config | changes)
+
+
+def interrupted_after(count, original, error=KeyboardInterrupt):
+    """A function like another one, which fails after some calls."""
+    calls = iter(range(count))
+
+    def call(*arguments, **keywords):
+        if next(calls, None) is None:
+            raise error
+        return original(*arguments, **keywords)
+
+    return call

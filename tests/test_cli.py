@@ -4,18 +4,19 @@ import json
 import logging
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
 import zipfile
 import zlib
 
+import foreign_talker
 import makers
 import pytest
 import quirk_table
 import zoo_tools
 from fmu_tools import HERE, library_name, probe_fmu, read_fmu
+from pythonfmu.builder import FmuBuilder
 
 import fmugym
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
@@ -217,12 +218,7 @@ class TestInfo:
 class TestSkeleton:
     @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
     def test_runs_and_keeps_the_contract(self, tmp_path, model, fmi_version):
-        fmu = fmugym.bundled_fmu(model, fmi_version)
-        assert run("new", "--class", fmu, "--output", tmp_path / "made.py").returncode == 0
-        command = [sys.executable, "-W", "error", "made.py"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, done.stderr
-        assert "keeps the contract" in done.stdout
+        assert_skeleton_runs(fmugym.bundled_fmu(model, fmi_version), tmp_path, "-W", "error")
 
     @pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
     def test_base_class_and_names_are_those_of_the_fmu(self, skeleton, fmi_version):
@@ -232,14 +228,6 @@ class TestSkeleton:
         assert '"g": 9.81,  # [m/s2]' in text
         assert '"body": "point_mass",' in text
         assert '"bounds"' not in text  # the FMU has limits for its input
-
-    def test_output_is_a_new_file_only(self, tmp_path, capsys):
-        target = tmp_path / "mine.py"
-        target.write_text("precious")
-        fmu = str(fmugym.bundled_fmu("Pendulum"))
-        assert main(["new", "--class", fmu, "--output", str(target)]) == 1
-        assert "exists" in capsys.readouterr().err
-        assert target.read_text() == "precious"
 
     def test_unbounded_inputs_get_placeholders_and_a_note(self, skeleton, make_fmu):
         half = variable("v", '<Real start="0" min="2"/>')
@@ -325,11 +313,11 @@ class TestSkeleton:
         made.append(quirk_table.quirk_fmu(tmp_path, version, "well behaved"))
         made.append(zoo_tools.zoo_fmu(tmp_path, version))
         for path in made:
-            assert_skeleton_runs(path)
+            assert_skeleton_runs(path, tmp_path)
 
     @pytest.mark.parametrize("name", makers.MADE)
     def test_runs_for_fmus_of_other_makers(self, tmp_path, name):
-        assert_skeleton_runs(makers.MADE[name].build(tmp_path))
+        assert_skeleton_runs(makers.MADE[name].build(tmp_path), tmp_path)
 
     def test_what_a_number_cannot_carry_is_left_out(self, skeleton, make_fmu):
         made = skeleton(
@@ -376,15 +364,8 @@ class TestSkeleton:
         assert "to observe" in capsys.readouterr().err
 
     def test_runs_for_an_fmu_without_inputs_of_another_exporter(self, tmp_path):
-        (tmp_path / "decay.py").write_text(DECAY)
-        builder = shutil.which("pythonfmu", path=os.path.dirname(sys.executable))
-        command = [builder, "build", "-f", "decay.py", "--no-external-tool"]
-        subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
-        made = run("new", "--class", tmp_path / "Decay.fmu", "--output", tmp_path / "made.py")
-        assert "no numeric input" in made.stderr
-        command = [sys.executable, "made.py"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert "DecayEnv keeps the contract" in done.stdout, done.stderr
+        fmu = FmuBuilder.build_FMU(foreign_talker.__file__, tmp_path)
+        assert_skeleton_runs(fmu, tmp_path)
 
 
 class TestNew:
@@ -411,34 +392,13 @@ class TestNew:
         assert tomllib.loads(text)["variables"].keys() == {"u"}
 
 
-def assert_skeleton_runs(path):
-    """Write a skeleton beside an FMU and run it."""
-    program = path.with_suffix(".py")
-    assert run("new", "--class", path, "--output", program).returncode == 0
-    command = [sys.executable, program.name]
-    done = subprocess.run(
-        command, cwd=path.parent, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert "keeps the contract" in done.stdout, done.stderr
-
-
-DECAY = """
-from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
-
-
-class Decay(Fmi2Slave):
-    def __init__(self, **kwargs):
-        super().__init__(**kwargs)
-        self.x = 1.0
-        self.rate = 0.5
-        self.register_variable(Real("x", causality=Fmi2Causality.output))
-        kind = dict(causality=Fmi2Causality.parameter, variability=Fmi2Variability.fixed)
-        self.register_variable(Real("rate", **kind))
-
-    def do_step(self, current_time, step_size):
-        self.x -= self.rate * self.x * step_size
-        return True
-"""
+def assert_skeleton_runs(fmu, folder, *options):
+    """Write a skeleton into a folder and run it."""
+    assert main(["new", "--class", str(fmu), "--output", str(folder / "made.py"), "--force"]) == 0
+    command = [sys.executable, *options, "made.py"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "keeps the contract" in done.stdout
 
 
 def config_of(text):

@@ -10,7 +10,6 @@ import pytest
 from source_tools import write_source_fmu
 
 import fmugym
-from fmugym.tools.cli import main
 
 COMMANDS = [
     *("info", "new", "validate", "simulate", "train", "evaluate", "tune", "export", "bench"),
@@ -18,39 +17,34 @@ COMMANDS = [
 ]
 
 
-def run(capsys, *arguments):
-    code = main(list(map(str, arguments)))
-    return code, *capsys.readouterr()
-
-
 class TestOldNames:
     """They work for one release, and tell the present name."""
 
-    def test_skeleton(self, capsys):
+    def test_skeleton(self, cli):
         fmu = fmugym.bundled_fmu("Pendulum")
-        code, out, err = run(capsys, "skeleton", fmu)
+        code, out, err = cli("skeleton", fmu)
         assert code == 0
-        assert out == run(capsys, "new", "--class", fmu)[1]
+        assert out == cli("new", "--class", fmu)[1]
         assert f"'skeleton' is going away; it is now: fmugym new --class {fmu}" in err
 
-    def test_record(self, capsys, tmp_path):
+    def test_record(self, cli, tmp_path):
         arguments = ["fmugym/CartPole-v0", "--action", "0"]
-        code, _, err = run(capsys, "record", *arguments, "--output", tmp_path / "old.csv")
+        code, _, err = cli("record", *arguments, "--output", tmp_path / "old.csv")
         assert code == 0
         assert "fmugym simulate fmugym/CartPole-v0" in err
-        assert run(capsys, "simulate", *arguments, "--output", tmp_path / "new.csv")[0] == 0
+        assert cli("simulate", *arguments, "--output", tmp_path / "new.csv")[0] == 0
         assert (tmp_path / "old.csv").read_text() == (tmp_path / "new.csv").read_text()
 
-    def test_compile(self, capsys, tmp_path):
+    def test_compile(self, cli, tmp_path):
         write_source_fmu(tmp_path / "model.fmu")
-        code, out, err = run(capsys, "compile", tmp_path / "model.fmu")
+        code, out, err = cli("compile", tmp_path / "model.fmu")
         assert code == 0
         assert "compiled for" in out
         assert f"fmugym info --repair {tmp_path / 'model.fmu'}" in err
 
-    def test_stand_in(self, capsys, tmp_path):
+    def test_stand_in(self, cli, tmp_path):
         fmu = fmugym.bundled_fmu("Pendulum")  # which lacks no library and has no source code
-        code, _, err = run(capsys, "stand-in", fmu, "--folder", tmp_path)
+        code, _, err = cli("stand-in", fmu, "--folder", tmp_path)
         assert code == 1
         assert f"fmugym info --repair {fmu} --output {tmp_path}" in err
 

@@ -7,15 +7,16 @@ import subprocess
 import sys
 import time
 import zipfile
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fmu_tools import interrupted_after
 from PIL import Image
 
 import fmugym
-from fmugym.tools.cli import main
 
 pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
 
@@ -32,12 +33,6 @@ LEVELS = {
 PENDULUM = LEVELS | {"variables": {"tau": {"min": -0.1, "max": 0.1}}}
 ON_POLICY = "--algorithm", "PPO", "n_steps=32", "batch_size=32", "n_epochs=2"
 OFF_POLICY = "--algorithm", "SAC", "learning_starts=20", "batch_size=16", "buffer_size=1000"
-
-
-def run(capsys, *arguments):
-    code = main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
 
 
 @pytest.fixture
@@ -68,47 +63,44 @@ def leaves(value):
     return value.detach().numpy().tobytes() if hasattr(value, "detach") else value
 
 
+@contextmanager
+def interrupted(algorithm, updates):
+    """Ctrl-C arrives in a training after some updates."""
+    import stable_baselines3
+
+    cls = getattr(stable_baselines3, algorithm)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cls, "train", interrupted_after(updates, cls.train))
+        yield
+
+
 class TestResume:
     @pytest.mark.parametrize(
-        ("options", "method"),
-        [(ON_POLICY, "PPO.train"), (OFF_POLICY, "SAC.train")],
+        ("options", "algorithm"),
+        [(ON_POLICY, "PPO"), (OFF_POLICY, "SAC")],
         ids=["PPO", "SAC"],
     )
-    def test_takes_the_same_course_to_the_last_bit(
-        self, options, method, task, tmp_path, capsys, monkeypatch
-    ):
+    def test_takes_the_same_course_to_the_last_bit(self, options, algorithm, task, tmp_path, cli):
         common = "--envs", "2", "--steps", "320", "--episodes", "2", *options
         whole, parts = tmp_path / "whole", tmp_path / "parts"
-        assert run(capsys, "train", task, "--output", whole, *common)[0] == 0
+        assert cli("train", task, "--output", whole, *common)[0] == 0
 
-        import stable_baselines3
-
-        cls, name = getattr(stable_baselines3, method.partition(".")[0]), "train"
-        original, calls = getattr(cls, name), iter(range(3 if options is ON_POLICY else 100))
-
-        def train(self, *args, **kwargs):
-            if next(calls, None) is None:
-                raise KeyboardInterrupt
-            return original(self, *args, **kwargs)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(cls, name, train)
-            code, *_ = run(capsys, "train", task, "--output", parts, *common)
-            assert code == 130
+        with interrupted(algorithm, 3 if options is ON_POLICY else 100):
+            assert cli("train", task, "--output", parts, *common)[0] == 130
         before = json.loads((parts / "checkpoint.json").read_text())["steps"]
         assert 0 < before < 320
-        code, _, err = run(capsys, "train", task, "--output", parts, "--resume")
+        code, _, err = cli("train", task, "--output", parts, "--resume")
         assert code == 0
         assert f"goes on after {before} steps\n" in err
         assert parameters(parts) == parameters(whole)
         for file in ("evaluations.csv", "agent.json", "training.json"):
             assert (parts / file).read_text() == (whole / file).read_text()
 
-    def test_may_be_longer(self, task, tmp_path, capsys):
+    def test_may_be_longer(self, task, tmp_path, cli):
         folder = tmp_path / "agent"
         options = "--envs", "2", "--episodes", "1", *ON_POLICY
-        run(capsys, "train", task, "--output", folder, "--steps", "64", *options)
-        code, *_ = run(capsys, "train", task, "--output", folder, "--resume", "--steps", "192")
+        cli("train", task, "--output", folder, "--steps", "64", *options)
+        code, *_ = cli("train", task, "--output", folder, "--resume", "--steps", "192")
         assert code == 0
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
         steps = [int(row["steps"]) for row in rows]
@@ -117,29 +109,29 @@ class TestResume:
         assert (folder / "progress.csv").exists()
         assert (folder / "progress_from_64.csv").exists()
 
-    def test_what_cannot_be_resumed(self, task, tmp_path, capsys):
+    def test_what_cannot_be_resumed(self, task, tmp_path, cli):
         folder = tmp_path / "agent"
         algorithm = "--algorithm", "PPO"
-        code, _, err = run(capsys, "train", task, "--output", folder, "--resume", *algorithm)
+        code, _, err = cli("train", task, "--output", folder, "--resume", *algorithm)
         assert (code, "no training to resume" in err) == (1, True)
         options = "--envs", "2", "--steps", "64", "--episodes", "1", *ON_POLICY
-        run(capsys, "train", task, "--output", folder, *options)
+        cli("train", task, "--output", folder, *options)
         for change, fact in (
             (("--envs", "3"), "envs = 2"),
             (("--algorithm", "A2C"), "algorithm"),
             (("gamma=0.5",), "arguments"),
         ):
-            code, _, err = run(capsys, "train", task, "--output", folder, "--resume", *change)
+            code, _, err = cli("train", task, "--output", folder, "--resume", *change)
             assert code == 1
             assert fact in err
             assert err.count("\n") == 1
         other = tmp_path / "other.toml"
         fmugym.Task.from_dict(PENDULUM | {"time_step": 0.1}).write(other)
-        code, _, err = run(capsys, "train", other, "--output", folder, "--resume", "--steps", "128")
+        code, _, err = cli("train", other, "--output", folder, "--resume", "--steps", "128")
         assert (code, err.count("\n")) == (1, 1)
         (place,) = folder.glob("checkpoint-*")
         (place / "state.pkl").write_bytes(b"broken")
-        code, _, err = run(capsys, "train", task, "--output", folder, "--resume")
+        code, _, err = cli("train", task, "--output", folder, "--resume")
         assert code == 1
         assert "cannot be resumed" in err
 
@@ -152,11 +144,11 @@ def steps_of(folder):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signals_keep_the_agent_and_a_checkpoint(number, task, tmp_path, temp_root, capsys):
+def test_signals_keep_the_agent_and_a_checkpoint(number, task, tmp_path, temp_root, cli):
     folder = tmp_path / "agent"
     options = "--envs", "2", "--steps", "100000", "--episodes", "1", *ON_POLICY
     program = (
-        "import sys; from fmugym.tools import training\n"
+        "import sys; from fmugym.training import training\n"
         "training._SECONDS_BETWEEN_CHECKPOINTS = 0.0\n"
         "from fmugym.__main__ import main; sys.exit(main())"
     )
@@ -171,15 +163,15 @@ def test_signals_keep_the_agent_and_a_checkpoint(number, task, tmp_path, temp_ro
     assert not list(temp_root.glob("fmugym-*"))
     assert (folder / "model.zip").exists()
     assert steps_of(folder) > 0
-    code, out, _ = run(capsys, "simulate", task, "--agent", folder, "--episodes", "2", "--json")
+    code, out, _ = cli("simulate", task, "--agent", folder, "--episodes", "2", "--json")
     assert code == 0
     assert len(json.loads(out)["episodes"]) == 2
 
 
-def test_json_of_a_training(task, tmp_path, capsys):
+def test_json_of_a_training(task, tmp_path, cli):
     folder = tmp_path / "agent"
     options = "--envs", "2", "--steps", "64", "--episodes", "1", *ON_POLICY
-    code, out, _ = run(capsys, "train", task, "--output", folder, *options, "--json")
+    code, out, _ = cli("train", task, "--output", folder, *options, "--json")
     facts = json.loads(out)
     assert code == 0
     assert facts["algorithm"] == "PPO"
@@ -191,38 +183,34 @@ def test_json_of_a_training(task, tmp_path, capsys):
 
 
 class TestAlgorithms:
-    @pytest.mark.parametrize("name", ["A2C", "TD3", "DDPG", "TQC", "ARS", "TRPO"])
-    def test_of_continuous_actions(self, name, task, tmp_path, capsys):
-        self.train_and_play(name, task, tmp_path, capsys)
-
-    @pytest.mark.parametrize("name", ["DQN", "QRDQN", "MaskablePPO", "RecurrentPPO"])
-    def test_of_levels(self, name, tmp_path, capsys):
-        task = tmp_path / "levels.toml"
-        fmugym.Task.from_dict(LEVELS).write(task)
-        self.train_and_play(name, task, tmp_path, capsys)
-
-    def train_and_play(self, name, task, tmp_path, capsys):
+    @pytest.mark.parametrize(
+        ("name", "document"),
+        [
+            *((name, PENDULUM) for name in ("A2C", "TD3", "DDPG", "TQC", "ARS", "TRPO")),
+            *((name, LEVELS) for name in ("DQN", "QRDQN", "MaskablePPO", "RecurrentPPO")),
+        ],
+    )
+    def test_train_and_play(self, name, document, tmp_path, cli):
         if name not in ("A2C", "TD3", "DDPG", "DQN"):
             pytest.importorskip("sb3_contrib", reason="needs sb3-contrib: the extra test-sb3")
-        folder = tmp_path / "agent"
+        folder, task = tmp_path / "agent", tmp_path / "task.toml"
+        fmugym.Task.from_dict(document).write(task)
         options = "--envs", "2", "--steps", "40", "--episodes", "1", "--algorithm", name
         small = ("n_steps=8", "batch_size=8") if "PPO" in name or name == "TRPO" else ()
-        code, _, err = run(capsys, "train", task, "--output", folder, *options, *small)
+        code, _, err = cli("train", task, "--output", folder, *options, *small)
         assert code == 0, err
-        code, out, _ = run(capsys, "evaluate", task, "--agent", folder, "--episodes", "1", "--json")
+        code, out, _ = cli("evaluate", task, "--agent", folder, "--episodes", "1", "--json")
         assert code == 0
         assert np.isfinite(json.loads(out)["scores"][1]["mean_reward"])
 
 
 class TestTune:
-    def test_finds_arguments_and_trains_with_them(self, task, tmp_path, capsys):
+    def test_finds_arguments_and_trains_with_them(self, task, tmp_path, cli):
         pytest.importorskip("optuna", reason="needs Optuna: the extra tune")
         folder = tmp_path / "agent"
         options = "--envs", "2", "--steps", "256", "--episodes", "1", "--tune", "3"
         options = "--algorithm", "PPO", *options
-        code, out, err = run(
-            capsys, "train", task, "--output", folder, *options, "gamma=0.9", "--json"
-        )
+        code, out, err = cli("train", task, "--output", folder, *options, "gamma=0.9", "--json")
         assert code == 0, err
         rows = list(csv.DictReader((folder / "trials.csv").read_text().splitlines()))
         assert len(rows) == 3
@@ -234,10 +222,10 @@ class TestTune:
         assert (folder / "trials" / "002" / "training.json").exists()
         assert json.loads((folder / "training.json").read_text())["arguments"] == facts["arguments"]
 
-    def test_without_optuna_the_extra_is_named(self, task, tmp_path, capsys, monkeypatch):
+    def test_without_optuna_the_extra_is_named(self, task, tmp_path, cli, monkeypatch):
         monkeypatch.setitem(sys.modules, "optuna", None)
         arguments = "--output", tmp_path / "agent", "--algorithm", "PPO", "--tune", "2"
-        code, _, err = run(capsys, "train", task, *arguments)
+        code, _, err = cli("train", task, *arguments)
         assert code == 1
         assert ".[tune]" in err
         assert not (tmp_path / "agent").exists()
@@ -248,12 +236,12 @@ class TestTrack:
         folder = "--output", tmp_path / "agent"
         return "--envs", "2", "--steps", "192", "--episodes", "1", *ON_POLICY, *folder
 
-    def test_mlflow(self, task, tmp_path, capsys, monkeypatch):
+    def test_mlflow(self, task, tmp_path, cli, monkeypatch):
         mlflow = pytest.importorskip("mlflow", reason="needs MLflow: the extra mlflow")
         monkeypatch.setenv("MLFLOW_TRACKING_URI", (tmp_path / "runs").as_uri())
         monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
         mlflow.set_tracking_uri((tmp_path / "runs").as_uri())
-        code, _, err = run(capsys, "train", task, *self.options(tmp_path), "--track", "mlflow")
+        code, _, err = cli("train", task, *self.options(tmp_path), "--track", "mlflow")
         assert code == 0, err
         (found,) = mlflow.search_runs(search_all_experiments=True, output_format="list")
         assert found.data.params["algorithm"] == "PPO"
@@ -263,18 +251,18 @@ class TestTrack:
         assert found.data.metrics["evaluation.reward"] == float(row["reward"])
         assert any(name.startswith("train.") for name in found.data.metrics)
 
-    def test_wandb(self, task, tmp_path, capsys, monkeypatch):
+    def test_wandb(self, task, tmp_path, cli, monkeypatch):
         pytest.importorskip("wandb", reason="needs W&B: the extra wandb")
         monkeypatch.setenv("WANDB_MODE", "offline")
         monkeypatch.setenv("WANDB_SILENT", "true")
-        code, _, err = run(capsys, "train", task, *self.options(tmp_path), "--track", "wandb")
+        code, _, err = cli("train", task, *self.options(tmp_path), "--track", "wandb")
         assert code == 0, err
         assert list((tmp_path / "agent").rglob("offline-run-*/*.wandb"))
 
     @pytest.mark.parametrize("name", ["mlflow", "wandb"])
-    def test_a_missing_library_names_its_extra(self, name, task, tmp_path, capsys, monkeypatch):
+    def test_a_missing_library_names_its_extra(self, name, task, tmp_path, cli, monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
-        code, _, err = run(capsys, "train", task, *self.options(tmp_path), "--track", name)
+        code, _, err = cli("train", task, *self.options(tmp_path), "--track", name)
         assert code == 1
         assert f".[{name}]" in err
         assert not (tmp_path / "agent").exists()
@@ -282,10 +270,10 @@ class TestTrack:
 
 class TestDamagedAgents:
     @pytest.fixture
-    def agent(self, task, tmp_path, capsys):
+    def agent(self, task, tmp_path, cli):
         folder = tmp_path / "agent"
         options = "--envs", "2", "--steps", "64", "--episodes", "1", *ON_POLICY
-        assert run(capsys, "train", task, "--output", folder, *options)[0] == 0
+        assert cli("train", task, "--output", folder, *options)[0] == 0
         return folder
 
     @pytest.mark.parametrize(
@@ -298,18 +286,18 @@ class TestDamagedAgents:
             ("agent.json", b'{"algorithm": "PPOO"}'),
         ],
     )
-    def test_are_one_line(self, file, text, agent, task, capsys):
+    def test_are_one_line(self, file, text, agent, task, cli):
         if text is None:
             (agent / file).write_bytes((agent / file).read_bytes()[:2000])
         else:
             (agent / file).write_bytes(text)
-        code, out, err = run(capsys, "evaluate", task, "--agent", agent, "--episodes", "1")
+        code, out, err = cli("evaluate", task, "--agent", agent, "--episodes", "1")
         assert (code, out) == (1, "")
         assert str(agent) in err or "PPOO" in err
         assert err.count("\n") == 1
 
-    def test_for_another_task(self, agent, capsys):
-        code, out, err = run(capsys, "simulate", CART_POLE, "--agent", agent)
+    def test_for_another_task(self, agent, cli):
+        code, out, err = cli("simulate", CART_POLE, "--agent", agent)
         assert (code, out) == (1, "")
         assert "another task" in err
         assert err.count("\n") == 1
@@ -325,11 +313,11 @@ class TestRecord:
     COMMON = ("--envs", "3", "--steps", "288", "--episodes", "2", *ON_POLICY)
     RECORD = ("--record", "q*", "--record", "tau", "--record-env", "0", "--record-env", "2")
 
-    def test_recordings_are_of_the_training_and_change_nothing(self, task, tmp_path, capsys):
+    def test_recordings_are_of_the_training_and_change_nothing(self, task, tmp_path, cli):
         pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
         plain, folder = tmp_path / "plain", tmp_path / "agent"
-        assert run(capsys, "train", task, "--output", plain, *self.COMMON)[0] == 0
-        code, *_ = run(capsys, "train", task, "--output", folder, *self.COMMON, *self.RECORD)
+        assert cli("train", task, "--output", plain, *self.COMMON)[0] == 0
+        code, *_ = cli("train", task, "--output", folder, *self.COMMON, *self.RECORD)
         assert code == 0
         assert parameters(folder) == parameters(plain)
         assert (folder / "evaluations.csv").read_text() == (plain / "evaluations.csv").read_text()
@@ -352,27 +340,15 @@ class TestRecord:
         assert "task.toml" in page
         assert not (plain / "report.html").exists()
 
-    def test_a_training_that_is_resumed_goes_on_with_its_recordings(
-        self, task, tmp_path, capsys, monkeypatch
-    ):
-        import stable_baselines3
-
+    def test_a_training_that_is_resumed_goes_on_with_its_recordings(self, task, tmp_path, cli):
         whole, parts = tmp_path / "whole", tmp_path / "parts"
         rate = "--record-every", "0.1"
         arguments = *self.COMMON, *self.RECORD, *rate
-        assert run(capsys, "train", task, "--output", whole, *arguments)[0] == 0
-        calls, original = iter(range(2)), stable_baselines3.PPO.train
-
-        def train(self, *args, **kwargs):
-            if next(calls, None) is None:
-                raise KeyboardInterrupt
-            return original(self, *args, **kwargs)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(stable_baselines3.PPO, "train", train)
-            assert run(capsys, "train", task, "--output", parts, *arguments)[0] == 130
+        assert cli("train", task, "--output", whole, *arguments)[0] == 0
+        with interrupted("PPO", 2):
+            assert cli("train", task, "--output", parts, *arguments)[0] == 130
         begin = json.loads((parts / "checkpoint.json").read_text())["steps"]
-        assert run(capsys, "train", task, "--output", parts, "--resume")[0] == 0
+        assert cli("train", task, "--output", parts, "--resume")[0] == 0
         again = recorded(parts / "records" / f"training_from_{begin}.csv")
         assert len(again) > 30
         assert again == recorded(whole / "records" / "training.csv")[-len(again) :]
@@ -389,9 +365,9 @@ class TestRecord:
             (["--record-env", "1"], "--record "),
         ],
     )
-    def test_mistakes_are_told_before_the_training(self, options, fact, task, tmp_path, capsys):
+    def test_mistakes_are_told_before_the_training(self, options, fact, task, tmp_path, cli):
         folder = tmp_path / "agent"
-        code, out, err = run(capsys, "train", task, "--output", folder, *self.COMMON, *options)
+        code, out, err = cli("train", task, "--output", folder, *self.COMMON, *options)
         assert (code, out) == (1, "")
         assert fact in err
         assert not folder.exists()

@@ -1,6 +1,6 @@
 """The CloudPendulum environment: on the FMU, on simulated cells, on whatever else is a client."""
 
-import itertools
+import contextlib
 import queue
 import signal
 import subprocess
@@ -24,12 +24,27 @@ M, L, B, G = 0.06, 0.1, 4e-4, 9.81  # kg, m, N m s/rad, m/s^2: the published nom
 
 @pytest.fixture(name="make_lab")
 def fixture_make_lab(opened):
-    """Make labs on a clock that stands still, closed after the test."""
+    """Make labs on a clock that stands still; in the end, nothing runs on them."""
+    labs = []
 
     def make(preset="ideal", **options):
-        return opened(Lab(preset, clock=ManualClock(), seed=0, **options))
+        labs.append(opened(Lab(preset, clock=ManualClock(), seed=0, **options)))
+        return labs[-1]
 
-    return make
+    yield make
+    assert not any(lab.running for lab in labs)
+
+
+@pytest.fixture
+def on_lab(make_lab):
+    """Make environments on a lab, or on a client, that are closed after the test."""
+    with contextlib.ExitStack() as stack:
+
+        def make(backend, **options):
+            made = gym.make_vec if "num_envs" in options else gym.make
+            return stack.enter_context(contextlib.closing(made(ID, backend=backend, **options)))
+
+        yield make
 
 
 def swings(count, amplitude=0.1, seed=0):
@@ -105,22 +120,6 @@ class TestTask:
             np.testing.assert_allclose(states[k + 1], state, atol=2e-3)
         env.close()
 
-    def test_without_friction_the_energy_stays(self):
-        env = CloudPendulumEnv(model_parameters={"q_0": 2.5, "b": 0.0})
-        q, q_dot = run(env, np.zeros((300, 1), np.float32))[0].T
-        energy = 0.5 * M * L**2 * q_dot**2 + M * G * L * (1 - np.cos(q))
-        np.testing.assert_allclose(energy, energy[0], rtol=1e-6)
-        env.close()
-
-    def test_small_swings_have_the_frequency_of_the_closed_form(self):
-        env = CloudPendulumEnv(model_parameters={"q_0": 0.01})
-        q = run(env, np.zeros((200, 1), np.float32))[0][:, 0]
-        decay, time_ = B / (2 * M * L**2), 0.02 * np.arange(201)
-        omega = np.sqrt(G / L - decay**2)
-        expected = np.cos(omega * time_) + decay / omega * np.sin(omega * time_)
-        np.testing.assert_allclose(q, 0.01 * np.exp(-decay * time_) * expected, atol=1e-6)
-        env.close()
-
     def test_the_start(self):
         env = gym.make_vec(ID, num_envs=500)
         observations, infos = env.reset(seed=0)
@@ -149,27 +148,6 @@ class TestTask:
         assert (terminated, truncated) == (True, False)
         assert reward < -1000.0
         assert env.observation_space.contains(observation)
-        env.close()
-
-    def test_ten_seconds(self):
-        env = gym.make(ID)
-        env.reset(seed=0)
-        steps = next(k for k in itertools.count(1) if env.step(np.zeros(1, np.float32))[3])
-        assert steps == 500
-        assert env.unwrapped.time == pytest.approx(10.0)
-        env.close()
-
-    def test_a_nan_is_refused_at_once(self):
-        env = CloudPendulumEnv()
-        env.reset()
-        with pytest.raises(ConfigError, match=r"nan.* finite"):
-            env.step(np.array([np.nan], np.float32))
-        env.close()
-
-    def test_parameters_are_drawn_for_each_episode(self):
-        env = gym.make_vec(ID, num_envs=3, model_parameters={"l": Uniform(0.09, 0.11)})
-        _, infos = env.reset(seed=0)
-        assert len(set(infos["drawn"]["l"])) == 3
         env.close()
 
     @pytest.mark.parametrize("limit", [0.0, -0.1, 0.2, float("nan")])
@@ -215,14 +193,12 @@ class TestOnTheLab:
         on_lab.close()
         on_fmu.close()
 
-    def test_a_client_will_do_and_needs_no_token(self, make_lab):
+    def test_a_client_will_do_and_needs_no_token(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make(ID, backend=Client(lab))
+        env = on_lab(Client(lab))
         _, info = env.reset(seed=1)
         assert lab.running == ["experiment"]
         assert (info["sample_age"], info["deadline_misses"]) == (0.0, 0)
-        env.close()
-        assert lab.running == []
 
     def test_tokens_of_users(self, make_lab):
         lab = make_lab(users={"ada": User(), "bob": User(gym=False)})
@@ -235,17 +211,15 @@ class TestOnTheLab:
             gym.make(ID, backend=lab, user_token="bob", gym_time=60).reset()
         assert lab.running == []
 
-    def test_a_lease_of_ones_own_serves_all_episodes(self, make_lab):
+    def test_a_lease_of_ones_own_serves_all_episodes(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make(ID, backend=lab, user_token="ada", gym_time=100.0)
+        env = on_lab(lab, user_token="ada", gym_time=100.0)
         for _ in range(3):
             env.reset()
             env.step(np.zeros(1, np.float32))
             assert lab.running == ["episode", "gym"]
         assert Client(lab).get_user_info("ada").gym_bucket_size == 19
         assert Client(lab).get_user_info("ada").number_of_attempts == 1000
-        env.close()
-        assert lab.running == []
 
     def test_a_lease_that_is_there_is_used_and_left(self, make_lab):
         lab = make_lab()
@@ -255,6 +229,7 @@ class TestOnTheLab:
         assert lab.running == ["episode", "gym"]
         env.close()
         assert lab.running == ["gym"]
+        Client(lab).stop_gym(token)
 
     @pytest.mark.parametrize("names", [{"q_dot_0": 1.0}, {"l": 0.12}, {"q_0": 0.1, "c": 0.0}])
     def test_what_the_lab_cannot_set_is_refused(self, make_lab, names):
@@ -296,9 +271,9 @@ class TestOnTheLab:
             env.close()
         assert abs(ends[0] - ends[1]) <= 1
 
-    def test_the_hardware_preset(self, make_lab):
+    def test_the_hardware_preset(self, make_lab, on_lab):
         lab = make_lab("hardware")
-        env = gym.make(ID, backend=lab)
+        env = on_lab(lab)
         env.reset(seed=0)
         ages = []
         for action in swings(200):
@@ -308,7 +283,6 @@ class TestOnTheLab:
         # Two readings and a setter, from the first reading on: 0.79 ms in the median.
         assert 0.5e-3 < np.median(ages) < 1.2e-3
         assert lab.clock.time() == pytest.approx(1.0 + 4.0, abs=0.2)
-        env.close()
 
     def test_a_pause_keeps_the_session_and_shifts_the_schedule(self, make_lab, monkeypatch):
         """A policy update of 5 s, in steps of time that the lab's heartbeat would survive."""
@@ -334,9 +308,9 @@ class TestOnTheLab:
         env.close()
         assert lab.running == []
 
-    def test_without_a_keeper_the_session_is_lost(self, make_lab):
+    def test_without_a_keeper_the_session_is_lost(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make(ID, backend=lab)
+        env = on_lab(lab)
         env.reset()
         lab.clock.advance(2.5)
         lab._bookings.settle(lab.clock.time())
@@ -346,36 +320,29 @@ class TestOnTheLab:
         assert np.isfinite(observation).all()
         env.reset()
         assert "fault" not in env.step(np.zeros(1, np.float32))[4]
-        env.close()
-        assert lab.running == []
 
-    def test_an_expired_lease(self, make_lab):
+    def test_an_expired_lease(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make(ID, backend=lab, gym_time=3.0)
+        env = on_lab(lab, gym_time=3.0)
         env.reset()
         assert "the lease of its gym is over" in last(env, swings(160))["fault"]
         with pytest.raises(SimulationError, match="the gym has ended"):
             env.reset()
         assert lab.running == []
         env.reset()  # takes a new lease
-        env.close()
-        assert lab.running == []
 
-    def test_the_session_time(self, make_lab):
+    def test_the_session_time(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make(ID, backend=lab, session_time=1.0)
+        env = on_lab(lab, session_time=1.0)
         env.reset()
         assert "its time of 1 s is over" in last(env, swings(56))["fault"]
-        env.close()
 
 
 class TestCells:
     @pytest.mark.parametrize("mode", ["next_step", "same_step"])
-    def test_one_lease_for_all_and_new_episodes(self, make_lab, mode):
+    def test_one_lease_for_all_and_new_episodes(self, make_lab, mode, on_lab):
         lab = make_lab()
-        env = gym.make_vec(
-            ID, num_envs=4, backend=Client(lab), autoreset_mode=mode, max_episode_steps=20
-        )
+        env = on_lab(Client(lab), num_envs=4, autoreset_mode=mode, max_episode_steps=20)
         alone = gym.make_vec(ID, num_envs=4, autoreset_mode=mode, max_episode_steps=20)
         for each in (env, alone):
             each.reset(seed=5)
@@ -387,31 +354,26 @@ class TestCells:
                 np.testing.assert_allclose(left, right, atol=1e-5)
         assert got[4]["_sample_age"].all()
         assert Client(lab).get_user_info("fmugym").gym_bucket_size == 19
-        env.close()
         alone.close()
-        assert lab.running == []
 
-    def test_cells_keep_the_same_time(self, make_lab):
+    def test_cells_keep_the_same_time(self, make_lab, on_lab):
         lab = make_lab()
-        env = gym.make_vec(ID, num_envs=4, backend=lab)
+        env = on_lab(lab, num_envs=4)
         env.reset()
         for _ in range(10):
             env.step(np.zeros((4, 1), np.float32))
         assert lab.clock.time() == pytest.approx(0.2)
-        env.close()
 
-    def test_cells_of_the_hardware_preset_start_together(self, make_lab):
+    def test_cells_of_the_hardware_preset_start_together(self, make_lab, on_lab):
         """Homing takes a second: for all of them at once, also where a clock is moved by hand."""
         lab = make_lab("hardware", stall_share=0.0)
-        env = gym.make_vec(ID, num_envs=4, backend=lab)
+        env = on_lab(lab, num_envs=4)
         env.reset(seed=0)
         assert lab.clock.time() == pytest.approx(1.0, abs=0.05)
         for _ in range(50):
             *_, infos = env.step(np.zeros((4, 1), np.float32))
         assert lab.clock.time() == pytest.approx(2.0, abs=0.05)
         assert infos["deadline_misses"].tolist() == [0] * 4
-        env.close()
-        assert lab.running == []
 
     def test_programs_of_several_threads(self, make_lab):
         """Two programs, each with a lease of its own; time waits for both."""
@@ -436,13 +398,12 @@ class TestCells:
         assert len(ends) == 2
         assert lab.running == []
 
-    def test_more_cells_than_there_are(self, make_lab):
-        env = gym.make_vec(ID, num_envs=5, backend=make_lab())
+    def test_more_cells_than_there_are(self, make_lab, on_lab):
+        env = on_lab(make_lab(), num_envs=5)
         with pytest.raises(SimulationError, match="the lab has 4 cells of type SINGLE, not 5"):
             env.reset()
-        env.close()
 
-    def test_a_fault_of_one_cell(self, make_lab, monkeypatch):
+    def test_a_fault_of_one_cell(self, make_lab, monkeypatch, on_lab):
         lab, tokens = make_lab(), []
         start_episode = lab.start_episode
 
@@ -451,7 +412,7 @@ class TestCells:
             return tokens[-1]
 
         monkeypatch.setattr(lab, "start_episode", started)
-        env = gym.make_vec(ID, num_envs=3, backend=lab, autoreset_mode="same_step")
+        env = on_lab(lab, num_envs=3, autoreset_mode="same_step")
         env.reset()
         zeros = np.zeros((3, 1), np.float32)
         Client(lab).stop_episode(tokens[1])
@@ -459,19 +420,13 @@ class TestCells:
         (index,) = np.flatnonzero(truncated)  # the cells start at the same time, in any order
         assert "was stopped" in infos["final_info"]["fault"][index]
         assert not env.step(zeros)[3].any()
-        env.close()
-        assert lab.running == []
 
     @pytest.mark.parametrize("vectorization_mode", ["sync", "vector_entry_point"])
-    def test_ways_to_vectorize(self, make_lab, vectorization_mode):
+    def test_ways_to_vectorize(self, make_lab, vectorization_mode, on_lab):
         lab = make_lab()
-        env = gym.make_vec(
-            ID, num_envs=2, vectorization_mode=vectorization_mode, backend=Client(lab)
-        )
+        env = on_lab(Client(lab), num_envs=2, vectorization_mode=vectorization_mode)
         env.reset(seed=0)
         assert env.step(np.zeros((2, 1), np.float32))[0].shape == (2, 3)
-        env.close()
-        assert lab.running == []
 
 
 PROGRAM = """

@@ -77,8 +77,8 @@ def test_an_action_follows_at_a_rate(kind):
     assert inputs == pytest.approx([0.05, 0.1, 0.05, 0.0, -0.05, 0.0])
 
 
-def test_least_times_and_masks():
-    env = fmugym.load(task("least times"))
+def test_least_times_and_masks(load):
+    env = load(task("least times"))
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     is_on, since, kept = False, 10**9, 0
@@ -93,7 +93,6 @@ def test_least_times_and_masks():
         env.step(action)
         assert env.inputs[0] == pytest.approx(0.02 if is_on else 0.0)
     assert kept > 30
-    env.close()
 
 
 def test_a_continuous_action_may_change_while_it_is_on():
@@ -114,8 +113,6 @@ def test_many_environments_equal_single_ones_to_the_last_bit(kind, hooks):
     ("variable", "fact"),
     [
         ({"name": "tau", "levels": [0, 1], "delta": 1}, "'delta'"),
-        ({"name": "tau", "delta": -1}, "positive.*-1"),
-        ({"name": "tau", "min_on": "5 parsec"}, "parsec"),
         ({"min": 0, "max": 1, "rate": 1}, "'u' is no input"),
         ({"name": "tau", "rate": 1e-3, "min": 0, "max": "oops"}, "'oops'"),
     ],
@@ -131,11 +128,10 @@ def test_observations_have_no_delta():
         fmugym.load(PLAIN | {"variables": variables})
 
 
-def test_masks_need_levels():
-    env = fmugym.load(task("rate"))
+def test_masks_need_levels(load):
+    env = load(task("rate"))
     with pytest.raises(ConfigError, match="levels"):
         env.action_masks()
-    env.close()
 
 
 FAILING = PLAIN | {

@@ -54,8 +54,8 @@ def figures(angles, rewards, costs):
     }
 
 
-def test_figures_are_those_of_the_steps():
-    env = fmugym.load(TASK, hooks="compiled")
+def test_figures_are_those_of_the_steps(load):
+    env = load(TASK, hooks="compiled")
     for seed in (0, None):
         _, info = env.reset(seed=seed)
         assert set(info["kpis"].values()) == {0.0}
@@ -67,7 +67,6 @@ def test_figures_are_those_of_the_steps():
             costs.append(info["cost"])
             assert info["kpis"] == pytest.approx(figures(angles, rewards, costs), rel=1e-12)
         assert cut
-    env.close()
 
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
@@ -79,10 +78,8 @@ def test_figures_of_many_environments(hooks, mode):
 @pytest.mark.parametrize(
     ("kpis", "fact"),
     [
-        ({"a": {"summ": "angle"}}, r"kpis\.a\.summ: .*'sum'"),
         ({"a": {}}, r"kpis\.a: .*mean"),
         ({"a": {"sum": "angle", "max": "angle"}}, r"kpis\.a: "),
-        ({"a": {"sum": "angel"}}, r"kpis\.a: .*'angle'"),
         ({"aa": "bb", "bb": "aa"}, r"kpis\.aa: .*'bb'"),
     ],
 )
@@ -115,8 +112,8 @@ def aiming(kind, **sensor):
 
 
 @pytest.mark.parametrize("kind", SETPOINTS)
-def test_a_deviation_is_observed(kind):
-    env = fmugym.load(aiming(kind))
+def test_a_deviation_is_observed(kind, load):
+    env = load(aiming(kind))
     observation, _ = env.reset(seed=1)
     assert env.observation_names == ("angle", "goal", "goal_error")
     low, high = env.observation_space.low, env.observation_space.high
@@ -128,28 +125,18 @@ def test_a_deviation_is_observed(kind):
         observation, reward, *_ = env.step([0.01])
         if kind in ("constant", "drawn", "sine", "data"):
             assert reward == pytest.approx(-abs(observation[2]), rel=1e-6)
-    env.close()
 
 
-def test_a_deviation_is_what_the_sensor_measures():
-    env = fmugym.load(aiming("constant", noise=5.0, delay="0.1s"))
+def test_a_deviation_is_what_the_sensor_measures(load):
+    env = load(aiming("constant", noise=5.0, delay="0.1s"))
     observation, _ = env.reset(seed=1)
     for _ in range(6):
         assert observation[2] == pytest.approx(5 - observation[0], abs=1e-4)
         observation, *_ = env.step([0.01])
     alone = aiming("constant", noise=5.0, delay="0.1s")
     alone["agent"] = {"actions": ["tau"], "observations": ["goal_error"]}
-    only = fmugym.load(alone)
+    only = load(alone)
     assert abs(only.reset(seed=1)[0][0] - (5 - np.rad2deg(only.state[0]))) > 0.1
-    env.close()
-    only.close()
-
-
-def test_a_deviation_of_nothing():
-    wrong = aiming("constant")
-    wrong["setpoints"] = {"goal": {"value": 5, "of": "angel"}}
-    with pytest.raises(TaskError, match=r"^setpoints\.goal\.of: .*'angle'"):
-        fmugym.load(wrong)
 
 
 def test_a_name_that_a_set_point_brings_with_it():
@@ -172,8 +159,8 @@ class TestNominal:
         }
 
     @pytest.mark.parametrize(("variable", "nominal"), [({"nominal": 8}, 8.0), ({}, None)])
-    def test_values_are_divided_by_it(self, variable, nominal):
-        env = fmugym.load(self.task(**variable))
+    def test_values_are_divided_by_it(self, variable, nominal, load):
+        env = load(self.task(**variable))
         nominal = nominal or env.fmu.variable("q_dot").nominal or 60.0
         env.reset(seed=0)
         seen, reward, *_ = env.step([0.5])
@@ -181,16 +168,9 @@ class TestNominal:
         assert seen[1] == 0.75
         assert env.observation_space.high[0] == np.float32(60 / nominal)
         assert env.observation_space.low[1] == -1.0
-        env.close()
 
     def test_of_what_has_none(self):
         wrong = self.task()
         wrong["setpoints"] = {"goal": 3}
         with pytest.raises(TaskError, match=r"^agent\.observations: .*'goal'.*nominal"):
-            fmugym.load(wrong)
-
-    def test_ways_have_names(self):
-        wrong = self.task()
-        wrong["agent"] = wrong["agent"] | {"normalize": "nominale"}
-        with pytest.raises(TaskError, match=r"^agent\.normalize: .*'nominal'"):
             fmugym.load(wrong)

@@ -40,8 +40,8 @@ def first_days(env, episodes):
     ("clock", "day"),
     [("01-15", 14), ("2024-03-01", 59), ("02-28 12:00", 58.5), ("3d 12h", 3.5), (0, 0), (DAY, 1)],
 )
-def test_an_episode_begins_at_a_time_of_the_year(clock, day):
-    env = fmugym.load(TASK | {"clock": clock})
+def test_an_episode_begins_at_a_time_of_the_year(clock, day, load):
+    env = load(TASK | {"clock": clock})
     observation, _ = env.reset(seed=0)
     is_day = 0.25 <= day % 1 < 22 / 24
     assert observation.tolist() == [int(day), 21 if is_day else 17, 0, day, int(day) + 1]
@@ -50,15 +50,13 @@ def test_an_episode_begins_at_a_time_of_the_year(clock, day):
         assert observation[0] == int(day + step * 0.25)
         assert reward == int(day + (step - 1) * 0.25)
         assert env.time == step * DAY / 4
-    env.close()
 
 
-def test_the_turn_of_the_year():
-    env = fmugym.load(TASK | {"clock": "12-31"})
+def test_the_turn_of_the_year(load):
+    env = load(TASK | {"clock": "12-31"})
     assert env.reset(seed=0)[0][0] == 364
     seen = [env.step([0.0])[0][0] for _ in range(4)]
     assert seen == [364, 364, 364, 0]
-    env.close()
 
 
 def test_one_of_several():
@@ -66,12 +64,11 @@ def test_one_of_several():
     assert set(days) == {1, 59, 3}
 
 
-def test_a_distribution_is_drawn_last_and_reported():
+def test_a_distribution_is_drawn_last_and_reported(load):
     clock = {"distribution": "uniform", "low": 0, "high": 10 * DAY}
-    env = fmugym.load(TASK | {"clock": clock})
+    env = load(TASK | {"clock": clock})
     observation, info = env.reset(seed=1)
     assert observation[0] == int(info["drawn"]["clock"] / DAY)
-    env.close()
 
 
 def test_a_season_leaves_scenarios_out():
@@ -118,14 +115,11 @@ def test_a_scenario_is_an_environment(tmp_path, capsys):
     ("change", "fact"),
     [
         ({"start_time": {"from": "01-01", "to": "02-01"}}, "start_time.*clock"),
-        ({"clock": "13-01"}, "clock.*'13-01'"),
         ({"clock": "1st of May"}, "clock.*1st of May"),
-        ({"clock": {"from": "01-01"}}, "clock.*'to'"),
         ({"clock": {"from": "01-01", "to": "01-02", "exclude": "peek"}}, "clock.*'peak'"),
         ({"clock": {"from": "01-15", "to": "01-15", "exclude": "peak"}}, "clock: no day"),
         ({"clock": {"from": "01-01", "to": "12-31", "step": "1min"}}, "clock.*60 s"),
         ({"scenarios": {"peak": {"start": "01-15"}}}, "scenarios.peak.*'length'"),
-        ({"scenarios": {"peak": {"begin": "01-15"}}}, "scenarios.peak.begin.*'begin'"),
     ],
 )
 def test_mistakes_are_placed(change, fact):

@@ -46,13 +46,12 @@ def test_the_bits_of_noise_are_those_of_splitmix64():
     assert functions._mixed(seeds).view(np.uint64).tolist() == expected
 
 
-def test_noise_is_normal_and_differs_in_steps_and_episodes():
-    env = fmugym.load(task(noise=3.0))
+def test_noise_is_normal_and_differs_in_steps_and_episodes(load):
+    env = load(task(noise=3.0))
     differences = []
     for index in range(60):
         observed, true, _ = episode(env, seed=1 if index == 0 else None)
         differences.append(observed - true)
-    env.close()
     noise = np.array(differences) / 3.0
     assert noise.shape == (60, 21)
     assert abs(noise.mean()) < 4 / np.sqrt(noise.size)
@@ -62,22 +61,11 @@ def test_noise_is_normal_and_differs_in_steps_and_episodes():
         assert abs(np.mean(first * second)) < 0.12
 
 
-def test_noise_changes_no_draw():
-    noisy, calm = fmugym.load(task(noise=3.0)), fmugym.load(task())
-    for seed in (5, None, None):
-        drawn = noisy.reset(seed=seed)[1]["drawn"]
-        assert drawn.pop("noise key") >= 0
-        assert drawn == calm.reset(seed=seed)[1]["drawn"]
-    noisy.close()
-    calm.close()
-
-
-def test_noise_without_other_draws_differs_from_episode_to_episode():
-    env = fmugym.load(task(parameters={}, noise=1.0))
+def test_noise_without_other_draws_differs_from_episode_to_episode(load):
+    env = load(task(parameters={}, noise=1.0))
     first, again, same = episode(env, 1)[0], episode(env)[0], episode(env, 1)[0]
     assert not np.any(first == again)
     np.testing.assert_array_equal(first, same)
-    env.close()
 
 
 def test_noise_differs_between_environments_of_a_vector():
@@ -90,34 +78,26 @@ def test_noise_differs_between_environments_of_a_vector():
     envs.close()
 
 
-def test_values_are_multiples_of_the_quantum():
-    env = fmugym.load(task(quantum=5.0))
-    observed, true, _ = episode(env, 0)
-    np.testing.assert_allclose(observed, 5.0 * np.round(true / 5.0), rtol=1e-6)
-    env.close()
-
-
-def test_values_come_late():
-    env = fmugym.load(task(delay="0.15s"))
+def test_values_come_late(load):
+    env = load(task(delay="0.15s"))
     observed, true, _ = episode(env, 0)
     np.testing.assert_allclose(observed, [true[0]] * 3 + list(true[:-3]), rtol=1e-6)
-    env.close()
 
 
-def test_saturation_clips():
-    env = fmugym.load(task(saturation=[7, 12]))
+@pytest.mark.parametrize(
+    ("sensor", "measured"),
+    [
+        ({"quantum": 5.0}, lambda true: 5.0 * np.round(true / 5.0)),
+        ({"saturation": [7, 12]}, lambda true: np.clip(true, 7, 12)),
+        ({"bias": -7.5}, lambda true: true - 7.5),
+    ],
+)
+def test_what_is_the_same_in_each_step(sensor, measured, load):
+    env = load(task(**sensor))
     observed, true, _ = episode(env, 0)
     assert true.min() < 7
     assert true.max() > 12
-    np.testing.assert_allclose(observed, np.clip(true, 7, 12), rtol=1e-6)
-    env.close()
-
-
-def test_a_constant_bias_is_added():
-    env = fmugym.load(task(bias=-7.5))
-    observed, true, _ = episode(env, 0)
-    np.testing.assert_allclose(observed, true - 7.5, rtol=1e-5)
-    env.close()
+    np.testing.assert_allclose(observed, measured(true), rtol=1e-5)
 
 
 BIASES = {
@@ -127,20 +107,19 @@ BIASES = {
 
 
 @pytest.mark.parametrize("kind", BIASES)
-def test_a_drawn_bias_is_one_number_in_each_episode(kind):
+def test_a_drawn_bias_is_one_number_in_each_episode(kind, load):
     bias, mean, std = BIASES[kind]
-    env, biases = fmugym.load(task(bias=bias)), []
+    env, biases = load(task(bias=bias)), []
     for index in range(150):
         observed, true, _ = episode(env, 1 if index == 0 else None, steps=3)
         assert np.ptp(observed - true) < 1e-4
         biases.append(observed[0] - true[0])
     assert np.mean(biases) == pytest.approx(mean, abs=4 * std / np.sqrt(150))
     assert np.std(biases) == pytest.approx(std, rel=0.2)
-    env.close()
 
 
-def test_a_drop_out_holds_the_last_value():
-    env = fmugym.load(task(drop_out=0.25))
+def test_a_drop_out_holds_the_last_value(load):
+    env = load(task(drop_out=0.25))
     held = []
     for index in range(40):
         observed, true, _ = episode(env, 1 if index == 0 else None)
@@ -150,27 +129,24 @@ def test_a_drop_out_holds_the_last_value():
             held.append(observed[step] != fresh)
             assert observed[step] == (observed[step - 1] if held[-1] else fresh)
     assert np.mean(held) == pytest.approx(0.25, abs=0.06)
-    env.close()
 
 
-def test_a_drop_out_gives_what_the_task_says():
-    env = fmugym.load(task(drop_out={"probability": 0.5, "value": -99}, delay="0.1s"))
+def test_a_drop_out_gives_what_the_task_says(load):
+    env = load(task(drop_out={"probability": 0.5, "value": -99}, delay="0.1s"))
     observed, true, _ = episode(env, 3)
     late = np.float32([true[0], true[0], *true[:-2]])
     is_lost = observed == -99
     assert 4 < is_lost.sum() < 17
     np.testing.assert_array_equal(observed[~is_lost], late[~is_lost])
-    env.close()
 
 
-def test_a_sensor_may_follow_slowly():
-    env = fmugym.load(task(rate=40))
+def test_a_sensor_may_follow_slowly(load):
+    env = load(task(rate=40))
     observed, true, _ = episode(env, 0)
     expected = [true[0]]
     for value in true[1:]:
         expected.append(np.clip(value, expected[-1] - 2, expected[-1] + 2))
     np.testing.assert_allclose(observed, expected, rtol=1e-6)
-    env.close()
 
 
 ALL_RANDOM = {
@@ -180,16 +156,14 @@ ALL_RANDOM = {
 }
 
 
-def test_nothing_random_in_devices_changes_a_draw():
+def test_nothing_random_in_devices_changes_a_draw(load):
     noisy_task = task(**ALL_RANDOM)
     noisy_task["variables"]["tau"] = {"noise": 0.001, "drop_out": 0.1}
-    noisy, calm = fmugym.load(noisy_task), fmugym.load(task())
+    noisy, calm = load(noisy_task), load(task())
     for seed in (5, None, None):
         drawn = noisy.reset(seed=seed)[1]["drawn"]
-        drawn.pop("noise key")
+        assert drawn.pop("noise key") >= 0
         assert drawn == calm.reset(seed=seed)[1]["drawn"]
-    noisy.close()
-    calm.close()
 
 
 def torques(steps=12, seed=1, agent=None, **actuator):
@@ -265,14 +239,13 @@ ACTUATORS = {
 
 
 @pytest.mark.parametrize("more", [{"quantum": 0.5}, {"drop_out": 0.4}, {"rate": 30}])
-def test_a_history_holds_what_was_measured(more):
+def test_a_history_holds_what_was_measured(more, load):
     history = {"of": "angle", "length": "0.1s"}
-    env = fmugym.load(task(noise=2.0, delay="0.1s", history=history, **more))
+    env = load(task(noise=2.0, delay="0.1s", history=history, **more))
     seen = [env.reset(seed=3)[0]]
     seen += [env.step([0.01])[0] for _ in range(10)]
     for now, before, earlier in zip(seen[2:], seen[1:], seen, strict=False):
         assert now[2:].tolist() == [before[0], earlier[0]]
-    env.close()
 
 
 SENSORS = {
@@ -293,10 +266,11 @@ COMBINATIONS += [("noise", actuators) for actuators in ACTUATORS if actuators]
 COMBINATIONS += [("drop-outs", "late"), ("rate", "lost")]
 
 
-@pytest.mark.parametrize("parameters", [DRAWN, {}], ids=["drawn", "constant"])
+@pytest.mark.parametrize(
+    ("mode", "parameters"), [("next_step", DRAWN), ("same_step", {})], ids=["drawn", "constant"]
+)
 @pytest.mark.parametrize(("sensors", "actuators"), COMBINATIONS)
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
 def test_many_environments_equal_single_ones(parameters, sensors, actuators, hooks, mode):
     history = {"of": ["angle", "tau"], "length": "0.1s"}
     declared = task(parameters, history, **SENSORS[sensors])
@@ -307,15 +281,10 @@ def test_many_environments_equal_single_ones(parameters, sensors, actuators, hoo
 @pytest.mark.parametrize(
     ("variables", "fact"),
     [
-        ({"angle": {"name": "q", "delay": "0.07s"}}, r"0\.07 s.*0\.05"),
         ({"angle": {"name": "q", "noise": 0}}, "positive"),
         ({"angle": {"name": "q"}, "tau": {"sample": "mean"}}, "read from the FMU"),
-        ({"angle": {"name": "q", "drop_out": 1.5}}, r"1\.5"),
         ({"angle": {"name": "q", "drop_out": {"probability": 0.1, "value": "nan"}}}, "nan"),
-        ({"angle": {"name": "q", "drop_out": {"probabilty": 0.1}}}, "'probability'"),
-        ({"angle": {"name": "q", "saturation": [3, 1]}}, r"\[3, 1\]"),
         ({"angle": {"name": "q", "saturation": 3}}, "list"),
-        ({"angle": {"name": "q", "rate": -1}}, "positive"),
         ({"angle": {"name": "q", "bias": {"distribution": "choice", "values": [1]}}}, "uniform"),
         ({"angle": {"name": "q"}, "tau": {"delay": "0.07s"}}, r"0\.07 s.*0\.05"),
         ({"angle": {"name": "q"}, "theta": {"noise": 1}}, "'theta' is not in its observations"),
@@ -341,8 +310,8 @@ RANDOM = task() | {
 }
 
 
-def test_random_steps_hold_and_are_foreseen():
-    env = fmugym.load(RANDOM)
+def test_random_steps_hold_and_are_foreseen(load):
+    env = load(RANDOM)
     values, last_foreseen = [], None
     for seed in range(20):
         observation = env.reset(seed=seed)[0]
@@ -357,25 +326,16 @@ def test_random_steps_hold_and_are_foreseen():
             if step % 4 == 0:
                 last_foreseen = foreseen
                 values.append(goal)
-    env.close()
     assert -2 <= min(values) < -1.5
     assert 2.5 < max(values) < 3
     assert np.mean(values) == pytest.approx(0.5, abs=0.5)
 
 
 def test_errors_of_forecasts_belong_to_times_and_fall():
-    env = fmugym.load(RANDOM)
-    errors = []
-    for seed in range(40):
-        rows = [env.reset(seed=seed)[0]]
-        rows += [env.step([0.0])[0] for _ in range(12)]
-        times = DT * np.arange(13)[:, None] + 0.1 * np.arange(1, 5)
-        true = np.interp(times % 1.5, [0, 0.5, 1, 1.5], [0, 10, 5, 0])
-        errors.append(np.array(rows)[:, 2:6] - true)
-    env.close()
+    errors = forecast_errors(2.0)
     spread = np.std(errors, axis=(0, 1))
     np.testing.assert_allclose(spread, 2.0 * np.sqrt([0.25, 0.5, 0.75, 1.0]), rtol=0.15)
-    later, sooner = np.array(errors)[:, :-2, 1], np.array(errors)[:, 2:, 0]  # of the same time
+    later, sooner = errors[:, :-2, 1], errors[:, 2:, 0]  # of the same time
     np.testing.assert_allclose(later / np.sqrt(2), sooner, atol=1e-5)
 
 
@@ -389,7 +349,8 @@ def forecast_errors(error, episodes=60):
         rows += [env.step([0.0])[0] for _ in range(8)]
         times = DT * np.arange(9)[:, None] + 0.1 * np.arange(1, 5)
         true = np.interp(times % 1.5, [0, 0.5, 1, 1.5], [0, 10, 5, 0])
-        errors.append((np.array(rows)[:, 2:6] - true) / (true if "relative" in error else 1))
+        is_relative = isinstance(error, dict) and "relative" in error
+        errors.append((np.array(rows)[:, 2:6] - true) / (true if is_relative else 1))
     env.close()
     return np.array(errors)
 
@@ -400,7 +361,6 @@ PARTS = np.array([0.25, 0.5, 0.75, 1.0])
 @pytest.mark.parametrize(
     ("error", "sizes"),
     [
-        ({"std": 2.0}, 2 * np.sqrt(PARTS)),
         ({"std": 2.0, "growth": "linear"}, 2 * PARTS),
         ({"std": 2.0, "growth": "none"}, [2, 2, 2, 2]),
         ({"std": 0.2, "relative": True}, 0.2 * np.sqrt(PARTS)),

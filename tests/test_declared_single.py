@@ -7,6 +7,7 @@ import test_declared_actions
 import test_declared_features
 import test_declared_seasons
 import test_declared_sensors
+import test_declared_warm_up
 
 import fmugym
 
@@ -31,6 +32,7 @@ TASKS = {
             "tau": {"noise": 0.001, "drop_out": 0.3, "delay": "0.1s", "rate": 0.1},
         }
     },
+    "warm-up": test_declared_warm_up.house(),
     "cart-pole": str(test_declared.EXAMPLES / "cart_pole.toml"),
     "pendulum": str(test_declared.EXAMPLES / "pendulum.toml"),
 }
@@ -55,8 +57,8 @@ def test_compiled_steps_are_those_of_python(task):
 
 
 @each_task
-def test_a_saved_state_goes_on_in_the_same_way(task):
-    env = fmugym.load(task)
+def test_a_saved_state_goes_on_in_the_same_way(task, load):
+    env = load(task)
     env.reset(seed=2)
     actions = [env.action_space.sample() for _ in range(6)]
     for action in actions[:3]:
@@ -68,4 +70,3 @@ def test_a_saved_state_goes_on_in_the_same_way(task):
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one[0], other[0])
         test_declared.same(one[1:], other[1:])
-    env.close()

@@ -119,17 +119,6 @@ class TestTime:
             middles = (np.arange(24 * 60) + 0.5) / 60
             assert at(series, middles).mean() == pytest.approx(np.arange(1, 25).mean())
 
-    def test_a_clear_day_is_where_the_sun_is(self, tmp_path):
-        """Against the exact course of which the file has the means."""
-        ends = np.clip(np.arange(25), 6, 18)
-        means = 1000 * 12 / np.pi * -np.diff(np.cos(np.pi * (ends - 6) / 12))
-        path = epw(tmp_path / "clear.epw", days_of(1999, (6, 21), 1), {14: means})
-        start = (datetime.date(2001, 6, 21) - datetime.date(2001, 1, 1)).days * 24
-        hours = np.linspace(0, 24, 481)
-        exact = 1000 * np.sin(np.pi * (np.clip(hours, 6, 18) - 6) / 12)
-        seen = at(read(path, "Global Horizontal Radiation"), start + hours)
-        assert abs(seen - exact).max() < 70  # an hour's shift would err by 250
-
     def test_records_of_a_quarter_of_an_hour(self, tmp_path):
         quarters = {7: np.arange(1, 97) / 4, 14: np.arange(96)}
         path = epw(tmp_path / "q.epw", days_of(1999, count=1), quarters, per_hour=4, minute="0")
@@ -400,14 +389,3 @@ class TestWeatherInModelica:
         series = read(tmp_path / "x.mos", 7)
         assert series.period == 200
         assert math.isclose(at(series, 0), 7)
-
-
-def test_a_task_with_a_table_survives_writing(tmp_path):
-    (tmp_path / "tables.txt").write_text(TABLES)
-    data = {"T": {"file": str(tmp_path / "tables.txt"), "table": "tab1", "column": 2}}
-    agent = {"actions": ["tau"], "observations": ["T", "q"]}
-    env = fmugym.load(BASE | {"data": data, "agent": agent})
-    env.task.write(tmp_path / "task.toml")
-    again = fmugym.Task.read(tmp_path / "task.toml")
-    assert again == env.task
-    env.close()

@@ -6,8 +6,6 @@ import pytest
 from test_snapshots import vector_of
 
 import fmugym
-from fmugym import ConfigError, SimulationError
-from fmugym.envs import CartPoleEnv
 
 M, L, B, G, DT = 0.06, 0.1, 1e-3, 9.81, 0.02
 HORIZON = 12
@@ -105,22 +103,3 @@ def test_later_actions_have_no_influence(snapshot):
     assert not found.by_actions[:, :, :, 0].transpose(0, 2, 1)[later].any()
     assert not found.of_rewards[later].any()
     envs.close()
-
-
-def test_of_what_has_none(snapshot):
-    envs, other = vector_of(Precise, 2), vector_of(CartPoleEnv, 2)
-    for given, arguments, reason in (
-        (other, {}, "Box of floats"),
-        (envs, {"actions": np.zeros(3)}, "shape"),
-        (envs, {"step": -1.0}, "step"),
-    ):
-        arguments = {"actions": np.zeros((3, 1))} | arguments
-        with pytest.raises(ConfigError, match=reason):
-            fmugym.derivatives(given, snapshot, **arguments)
-    ends = vector_of(lambda: Precise(max_episode_steps=2), 2)
-    with Precise(max_episode_steps=2) as env:
-        env.reset(seed=0)
-        with pytest.raises(SimulationError, match="after 2 of 3 steps"):
-            fmugym.derivatives(ends, env.save_state(), np.zeros((3, 1)))
-    for one in (envs, other, ends):
-        one.close()

@@ -1,27 +1,18 @@
 """The examples lqr_pendulum.py, ilqr_pendulum.py, ukf_pendulum.py and compare_pendulum.py."""
 
 import importlib
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_tools import EXAMPLES, run_example
 from PIL import Image
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
 PROGRAMS = {
     "lqr_pendulum.py": [],
     "ilqr_pendulum.py": ["--iterations", "3"],
     "ukf_pendulum.py": ["--steps", "12", "--candidates", "32"],
     "compare_pendulum.py": ["--generations", "2", "--candidates", "8"],
 }
-
-
-@pytest.fixture(name="example")
-def fixture_example(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return importlib.import_module
 
 
 @pytest.fixture(name="plan", scope="module")
@@ -131,15 +122,7 @@ class TestComparison:
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_program_draws(name, tmp_path):
     picture = tmp_path / "picture.png"
-    command = [sys.executable, "-W", "error", EXAMPLES / name, *PROGRAMS[name]]
-    command += ["--output", str(picture)]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-    assert (ended.returncode, ended.stderr) == (0, "")
-    assert str(picture) in ended.stdout
+    printed = run_example(name, *PROGRAMS[name], "--output", picture, folder=tmp_path)
+    assert str(picture) in printed
     with Image.open(picture) as image:
         assert len(set(image.convert("L").resize((70, 60)).getdata())) > 10
-
-
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_it_is_short(name):
-    assert len((EXAMPLES / name).read_text().splitlines()) < 150

@@ -1,27 +1,17 @@
 """The examples ppo.py and compare_ppo.py: PPO in one file."""
 
-import importlib
-from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-def test_it_is_short():
-    assert len((EXAMPLES / "ppo.py").read_text().splitlines()) < 250
-
-
 torch = pytest.importorskip("torch", reason="needs PyTorch: the extra torch")
 
 
 @pytest.fixture(name="ppo")
-def fixture_ppo(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return importlib.import_module("ppo")
+def fixture_ppo(example):
+    return example("ppo")
 
 
 def tell(steps, mean, agent):
@@ -139,11 +129,9 @@ def test_actions_of_a_box_stay_within_it(ppo):
     assert given.tolist() == [[-2, 10], [0, 5], [2, 0]]
 
 
-def test_the_comparison_with_stable_baselines(monkeypatch, capsys):
+def test_the_comparison_with_stable_baselines(example, capsys):
     pytest.importorskip("stable_baselines3", reason="needs Stable-Baselines3: the extra sb3")
-    monkeypatch.syspath_prepend(EXAMPLES)
-    comparison = importlib.import_module("compare_ppo")
-    comparison.main(["--seeds", "1", "--steps", "2100"])
+    example("compare_ppo").main(["--seeds", "1", "--steps", "2100"])
     table = capsys.readouterr().out
     assert table.count("ppo.py") == table.count("Stable-Baselines3") == 2
     assert table.count(" of 1 ") == 4

@@ -5,10 +5,8 @@ and the pendulum (and test_declared.py for their task files), test_house_plant.p
 test_cloud_pendulum.py for the cell, test_physics.py for the cart-pole of the Modelica study.
 """
 
-import importlib
 import math
 from contextlib import closing
-from pathlib import Path
 
 import fmpy
 import numpy as np
@@ -17,14 +15,7 @@ from scipy.integrate import solve_ivp
 
 from fmugym import FMUVectorEnv, bundled_fmu
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
 STEPS = 60
-
-
-@pytest.fixture(name="example")
-def fixture_example(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return importlib.import_module
 
 
 def swing(q, v, torques, step, *, m=0.06, length=0.1, b=4e-4, c=0.0, g=9.81, rod=False):

@@ -1,26 +1,14 @@
 """The example train_system.py: three FMUs of two makers as one environment."""
 
-import importlib
-from pathlib import Path
-
-import pytest
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
-
-
-@pytest.fixture(name="example")
-def fixture_example(monkeypatch):
-    monkeypatch.syspath_prepend(EXAMPLES)
-    return importlib.import_module("train_system")
-
 
 def test_it_learns_to_beat_a_thermostat(example, tmp_path, capsys):
-    final, reference = example.main(["--folder", str(tmp_path), "--generations", "12"])
+    home = example("train_system")
+    final, reference = home.main(["--folder", str(tmp_path), "--generations", "12"])
     assert final > reference + 0.1
     assert "thermostat" in capsys.readouterr().out
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")
     picture = (tmp_path / "home.svg").read_text()
     assert all(f">{name}<" in picture for name in ("roof", "house", "battery", "P_grid"))
-    system = example.make_system(tmp_path)
+    system = home.make_system(tmp_path)
     tools = [one.fmu.description.generation_tool for one in system.components.values()]
     assert ["PythonFMU" in tool for tool in tools] == [True, False, True]

@@ -6,22 +6,26 @@ import gymnasium
 import numpy as np
 import pytest
 from export_tools import (
-    COMPILERS,
+    ACTIVATIONS,
     FUNCTIONS,
     TIMED,
     TIMES,
+    acting,
     arguments_of,
     built,
+    closed_loop,
     compiled,
+    differences,
     drawn_in,
-    largest_difference,
+    exported,
+    made,
     network_for,
-    plant_of,
+    network_with,
 )
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.export import Activation, Layer, Network, agent_of, write_c
+from fmugym.export import Layer, Network, agent_of, write_c
 from fmugym.export.operations import HELPERS, TYPES, constant, expression
 
 BALANCING = np.array([[0.0, 0.0, 0.0, 0.0], [0.1, 0.5, 10.0, 2.0]], np.float32)
@@ -65,112 +69,71 @@ TASKS = {
 }  # fmt: skip
 
 
-def made(env_id, **arguments):
-    return gymnasium.make(env_id, **arguments).unwrapped
-
-
 def heating(name):
     own = TASKS[name]
     variables = HEATING["variables"] | own.get("variables", {})
     return fmugym.load(HEATING | own | {"variables": variables})
 
 
-def differences(env, network, controller, plant, steps):
-    """The largest differences of measurements and inputs between the two loops."""
-    logic = controller.agent.logic
-    measured, written = ([v.name for v in part] for part in (logic.measurements, logic.inputs))
-    observation, step = env._get_observation(), env.inside.interface.time_step
-    worst = np.zeros(2)
-    for count in range(steps):
-        own = np.array(plant.read(measured))
-        actions = controller.step(own)
-        is_discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
-        action = network.action(np.ravel(observation))
-        seen = [env.out[name] for name in measured]
-        observation, _, terminated, truncated, _ = env.step(
-            int(action[0]) if is_discrete else action
-        )
-        inputs = dict(zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True))
-        wanted = [inputs[name] for name in written]
-        worst = np.maximum(
-            worst, [np.abs(own - seen).max(), np.abs(actions - np.array(wanted)).max()]
-        )
-        plant.write(
-            [*written, *inputs.keys() - set(written)],
-            [*actions, *(inputs[n] for n in inputs.keys() - set(written))],
-        )
-        plant.step(count * step)
-        if terminated or truncated:
-            return *worst, count + 1
-    return *worst, steps
+class Loops:
+    """The environment with its agent, beside the plant in FMPy with the exported agent.
 
+    Attributes:
+        languages: Those of the agent; the last one for registered tasks, the first one for others.
+    """
 
-class TestClosedLoop:
-    """The environment with its agent, beside the plant in FMPy with the agent in C."""
-
-    @pytest.mark.parametrize("language", COMPILERS)
-    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House"])
-    def test_of_registered_tasks(self, env_id, language, tmp_path):
-        env = made(f"fmugym/{env_id}-v0")
-        network = network_for(env)
-        controller = compiled(agent_of(env, network, all_inputs=True), tmp_path, language)
-        env.reset(seed=3)
-        controller.begin(**{k: v for k, v in env.variables.items() if k == "clock"})
-        with plant_of(env, tmp_path) as plant:
-            measured, written, steps = differences(env, network, controller, plant, 200)
+    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House", "CloudPendulum"])
+    def test_of_registered_tasks(self, env_id, tmp_path):
+        env = made(env_id)
+        network, language = network_for(env), self.languages[-1]
+        agent = agent_of(env, network, all_inputs=True)
+        measured, written, steps = closed_loop(
+            env, acting(network), agent, tmp_path, 200, seed=3, language=language
+        )
         assert steps > 5
         assert measured <= 1e-5
         assert written <= 1e-5
-        env.close()
-
-    def test_a_cart_pole_that_is_balanced_all_the_time(self, tmp_path):
-        env = made("fmugym/CartPole-v0")
-        network = Network((Layer(BALANCING, np.zeros(2, np.float32)),), env.action_space)
-        controller = compiled(agent_of(env, network), tmp_path)
-        env.reset(seed=0)
-        controller.begin()
-        with plant_of(env, tmp_path) as plant:
-            assert differences(env, network, controller, plant, 500) == (0.0, 0.0, 500)
         env.close()
 
     @pytest.mark.parametrize("task", TASKS)
     def test_of_what_a_task_file_declares(self, task, tmp_path):
         env = heating(task)
         network = network_for(env, scaled=False)
-        controller = compiled(agent_of(env, network), tmp_path)
-        env.reset(seed=1)
-        controller.begin(**env.variables)
-        with plant_of(env, tmp_path) as plant:
-            measured, written, steps = differences(env, network, controller, plant, 1000)
+        measured, written, steps = closed_loop(
+            *(env, acting(network), agent_of(env, network), tmp_path),
+            seed=1,
+            language=self.languages[0],
+        )
         assert steps == 192
         assert measured <= 1e-4
         assert written <= 1e-5
         env.close()
 
     @pytest.mark.parametrize("times", TIMES)
-    def test_from_several_start_times(self, times, tmp_path):
-        env = fmugym.load(TIMED | TIMES[times])
+    def test_from_several_start_times(self, times, tmp_path, load):
+        env = load(TIMED | TIMES[times])
         network = network_for(env, scaled=False)
-        controller = compiled(agent_of(env, network), tmp_path)
-        logic, began = controller.agent.logic, set()
+        agent = agent_of(env, network)
+        controller = exported(agent, tmp_path, self.languages[0])
+        logic, began = agent.logic, set()
         for seed in range(6):
             env.reset(seed=seed)
             began.add(env.time + env.variables.get("clock", 0.0))
             controller.begin(**drawn_in(env, logic))
-            assert largest_difference(env, network, logic, controller.step, 60) <= 1e-5
+            _, worst, _ = differences(env, acting(network), logic, controller.step, 60)
+            assert worst <= 1e-5
         assert (len(began) > 1) == (times != "constant")
-        env.close()
 
-    def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
-        env = heating("history")
-        controller = compiled(agent_of(env, network_for(env)), tmp_path)
+
+class TestClosedLoop(Loops):
+    languages = "C99", "C++"
+
+    def test_a_cart_pole_that_is_balanced_all_the_time(self, tmp_path):
+        env = made("CartPole")
+        network = Network((Layer(BALANCING, np.zeros(2, np.float32)),), env.action_space)
+        played = closed_loop(env, acting(network), agent_of(env, network), tmp_path, 500)
+        assert played == (0.0, 0.0, 500)
         env.close()
-        runs = []
-        for _ in range(2):
-            controller.begin()
-            runs.append([controller.step([290.0 + i // 4]) for i in range(8)])
-        assert runs[0] == runs[1]
-        assert len(set(map(tuple, runs[0]))) > 3  # measurements of before count, too
 
 
 class Filtered(fmugym.FMI2CSEnv):
@@ -217,20 +180,6 @@ class Filtered(fmugym.FMI2CSEnv):
 class TestHooks:
     """Agents of environments whose hooks are written by hand."""
 
-    def test_what_can_be_traced_is_translated(self, tmp_path):
-        env = Filtered()
-        network = network_for(env)
-        controller = compiled(agent_of(env, network), tmp_path)
-        observation, _ = env.reset(seed=5)
-        controller.begin(goal=env.variables["goal"])
-        for _ in range(100):
-            action = network.action(np.concatenate([observation["angle"], observation["speed"]]))
-            assert controller.step(env.state) == pytest.approx(
-                [[0.5, 1.0, 2.0][action[0]] * (action[1] - 1.0)]
-            )
-            observation, *_ = env.step(action)
-        env.close()
-
     def test_kept_values_move_on_together(self, tmp_path):
         class Delayed(fmugym.FMI2CSEnv):
             """A pendulum whose agent sees the angle three steps late."""
@@ -275,7 +224,7 @@ class TestHooks:
 
     @pytest.mark.parametrize("env_id", ["CartPole", "House"])
     def test_an_environment_that_runs_compiled(self, env_id, tmp_path):
-        env, other = made(f"fmugym/{env_id}-v0"), made(f"fmugym/{env_id}-v0")
+        env, other = made(env_id), made(env_id)
         network, texts, ran_compiled = network_for(env), [], False
         action = env.action_space.sample()
         for one in (env, other):
@@ -303,13 +252,12 @@ class TestHooks:
         assert [kept.name for kept in logic.kept] == ["slow", "goal"]
         env.close()
 
-    def test_a_hidden_state_is_refused(self):
+    def test_a_hidden_state_is_refused(self, load):
         task = HEATING | {"agent": PRESENT | {"observations": ["rate"]}}
         variables = HEATING["variables"] | {"rate": {"name": "der_T_m", "min": -1, "max": 1}}
-        env = fmugym.load(task | {"variables": variables})
+        env = load(task | {"variables": variables})
         with pytest.raises(ConfigError, match=r"'der_T_m'.*'local'"):
             agent_of(env, network_for(env))
-        env.close()
 
     @pytest.mark.parametrize(
         ("hooks", "fact"),
@@ -358,7 +306,7 @@ class TestExternal:
     """Data that the agent is given instead of having them in tables."""
 
     def test_takes_the_place_of_tables(self, tmp_path):
-        env, names = made("fmugym/House-v0"), ["T_out", "sun", "price"]
+        env, names = made("House"), ["T_out", "sun", "price"]
         network = network_for(env)
         agent = agent_of(env, network, external=names)
         controller = compiled(agent, tmp_path)
@@ -385,7 +333,7 @@ class TestExternal:
         ("name", "fact"), [("T_outt", "'T_out'"), ("people", "'people'"), ("hour", "'hour'")]
     )
     def test_mistakes(self, name, fact):
-        env = made("fmugym/House-v0")
+        env = made("House")
         with pytest.raises(ConfigError, match=fact):
             agent_of(env, network_for(env), external=[name])
         env.close()
@@ -399,7 +347,7 @@ class TestExternal:
 
 class TestFiles:
     def test_measurements_and_actions_have_names_and_units(self, tmp_path):
-        env = made("fmugym/House-v0")
+        env = made("House")
         header, source = write_c(agent_of(env, network_for(env), name="heat"), tmp_path)
         env.close()
         text = header.read_text()
@@ -410,7 +358,7 @@ class TestFiles:
         assert "malloc" not in source.read_text()
 
     def test_two_agents_live_in_one_program(self, tmp_path):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         agents = [
             compiled(agent_of(env, network_for(env, seed=seed), name=name), tmp_path)
             for seed, name in enumerate(["left", "right"])
@@ -423,7 +371,7 @@ class TestFiles:
         assert chosen[0] != chosen[1]
 
     def test_nothing_is_overwritten(self, tmp_path):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         agent = agent_of(env, network_for(env))
         env.close()
         write_c(agent, tmp_path)
@@ -434,7 +382,7 @@ class TestFiles:
 
     @pytest.mark.parametrize("name", ["math", "fmi2", "a-b", "ä", "2a", ""])
     def test_names_that_are_none(self, name):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         with pytest.raises(ConfigError, match="name"):
             agent_of(env, network_for(env), name=name)
         env.close()
@@ -503,30 +451,14 @@ class TestFunctions:
 
 
 class TestNetworks:
-    @pytest.mark.parametrize("activation", ["tanh", "relu", "sigmoid", "silu"])
+    @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda one: one.name)
     @pytest.mark.parametrize("squashed", [False, True])
     def test_activations(self, activation, squashed, tmp_path):
-        env = made("fmugym/Pendulum-v0")
-        network = network_for(env, squashed=squashed, activation=activation)
-        self._compare(env, network, tmp_path)
-
-    @pytest.mark.parametrize(
-        "activation",
-        [
-            Activation("leaky_relu", (0.01,)),
-            Activation("elu", (0.7,)),
-            Activation("softplus", (1.5, 20.0)),
-            Activation("clamp", (-0.5, 0.25)),
-        ],
-    )
-    def test_activations_with_constants(self, activation, tmp_path):
-        env = made("fmugym/Pendulum-v0")
-        first, *rest = network_for(env).layers
-        layers = Layer(first.weights, first.bias, (activation,)), *rest
-        self._compare(env, Network(layers, env.action_space), tmp_path)
+        env = made("Pendulum")
+        self._compare(env, network_with(activation, env, squashed), tmp_path)
 
     def test_double_precision(self, tmp_path):
-        env = made("fmugym/Pendulum-v0")
+        env = made("Pendulum")
         layers = network_for(env).layers
         wide = [
             Layer(one.weights.astype(float), one.bias.astype(float), one.activations)
@@ -547,7 +479,7 @@ class TestNetworks:
         env.close()
 
     def test_of_another_task_is_refused(self):
-        env, other = made("fmugym/Pendulum-v0"), made("fmugym/CartPole-v0")
+        env, other = made("Pendulum"), made("CartPole")
         with pytest.raises(ConfigError, match="4 values, the task gives 3"):
             agent_of(env, network_for(other))
         env.close()

@@ -13,7 +13,16 @@ import fmpy
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import TIMED, TIMES, drawn_in, largest_difference, network_for, plant_of
+from export_tools import (
+    TIMED,
+    TIMES,
+    acting,
+    differences,
+    drawn_in,
+    made,
+    network_for,
+    plant_of,
+)
 from fmpy.fmi2 import FMU2Slave
 from fmpy.fmi3 import FMU3Slave
 from fmpy.validation import validate_fmu
@@ -28,10 +37,6 @@ pytestmark = pytest.mark.skipif(
     sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler"
 )
 VERSIONS = ["2.0", "3.0"]
-
-
-def made(env_id):
-    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
 
 
 @pytest.fixture(params=VERSIONS, scope="module")
@@ -156,35 +161,18 @@ class TestClosedLoop:
         network = network_for(env)
         agent = agent_of(env, network, name="agent", all_inputs=True)
         path = write_fmu(agent, tmp_path / "agent.fmu", fmi_version=version)
-        measured, written = (
-            [v.name for v in p] for p in (agent.logic.measurements, agent.logic.inputs)
-        )
-        observation, _ = env.reset(seed=1)
-        parameters = {one.name: env.variables[one.name] for one in agent.logic.parameters}
-        worst, size, inputs = 0.0, env.inside.interface.time_step, env.inside.interface.inputs
+        env.reset(seed=1)
         with plant_of(env, tmp_path) as plant, controller_of(path, tmp_path) as controller:
-            controller.begin(**parameters)
-            for count in range(300):
-                controller.set(dict(zip(measured, plant.read(measured), strict=True)))
-                controller.step(count * size, size)
-                actions = controller.get(written)
-                plant.write(written, actions.tolist())
-                plant.step(count * size)
-                action = network.action(np.ravel(observation))
-                is_discrete = isinstance(env.action_space, gymnasium.spaces.Discrete)
-                result = env.step(int(action[0]) if is_discrete else action)
-                observation = result[0]
-                wanted = dict(zip([v.name for v in inputs], env.inputs, strict=True))
-                worst = max(worst, np.abs(actions - [wanted[name] for name in written]).max())
-                if result[2]:
-                    break
+            controller.begin(**drawn_in(env, agent.logic))
+            step = sampling(controller, agent.logic)
+            _, worst, count = differences(env, acting(network), agent.logic, step, 300, plant)
         assert count > 5
         assert worst <= 1e-5
         env.close()
 
     @pytest.mark.parametrize("times", ["drawn", "after a warm-up"])
-    def test_from_several_start_times(self, times, version, tmp_path):
-        env = fmugym.load(TIMED | TIMES[times])
+    def test_from_several_start_times(self, times, version, tmp_path, load):
+        env = load(TIMED | TIMES[times])
         network = network_for(env, scaled=False)
         agent = agent_of(env, network, name="agent")
         path = write_fmu(agent, tmp_path / "agent.fmu", fmi_version=version)
@@ -194,8 +182,8 @@ class TestClosedLoop:
                 assert controller.variables["start_time"].unit == "s"
                 controller.begin(**drawn_in(env, agent.logic))
                 step = sampling(controller, agent.logic)
-                assert largest_difference(env, network, agent.logic, step, 60) <= 1e-5
-        env.close()
+                _, worst, _ = differences(env, acting(network), agent.logic, step, 60)
+                assert worst <= 1e-5
 
     def test_in_the_simulation_of_fmpy(self, house, tmp_path):
         env, network, path = house

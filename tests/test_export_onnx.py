@@ -2,24 +2,27 @@
 
 import json
 
-import gymnasium
 import numpy as np
 import pytest
+import test_export
+import test_export_search
 from export_tools import (
+    ACTIVATIONS,
     FUNCTIONS,
-    TIMED,
-    TIMES,
+    Runner,
+    acting,
     arguments_of,
-    drawn_in,
-    largest_difference,
+    closed_loop,
+    exported,
+    made,
     network_for,
+    network_with,
 )
-from test_export import TASKS, Filtered, heating
-from test_export_search import HEATERS, HISTORY, PID, agent_for, heater, played, require_same
+from test_export import Filtered, heating
+from test_export_search import HEATERS, PID, heater
 
-import fmugym
 from fmugym import ConfigError
-from fmugym.export import Activation, Layer, Network, agent_of, write_onnx
+from fmugym.export import agent_of, write_onnx
 from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import computed, interpolated
 from fmugym.search.agent import Agent
@@ -28,131 +31,39 @@ onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
 runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
 
 
-def made(env_id):
-    return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
-
-
-class Runner:
-    """Takes samples with ONNX Runtime, as a user would."""
-
-    def __init__(self, path, count=1):
-        self.session = runtime.InferenceSession(str(path))
-        facts = self.session.get_modelmeta().custom_metadata_map
-        self.facts = {name: json.loads(value) for name, value in facts.items()}
-        types = {"tensor(double)": np.float64, "tensor(float)": np.float32}
-        types["tensor(int64)"] = np.int64
-        kinds = {one.name: types[one.type] for one in self.session.get_inputs()}
-        self.memory = {
-            name: np.repeat(np.array(start, kinds[name])[None], count, axis=0)
-            for name, start in self.facts["memory"].items()
-        }
-
-    def step(self, measurements):
-        """The actions for measurements of shape (N, m)."""
-        names = ["actions", *(f"next_{name}" for name in self.memory)]
-        inputs = {"measurements": np.asarray(measurements, np.float64), **self.memory}
-        actions, *memory = self.session.run(names, inputs)
-        self.memory = dict(zip(self.memory, memory, strict=True))
-        return actions
-
-
-def difference(env, network, agent, path, steps):
-    """The largest difference of inputs while the environment's own agent acts."""
-    runner = Runner(write_onnx(agent, path))
-    for name, value in drawn_in(env, agent.logic).items():
-        runner.memory[name][:] = value
-
-    def step(measured):
-        return runner.step([measured])[0]
-
-    return largest_difference(env, network, agent.logic, step, steps)
-
-
-class TestEpisodes:
-    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House", "CloudPendulum"])
-    def test_of_registered_tasks(self, env_id, tmp_path):
-        env = made(env_id)
-        network = network_for(env)
-        env.reset(seed=4)
-        agent = agent_of(env, network, all_inputs=True)
-        assert difference(env, network, agent, tmp_path / "agent.onnx", 200) <= 1e-5
-        env.close()
-
-    @pytest.mark.parametrize("task", TASKS)
-    def test_of_what_a_task_file_declares(self, task, tmp_path):
-        env = heating(task)
-        network = network_for(env, scaled=False)
-        env.reset(seed=1)
-        assert (
-            difference(env, network, agent_of(env, network), tmp_path / "agent.onnx", 192) <= 1e-5
-        )
-        env.close()
-
-    @pytest.mark.parametrize("times", TIMES)
-    def test_from_several_start_times(self, times, tmp_path):
-        env = fmugym.load(TIMED | TIMES[times])
-        network = network_for(env, scaled=False)
-        for seed in range(3):
-            env.reset(seed=seed)
-            path = tmp_path / f"{seed}.onnx"
-            assert difference(env, network, agent_of(env, network), path, 60) <= 1e-5
-        env.close()
+class TestEpisodes(test_export.Loops):
+    languages = ("ONNX",)
 
     def test_of_data_that_are_given(self, tmp_path):
         env = made("House")
         network = network_for(env)
         agent = agent_of(env, network, external=["T_set"])
-        runner = Runner(write_onnx(agent, tmp_path / "agent.onnx"))
+        runner = exported(agent, tmp_path, "ONNX")
         places = [i for i, one in enumerate(env.observation_names) if one.startswith("T_set")]
         observation, _ = env.reset(seed=2)
-        runner.memory["clock"][:] = env.variables["clock"]
+        runner.begin(clock=env.variables["clock"])
         for _ in range(50):
-            actions = runner.step([[env.out["T_op"], env.out["T_w"], *observation[places]]])
+            actions = runner.step([env.out["T_op"], env.out["T_w"], *observation[places]])
             observation, *_ = env.step(network.action(observation))
-            assert actions[0, 0] == pytest.approx(env.inputs[0], abs=1e-5)
+            assert actions[0] == pytest.approx(env.inputs[0], abs=1e-5)
         env.close()
 
     def test_of_hooks_by_hand(self, tmp_path):
         env = Filtered()
         network = network_for(env)
-        runner = Runner(write_onnx(agent_of(env, network), tmp_path / "agent.onnx"))
+        runner = exported(agent_of(env, network), tmp_path, "ONNX")
         observation, _ = env.reset(seed=5)
-        runner.memory["goal"][:] = env.variables["goal"]
+        runner.begin(goal=env.variables["goal"])
         for _ in range(50):
             action = network.action(np.concatenate([observation["angle"], observation["speed"]]))
             gain = [0.5, 1.0, 2.0][action[0]]
-            assert runner.step([env.state]).item() == pytest.approx(gain * (action[1] - 1.0))
+            assert runner.step(env.state).item() == pytest.approx(gain * (action[1] - 1.0))
             observation, *_ = env.step(action)
         env.close()
 
 
-class TestSearch:
-    """Agents that a search has found, beside their Python policies."""
-
-    @pytest.mark.parametrize("task", HEATERS)
-    def test_of_task_files(self, task, tmp_path):
-        document, text, form = HEATERS[task]
-        env = heater(document)
-        agent = agent_for(env, text, form)
-        exported = agent_of(env, agent)
-        runner = Runner(write_onnx(exported, tmp_path / "agent.onnx"))
-        env.reset(seed=1)
-        for name, value in drawn_in(env, exported.logic).items():
-            runner.memory[name][:] = value
-        both = played(env, agent, lambda values: runner.step([values])[0])
-        require_same(both, different=2)
-        env.close()
-
-    def test_of_choices(self, tmp_path):
-        env = made("CartPole")
-        agent = agent_for(env, None, HISTORY)
-        exported = agent_of(env, agent)
-        runner = Runner(write_onnx(exported, tmp_path / "agent.onnx"))
-        policy, rows = agent.policy().bind(env), np.random.default_rng(0).normal(size=(200, 4))
-        chosen = [policy.act(row) for row in rows.astype(np.float32)]
-        assert 5 < np.sum(chosen) < 195
-        assert [runner.step([row]).item() for row in rows] == [-10.0 + 20.0 * one for one in chosen]
-        env.close()
+class TestSearch(test_export_search.Agents):
+    language = "ONNX"
 
     def test_the_memory_is_json_without_nan(self, tmp_path):
         env = heater(HEATERS["a controller"][0])
@@ -230,8 +141,8 @@ class TestModel:
         env.close()
         seen = 290 + 5 * np.random.default_rng(0).normal(size=(20, 7, 1))
         many, one = Runner(path, 7), Runner(path)
-        together = np.array([many.step(row) for row in seen])
-        alone = np.array([one.step(row[3:4]) for row in seen])
+        together = np.array([many.steps(row) for row in seen])
+        alone = np.array([one.steps(row[3:4]) for row in seen])
         assert together[:, 3:4] == pytest.approx(alone, abs=1e-6)
         assert np.ptp(together) > 0.01
 
@@ -246,25 +157,14 @@ class TestModel:
         assert facts["memory"].keys() == {"count", "clock"}
         onnx.checker.check_model(str(path), full_check=True)
 
-    @pytest.mark.parametrize(
-        "activation",
-        [
-            *map(Activation, ["tanh", "relu", "sigmoid", "silu"]),
-            Activation("leaky_relu", (0.02,)),
-            Activation("elu", (0.7,)),
-            Activation("softplus", (1.5, 20.0)),
-            Activation("clamp", (-0.5, 0.25)),
-        ],
-        ids=lambda one: one.name,
-    )
+    @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda one: one.name)
     @pytest.mark.parametrize("squashed", [False, True])
     def test_activations(self, activation, squashed, tmp_path):
         env = made("Pendulum")
-        first, *rest = network_for(env, squashed=squashed).layers
-        layers = Layer(first.weights, first.bias, (activation,)), *rest
-        network = Network(layers, env.action_space, squashed=squashed)
-        env.reset(seed=0)
-        assert difference(env, network, agent_of(env, network), tmp_path / "agent.onnx", 50) <= 1e-5
+        network = network_with(activation, env, squashed)
+        agent = agent_of(env, network)
+        _, written, _ = closed_loop(env, acting(network), agent, tmp_path, 50, language="ONNX")
+        assert written <= 1e-5
         env.close()
 
     def test_nothing_is_overwritten(self, tmp_path):

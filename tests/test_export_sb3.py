@@ -6,14 +6,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import compiled, plant_of
+from export_tools import closed_loop, compiled, made
 from fmpy.validation import validate_fmu
 from test_export import Filtered
 
 from fmugym import ConfigError
 from fmugym.export import Scaling, agent_of, network_of
 from fmugym.export.policies import network_of_model
-from fmugym.tools.cli import main
 
 sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra 'sb3'")
 torch = pytest.importorskip("torch", reason="needs PyTorch")
@@ -39,43 +38,15 @@ def model_of(name, env, **more):
     return algorithm(name)("MlpPolicy", env, **keywords)
 
 
-def made(env_id):
-    return gymnasium.make(env_id).unwrapped
+def predicting(model, normalization=None):
+    """A model as an agent of an environment."""
 
+    def act(observation):
+        if normalization is not None:
+            observation = normalization.normalize_obs(observation)
+        return model.predict(observation, deterministic=True)[0]
 
-def loops_differ(env, model, agent, tmp_path, normalization=None, seed=0):
-    """Play an episode in both loops.
-
-    Returns:
-        The largest differences of measurements and of inputs, and the number of steps.
-    """
-    controller = compiled(agent, tmp_path)
-    outer, env = env, env.unwrapped
-    observation, _ = outer.reset(seed=seed)
-    controller.begin(**{k: v for k, v in env.variables.items() if k == "clock"})
-    measured, written = (
-        [v.name for v in p] for p in (agent.logic.measurements, agent.logic.inputs)
-    )
-    worst, count, is_over = np.zeros(2), 0, False
-    with plant_of(env, tmp_path) as plant:
-        while not is_over:
-            own, seen = np.array(plant.read(measured)), [env.out[name] for name in measured]
-            actions = np.array(controller.step(own))
-            if normalization is not None:
-                observation = normalization.normalize_obs(observation)
-            action, _ = model.predict(observation, deterministic=True)
-            observation, _, terminated, truncated, _ = outer.step(
-                action if action.ndim else int(action)
-            )
-            wanted = dict(
-                zip([v.name for v in env.inside.interface.inputs], env.inputs, strict=True)
-            )
-            errors = np.abs(own - seen).max(), np.abs(actions - [wanted[n] for n in written]).max()
-            worst = np.maximum(worst, errors)
-            plant.write(written, actions)
-            plant.step(count * env.inside.interface.time_step)
-            count, is_over = count + 1, terminated or truncated or count == 699
-    return *worst, count
+    return act
 
 
 class TestClosedLoop:
@@ -87,11 +58,12 @@ class TestClosedLoop:
     )
     def test_continuous_actions(self, name, are_scaled, tmp_path):
         """Gymnasium's wrapper brings those from -1 to 1 to the ranges of the task."""
-        env = played = made("fmugym/Pendulum-v0")
+        env = played = made("Pendulum")
         if are_scaled:
             played = gymnasium.wrappers.RescaleAction(env, np.float32(-1), np.float32(1))
         model = model_of(name, played)
-        measured, written, steps = loops_differ(played, model, agent_of(env, model), tmp_path)
+        agent = agent_of(env, model)
+        measured, written, steps = closed_loop(played, predicting(model), agent, tmp_path, 700)
         assert measured <= 1e-4
         assert written <= 1e-4
         assert steps == 700
@@ -99,9 +71,10 @@ class TestClosedLoop:
 
     @pytest.mark.parametrize("name", DISCRETE)
     def test_discrete_actions(self, name, tmp_path):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         model = model_of(name, env)
-        measured, written, steps = loops_differ(env, model, agent_of(env, model), tmp_path)
+        agent = agent_of(env, model)
+        measured, written, steps = closed_loop(env, predicting(model), agent, tmp_path)
         assert (measured, written) == (0.0, 0.0)
         assert steps >= 8
         env.close()
@@ -115,9 +88,10 @@ class TestClosedLoop:
         model = model_of("PPO", venv, n_steps=64, batch_size=64)
         model.learn(512)
         venv.training = False
-        env = made("fmugym/House-v0")
+        env = made("House")
         agent = agent_of(env, model, venv, all_inputs=True)
-        measured, written, steps = loops_differ(env, model, agent, tmp_path, venv)
+        predict = predicting(model, venv)
+        measured, written, steps = closed_loop(env, predict, agent, tmp_path)
         assert measured <= 1e-3
         assert written <= 1e-4
         assert steps == 672
@@ -147,9 +121,10 @@ class TestClosedLoop:
 
     @pytest.mark.parametrize("name", ["PPO", "SAC"])
     def test_noise_that_depends_on_states(self, name, tmp_path):
-        env = made("fmugym/Pendulum-v0")
+        env = made("Pendulum")
         model = model_of(name, env, use_sde=True)
-        measured, written, _ = loops_differ(env, model, agent_of(env, model), tmp_path)
+        agent = agent_of(env, model)
+        measured, written, _ = closed_loop(env, predicting(model), agent, tmp_path, 700)
         assert measured <= 1e-4
         assert written <= 1e-4
         env.close()
@@ -157,7 +132,7 @@ class TestClosedLoop:
 
 class TestPyTorch:
     def test_a_sequential(self, tmp_path):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         layers = [torch.nn.Linear(4, 8), torch.nn.ReLU(), torch.nn.Linear(8, 2)]
         module = torch.nn.Sequential(torch.nn.Sequential(*layers[:2]), layers[2])
         controller = compiled(agent_of(env, network_of(module, env.action_space)), tmp_path)
@@ -174,7 +149,7 @@ class TestPyTorch:
         options = {"env_id": "fmugym/Pendulum-v0", "num_envs": 8, "steps": 512, "normalize": True}
         settings = ppo.Settings(**options)
         example = ppo.train(settings, lambda steps, mean, agent: None)
-        env = made("fmugym/Pendulum-v0")
+        env = made("Pendulum")
         scale = Scaling(example.scale.mean, example.scale.spread, np.full(3, np.inf))
         modules = [example._body, example._actor, torch.nn.Hardtanh()]
         network = network_of(modules, env.action_space, scaling=scale, squashed=True)
@@ -205,14 +180,14 @@ class TestRefused:
         [("RecurrentPPO", "MlpLstmPolicy", "memory"), ("MaskablePPO", "MlpPolicy", "masks")],
     )
     def test_a_policy_that_needs_more_than_observations(self, name, policy, fact):
-        env = made("fmugym/CartPole-v0")
+        env = made("CartPole")
         model = algorithm(name)(policy, env, device="cpu")
         with pytest.raises(ConfigError, match=f"{name}.*{fact}"):
             agent_of(env, model)
         env.close()
 
     def test_a_policy_that_does_more_than_its_layers(self):
-        env = made("fmugym/Pendulum-v0")
+        env = made("Pendulum")
         model = model_of("PPO", env)
         predict = model.policy._predict
         model.policy._predict = lambda *args, **more: predict(*args, **more) + 0.5
@@ -231,54 +206,48 @@ class Pretend(gymnasium.Env):
 class TestCommand:
     """``fmugym export``."""
 
-    def test_from_training_to_c(self, tmp_path, capsys):
-        task, folder = str(EXAMPLES / "cart_pole.toml"), tmp_path / "trained"
-        options = [
-            "--algorithm",
-            "PPO",
-            "--steps",
-            "256",
-            "--envs",
-            "2",
-            "--episodes",
-            "1",
-            "n_steps=64",
-        ]
-        assert main(["train", task, "--output", str(folder), *options]) == 0
-        capsys.readouterr()
-        output = tmp_path / "agent.c"
-        command = ["export", str(folder), "--task", task, "--output", str(output)]
-        assert main([*command, "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
+    def test_from_training_to_c(self, tmp_path, cli):
+        task, folder, output = EXAMPLES / "cart_pole.toml", tmp_path / "agent", tmp_path / "agent.c"
+        options = "--steps", "256", "--envs", "2", "--episodes", "1", "n_steps=64"
+        code, *_ = cli("train", task, "--output", folder, "--algorithm", "PPO", *options)
+        assert code == 0
+        command = "export", folder, "--task", task, "--output", output
+        code, out, _ = cli(*command, "--json")
+        facts = json.loads(out)
+        assert code == 0
         assert facts["files"] == [str(tmp_path / "agent.h"), str(output)]
         assert [one["name"] for one in facts["measurements"]] == ["x", "x_dot", "phi", "phi_dot"]
         assert facts["actions"] == [{"name": "f", "unit": "N"}]
         assert facts["sample_time"] == 0.02
-        assert main(command) == 1  # the files are there
-        assert "agent.c exists" in capsys.readouterr().err
+        code, _, err = cli(*command)
+        assert (code, "agent.c exists" in err) == (1, True)  # the files are there
 
-    def test_to_an_fmu(self, tmp_path, capsys):
-        env = made("fmugym/House-v0")
-        model_of("PPO", env).save(tmp_path / "model.zip")
-        env.close()
-        output = tmp_path / "heater.fmu"
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/House-v0"]
-        assert main([*command, "--output", str(output), "--fmi", "3.0", "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
-        assert [one["name"] for one in facts["parameters"]] == ["clock"]
-        assert validate_fmu(str(output)) == []
-        assert main(["info", str(output)]) == 0
-        assert "heater" in capsys.readouterr().out
+    @pytest.fixture
+    def export(self, tmp_path, cli):
+        """Export an untrained model; it, the exit code, and what the command printed."""
 
-    def test_to_onnx(self, tmp_path, capsys):
+        def command(env_id, output, *options, algorithm="PPO"):
+            env = made(env_id)
+            model = model_of(algorithm, env)
+            model.save(tmp_path / "model.zip")
+            env.close()
+            arguments = "--task", f"fmugym/{env_id}-v0", "--output", tmp_path / output
+            return model, *cli("export", tmp_path / "model.zip", *arguments, *options)
+
+        return command
+
+    def test_to_an_fmu(self, export, tmp_path, cli):
+        _, code, out, _ = export("House", "heater.fmu", "--fmi", "3.0", "--json")
+        assert code == 0
+        assert [one["name"] for one in json.loads(out)["parameters"]] == ["clock"]
+        assert validate_fmu(str(tmp_path / "heater.fmu")) == []
+        code, out, _ = cli("info", tmp_path / "heater.fmu")
+        assert (code, "heater" in out) == (0, True)
+
+    def test_to_onnx(self, export, tmp_path):
         runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")
-        env = made("fmugym/CartPole-v0")
-        model = model_of("PPO", env)
-        model.save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
-        assert main([*command, "--output", str(tmp_path / "agent.onnx")]) == 0
-        assert "action f N" in capsys.readouterr().out
+        model, code, out, _ = export("CartPole", "agent.onnx")
+        assert (code, "action f N" in out) == (0, True)
         session = runtime.InferenceSession(str(tmp_path / "agent.onnx"))
         seen = np.random.default_rng(0).normal(size=(100, 4))
         count = np.zeros(100, np.int64)
@@ -286,22 +255,11 @@ class TestCommand:
         best, _ = model.predict(seen.astype(np.float32), deterministic=True)
         assert actions[:, 0].tolist() == np.where(best, 10.0, -10.0).tolist()
 
-    def test_of_a_model_file(self, tmp_path, capsys):
-        env = made("fmugym/Pendulum-v0")
-        model_of("SAC", env).save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/Pendulum-v0"]
-        command += ["--output", str(tmp_path / "swing.c")]
-        assert main([*command, "--algorithm", "SAC"]) == 0
-        assert "action tau N.m" in capsys.readouterr().out
+    def test_of_another_algorithm(self, export):
+        _, code, out, _ = export("Pendulum", "swing.c", "--algorithm", "SAC", algorithm="SAC")
+        assert (code, "action tau N.m" in out) == (0, True)
 
-    @pytest.mark.parametrize(
-        ("output", "fact"), [("agent.exe", ".c"), ("a-b.c", "'a-b'"), ("no/agent.c", "no folder")]
-    )
-    def test_mistakes(self, output, fact, tmp_path, capsys):
-        env = made("fmugym/CartPole-v0")
-        model_of("PPO", env).save(tmp_path / "model.zip")
-        env.close()
-        command = ["export", str(tmp_path / "model.zip"), "--task", "fmugym/CartPole-v0"]
-        assert main([*command, "--output", str(tmp_path / output)]) == 1
-        assert fact in capsys.readouterr().err
+    @pytest.mark.parametrize(("output", "fact"), [("a-b.c", "'a-b'"), ("no/agent.c", "no folder")])
+    def test_mistakes(self, output, fact, export):
+        _, code, _, err = export("CartPole", output)
+        assert (code, fact in err) == (1, True)

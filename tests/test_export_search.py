@@ -6,10 +6,10 @@ import sys
 import gymnasium
 import numpy as np
 import pytest
-from export_tools import compiled, drawn_in
+from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
 from test_export import HEATING, PRESENT, TASKS, Filtered
-from test_export_fmu import controller_of
+from test_export_fmu import controller_of, sampling
 
 import fmugym
 from fmugym import ConfigError
@@ -86,18 +86,18 @@ def require_same(both, different=8):
     np.testing.assert_allclose(own, wanted, rtol=1e-9, atol=1e-12)
 
 
-class TestInC:
-    """The agent in C, beside its Python policy in an episode."""
+class Agents:
+    """The exported agent, beside its Python policy in an episode."""
 
     @pytest.mark.parametrize("task", HEATERS)
     def test_of_task_files(self, task, tmp_path):
         document, text, form = HEATERS[task]
         env = heater(document)
         agent = agent_for(env, text, form)
-        exported = agent_of(env, agent)
-        controller = compiled(exported, tmp_path)
+        made = agent_of(env, agent)
+        controller = exported(made, tmp_path, self.language)
         env.reset(seed=1)
-        controller.begin(**drawn_in(env, exported.logic))
+        controller.begin(**drawn_in(env, made.logic))
         both = played(env, agent, controller.step)
         assert both.shape[1] == 192
         require_same(both, different=2 if task == "levels" else 8)
@@ -115,15 +115,43 @@ class TestInC:
     def test_of_choices(self, text, form, tmp_path):
         env = gymnasium.make("fmugym/CartPole-v0").unwrapped
         agent = agent_for(env, text, form)
-        exported = agent_of(env, agent)
-        controller = compiled(exported, tmp_path)
+        made = agent_of(env, agent)
+        controller = exported(made, tmp_path, self.language)
         controller.begin()
         policy, rows = agent.policy().bind(env), np.random.default_rng(0).normal(size=(200, 4))
         chosen = [policy.act(row) for row in rows.astype(np.float32)]
-        seen = rows[:, [env.inside.interface.outputs.index(v) for v in exported.logic.measurements]]
+        seen = rows[:, [env.inside.interface.outputs.index(v) for v in made.logic.measurements]]
         assert 5 < np.sum(chosen) < 195
         assert [controller.step(row) for row in seen] == [[-10.0 + 20.0 * one] for one in chosen]
         env.close()
+
+    @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
+    def test_of_a_constant(self, text, tmp_path):
+        env = heater({"agent": PRESENT})
+        agent = agent_for(env, text, Form("constant", blind=True))
+        made = agent_of(env, agent)
+        assert made.network is None
+        assert [one.name for one in made.logic.measurements] == ["T_op"] * (text is not None)
+        controller = exported(made, tmp_path, self.language)
+        controller.begin()
+        require_same(played(env, agent, controller.step), different=1)
+        env.close()
+
+    def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
+        env = heater(TASKS["history"])
+        agent = agent_for(env, PID, HISTORY)
+        controller = exported(agent_of(env, agent), tmp_path, self.language)
+        runs = []
+        for _ in range(2):
+            controller.begin()
+            runs.append(played(env, agent, controller.step))
+        assert np.array_equal(*runs)
+        require_same(runs[1])
+        env.close()
+
+
+class TestInC(Agents):
+    language = "C99"
 
     def test_of_hooks_by_hand_with_several_choices(self, tmp_path):
         env = Filtered()
@@ -132,18 +160,6 @@ class TestInC:
         controller = compiled(agent_of(env, agent), tmp_path, "C++")
         controller.begin(goal=env.variables["goal"])
         require_same(played(env, agent, controller.step), different=3)
-        env.close()
-
-    @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
-    def test_of_a_constant(self, text, tmp_path):
-        env = heater({"agent": PRESENT})
-        agent = agent_for(env, text, Form("constant", blind=True))
-        exported = agent_of(env, agent)
-        assert exported.network is None
-        assert [one.name for one in exported.logic.measurements] == ["T_op"] * (text is not None)
-        controller = compiled(exported, tmp_path)
-        controller.begin()
-        require_same(played(env, agent, controller.step), different=1)
         env.close()
 
     def test_of_a_controller_in_python(self, tmp_path):
@@ -158,18 +174,6 @@ class TestInC:
         assert policy.baseline._state[1] == 20.0  # it is as before
         env.close()
 
-    def test_a_second_episode_begins_as_the_first_one(self, tmp_path):
-        env = heater(TASKS["history"])
-        agent = agent_for(env, PID, HISTORY)
-        controller = compiled(agent_of(env, agent), tmp_path)
-        runs = []
-        for _ in range(2):
-            controller.begin()
-            runs.append(played(env, agent, controller.step))
-        assert np.array_equal(*runs)
-        require_same(runs[1])
-        env.close()
-
 
 @pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
@@ -182,18 +186,9 @@ def test_as_an_fmu(version, task, tmp_path):
     path = write_fmu(exported, tmp_path / "heater.fmu", fmi_version=version)
     assert validate_fmu(str(path)) == []
     env.reset(seed=1)
-    names = [one.name for one in exported.logic.measurements]
     with controller_of(path, tmp_path) as controller:
         controller.begin(**drawn_in(env, exported.logic))
-        taken = []
-
-        def step(measurements):
-            controller.set(dict(zip(names, measurements, strict=True)))
-            controller.step(len(taken) * 900.0, 900.0)
-            taken.append(measurements)
-            return controller.get(["u"])
-
-        require_same(played(env, agent, step))
+        require_same(played(env, agent, sampling(controller, exported.logic)))
     env.close()
 
 
@@ -204,11 +199,10 @@ class TestRefused:
             agent_of(env, agent_for(env, "schedule 06:00=1 22:00=0", None))
         env.close()
 
-    def test_a_task_in_the_form_for_agents(self):
-        env = fmugym.load(HEATING | {"agent": PRESENT})
+    def test_a_task_in_the_form_for_agents(self, load):
+        env = load(HEATING | {"agent": PRESENT})
         with pytest.raises(ConfigError, match=r"physical"):
             agent_of(env, Agent("by hand", PID))
-        env.close()
 
     def test_another_task(self):
         env, other = heater({"agent": PRESENT}), heater(TASKS["forecast"])
@@ -233,11 +227,10 @@ class TestRefused:
         env.close()
 
 
-def test_by_the_command_line(tmp_path, capsys):
+def test_by_the_command_line(tmp_path, capsys, load):
     task = "examples/cart_pole.toml"
-    env = fmugym.load(task, physical=True)
+    env = load(task, physical=True)
     agent_for(env, "pid of=phi setpoint=0 kp=-100 td=0.1", HISTORY).save(tmp_path)
-    env.close()
     main(["export", str(tmp_path), "--task", task, "--output", str(tmp_path / "agent.c")])
     assert "measurement phi rad" in capsys.readouterr().out
     assert "agent_controller[2]" in (tmp_path / "agent.h").read_text()

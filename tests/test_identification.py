@@ -1,22 +1,19 @@
 """Identification: what was simulated is found again, and what was measured is predicted."""
 
 import os
-import subprocess
 import sys
 from contextlib import closing
 from pathlib import Path
 
-import fuzz_driver
-import fuzz_identification
 import numpy as np
 import pytest
+from example_tools import run_example
+from fmu_tools import PlainEnv
 from scipy.integrate import solve_ivp
 
 import fmugym
 from fmugym.identification import Trajectory, fit_parameters, fit_swing, plot_comparison
-from fmugym.identification.statistics import information_inverse
 
-ROOT = Path(__file__).parent.parent
 PENDULUM = fmugym.bundled_fmu("Pendulum")
 DOUBLE_PENDULUM = fmugym.bundled_fmu("DoublePendulum")
 TRUE = {"m": 0.06, "l": 0.1, "b": 4e-4, "c": 2e-3}
@@ -55,15 +52,21 @@ def noisy(seed, *angles, c=2e-3, end=2.0, tau=0.0, step=0.004):
     return made
 
 
-@pytest.fixture(scope="module", name="fit")
-def fixture_fit():
+def fitted(**options):
+    """Three parameters, fitted to three swings with noise."""
     return fit_parameters(
         PENDULUM,
         {"l": (0.05, 0.2), "b": 1e-3, "c": (1e-3, 0.0, 0.01)},
         noisy(1, 2.0, -1.0, 2.8),
         initial_states=START,
         scales={"q": 0.01, "q_dot": 0.1},
+        **options,
     )
+
+
+@pytest.fixture(scope="module", name="fit")
+def fixture_fit():
+    return fitted()
 
 
 class TestSwing:
@@ -220,14 +223,7 @@ class TestOutputError:
             fit_parameters(preloading, {"b": 1e-3}, noisy(0, 1.0))
 
     def test_both_pools_give_the_same(self, fit):
-        again = fit_parameters(
-            PENDULUM,
-            {"l": (0.05, 0.2), "b": 1e-3, "c": (1e-3, 0.0, 0.01)},
-            noisy(1, 2.0, -1.0, 2.8),
-            initial_states=START,
-            scales={"q": 0.01, "q_dot": 0.1},
-            backend="fmpy",
-        )
+        again = fitted(backend="fmpy")
         assert again.values == pytest.approx(fit.values, rel=1e-9)
 
     def test_parameters_that_the_data_do_not_tell(self):
@@ -250,16 +246,12 @@ class TestOutputError:
         assert (found.low, found.high) == (0.11, 0.2)
 
     def test_the_result_goes_into_an_environment(self, fit):
-        class Env(fmugym.FMUEnv):
-            def _is_done(self):
-                return False
-
         config = {"model_input_names": "tau", "model_output_names": "q", "time_step": 0.02}
-        env = Env(PENDULUM, config | {"model_parameters": fit.values})
+        env = PlainEnv(PENDULUM, config | {"model_parameters": fit.values})
         env.reset()
         assert dict(env.parameters) == fit.values
         env.close()
-        env = Env(PENDULUM, config | {"model_parameters": fit.distributions()})
+        env = PlainEnv(PENDULUM, config | {"model_parameters": fit.distributions()})
         env.reset(seed=1)
         assert env.parameters["l"] == pytest.approx(fit.values["l"], rel=0.05)
         assert env.parameters["l"] != fit.values["l"]
@@ -327,14 +319,6 @@ class TestOutputError:
             fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0), fixed=fixed)
 
 
-def test_odd_arguments_raise_nothing_but_our_own_errors(same_working_directory):
-    """A short form of ``python tests/fuzz_identification.py``."""
-    tally = fuzz_driver.run(fuzz_identification.program, 400, seed="tests")
-    assert tally.failures == []
-    assert tally.total("accepted") + tally.total("refused") == 400
-    assert min(tally.total("accepted"), tally.total("refused")) > 10
-
-
 class TestTrajectory:
     def test_repeats_are_left_out_but_for_a_plant_at_rest(self):
         q = np.array([1.0, 1.0, 2.0, 3.0, 3.0, 3.0, 4.0, *[0.0] * 20])
@@ -371,13 +355,8 @@ class TestTrajectory:
 
 def simulate(torques):
     """The angle of the pendulum FMU at the start and after each step of 0.01 s."""
-
-    class Env(fmugym.FMUEnv):
-        def _is_done(self):
-            return False
-
     config = {"model_input_names": "tau", "model_output_names": "q", "time_step": 0.01}
-    env = Env(PENDULUM, config | {"model_parameters": {"q_0": 0.0}})
+    env = PlainEnv(PENDULUM, config | {"model_parameters": {"q_0": 0.0}})
     env.reset()
     angles = [env.state[0]]
     for torque in torques:
@@ -385,12 +364,6 @@ def simulate(torques):
         angles.append(env.state[0])
     env.close()
     return np.array(angles)
-
-
-def test_a_column_of_zeros_is_undetermined():
-    inverse = information_inverse(np.array([[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]))
-    assert inverse.undetermined.tolist() == [False, True]
-    assert inverse.matrix[0, 0] == pytest.approx(1 / 14)
 
 
 def test_scipy_is_named_with_its_extra(monkeypatch):
@@ -453,11 +426,6 @@ def free_fall(index):
 
 
 def test_example(tmp_path):
-    command = [sys.executable, "-W", "error", ROOT / "examples/identify_pendulum.py"]
-    environment = {**os.environ, "MPLBACKEND": "Agg"}
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=environment
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "least squares, with Coulomb friction" in done.stdout
+    printed = run_example("identify_pendulum.py", folder=tmp_path)
+    assert "least squares, with Coulomb friction" in printed
     assert [path.name for path in tmp_path.iterdir()] == ["identified_pendulum.png"]

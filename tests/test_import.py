@@ -57,3 +57,14 @@ def test_other_names_are_refused(module):
     with pytest.raises(AttributeError, match=rf"module '{module.__name__}' has no attribute 'Foo'"):
         module.Foo  # noqa: B018 (the access is what is tested)
     assert not hasattr(module, "__wrapped__")
+
+
+@pytest.mark.parametrize(
+    ("module", "library"),
+    [("sb3", "stable_baselines3"), ("minari", "minari"), ("rllib", "ray"), ("torchrl", "torch")],
+)
+def test_a_missing_library_names_its_extra(module, library):
+    program = f"import sys; sys.modules[{library!r}] = None; import fmugym.{module}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert f"pip install '.[{module}]'" in done.stderr

@@ -4,7 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from lab_tools import TOKEN, experiment, track
+from lab_tools import (
+    TOKEN,
+    experiment,
+    fixture_lab,  # noqa: F401  # the fixture "lab"
+    track,
+)
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError
@@ -14,6 +19,7 @@ WEIGHT = 0.06 * 9.81 * 0.1  # N m
 INERTIA = 0.06 * 0.1**2  # kg m^2
 ENCODER_STEP = 2 * math.pi / 2**17  # rad
 LAG = 0.00375  # s
+AT_ONCE = {"get_time": (0.0, 0.0), "set_time": (0.0, 0.0)}
 
 
 def make_lab(preset="ideal", **arguments):
@@ -34,47 +40,42 @@ def free_fall(angle, times, friction=0.0):
 
 
 class TestMotion:
-    def test_free_fall_is_that_of_the_equation(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, initial_position=[2.0])
-            swing = track(lab, client, token, 3.0)
+    def test_free_fall_is_that_of_the_equation(self, lab):
+        client, token = experiment(lab, initial_position=[2.0])
+        swing = track(lab, client, token, 3.0)
         reference, _ = free_fall(2.0, np.arange(151) * 0.02)
         assert swing == pytest.approx(reference, abs=1e-6)
 
-    def test_cells_move_between_calls_however_few(self):
-        with make_lab() as lab:
-            often, first = experiment(lab, initial_position=[1.0])
-            seldom, second = experiment(lab, initial_position=[1.0])
-            for _ in range(150):
-                lab.clock.advance(0.01)
-                often.get_velocity(first)
-            assert often.get_position(first) == seldom.get_position(second)
+    def test_cells_move_between_calls_however_few(self, lab):
+        often, first = experiment(lab, initial_position=[1.0])
+        seldom, second = experiment(lab, initial_position=[1.0])
+        for _ in range(150):
+            lab.clock.advance(0.01)
+            often.get_velocity(first)
+        assert often.get_position(first) == seldom.get_position(second)
 
-    def test_cells_are_independent(self):
-        with make_lab() as lab:
-            pushed, first = experiment(lab)
-            resting, second = experiment(lab)
-            pushed.set_torque(0.05, first)
-            lab.clock.advance(0.1)
-            assert pushed.get_position(first) > 0.1
-            assert resting.get_position(second) == pytest.approx(0.0, abs=1e-12)
+    def test_cells_are_independent(self, lab):
+        pushed, first = experiment(lab)
+        resting, second = experiment(lab)
+        pushed.set_torque(0.05, first)
+        lab.clock.advance(0.1)
+        assert pushed.get_position(first) > 0.1
+        assert resting.get_position(second) == pytest.approx(0.0, abs=1e-12)
 
-    def test_double_integrator_has_no_weight(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, "DoubleIntegrator", initial_position=[1.0])
-            lab.clock.advance(1.0)
-            assert client.get_position(token) == pytest.approx(1.0, abs=1e-12)
+    def test_double_integrator_has_no_weight(self, lab):
+        client, token = experiment(lab, "DoubleIntegrator", initial_position=[1.0])
+        lab.clock.advance(1.0)
+        assert client.get_position(token) == pytest.approx(1.0, abs=1e-12)
 
-    def test_a_session_begins_anew(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, cell_id=101)
-            client.set_impedance_controller_params(1.0, 0.01, token)
-            client.set_torque(0.1, token)
-            lab.clock.advance(0.2)
-            client.stop_experiment(token)
-            client, token = experiment(lab, cell_id=101)
-            lab.clock.advance(0.5)
-            assert (client.get_position(token), client.get_velocity(token)) == pytest.approx((0, 0))
+    def test_a_session_begins_anew(self, lab):
+        client, token = experiment(lab, cell_id=101)
+        client.set_impedance_controller_params(1.0, 0.01, token)
+        client.set_torque(0.1, token)
+        lab.clock.advance(0.2)
+        client.stop_experiment(token)
+        client, token = experiment(lab, cell_id=101)
+        lab.clock.advance(0.5)
+        assert (client.get_position(token), client.get_velocity(token)) == pytest.approx((0, 0))
 
     def test_parameters_of_the_plant(self):
         with make_lab(parameters={CellType.SINGLE: {"b": 0.0, "l": 0.4}}) as lab:
@@ -96,30 +97,27 @@ class TestMotion:
 
 
 class TestDrive:
-    def test_stiffness_balances_the_weight(self):
-        with make_lab() as lab:
-            client, token = experiment(lab)
-            client.set_position([1.0], token)
-            client.set_impedance_controller_params([0.1], [0.01], token)
-            track(lab, client, token, 5.0, 0.5)
-            q, torque = client.get_position(token), client.get_torque(token)
+    def test_stiffness_balances_the_weight(self, lab):
+        client, token = experiment(lab)
+        client.set_position([1.0], token)
+        client.set_impedance_controller_params([0.1], [0.01], token)
+        track(lab, client, token, 5.0, 0.5)
+        q, torque = client.get_position(token), client.get_torque(token)
         assert torque == pytest.approx(0.1 * (1.0 - q), abs=1e-6)
         assert torque == pytest.approx(WEIGHT * math.sin(q), abs=1e-6)
 
-    def test_damping_follows_a_velocity(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, "DoubleIntegrator")
-            client.set_impedance_controller_params(0.0, 0.05, token)
-            client.set_velocity(3.0, token)
-            track(lab, client, token, 1.0, 0.5)
-            assert client.get_velocity(token) == pytest.approx(3.0 * 0.05 / 0.0504, rel=1e-4)
+    def test_damping_follows_a_velocity(self, lab):
+        client, token = experiment(lab, "DoubleIntegrator")
+        client.set_impedance_controller_params(0.0, 0.05, token)
+        client.set_velocity(3.0, token)
+        track(lab, client, token, 1.0, 0.5)
+        assert client.get_velocity(token) == pytest.approx(3.0 * 0.05 / 0.0504, rel=1e-4)
 
-    def test_torque_is_fed_forward(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, initial_position=[math.pi / 2])
-            client.set_torque(WEIGHT, token)
-            track(lab, client, token, 1.0, 0.5)
-            assert client.get_position(token) == pytest.approx(math.pi / 2, abs=1e-6)
+    def test_torque_is_fed_forward(self, lab):
+        client, token = experiment(lab, initial_position=[math.pi / 2])
+        client.set_torque(WEIGHT, token)
+        track(lab, client, token, 1.0, 0.5)
+        assert client.get_position(token) == pytest.approx(math.pi / 2, abs=1e-6)
 
     def test_spring_gains_no_energy(self):
         plant = {CellType.SINGLE: {"b": 0.0}}
@@ -142,11 +140,10 @@ class TestDrive:
 
 
 class TestStartPosition:
-    def test_ideal_cells_start_where_they_are_told(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, initial_position=[-2.5])
-            assert client.get_position(token) == pytest.approx(-2.5, abs=1e-12)
-            assert client.get_velocity(token) == 0.0
+    def test_ideal_cells_start_where_they_are_told(self, lab):
+        client, token = experiment(lab, initial_position=[-2.5])
+        assert client.get_position(token) == pytest.approx(-2.5, abs=1e-12)
+        assert client.get_velocity(token) == 0.0
 
     @pytest.mark.parametrize(
         ("asked", "measured"),
@@ -166,7 +163,7 @@ class TestStartPosition:
         assert 0.43 * (asked - q) == pytest.approx(WEIGHT * math.sin(q), abs=1e-4)
 
     def test_homing_takes_its_time(self):
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             experiment(lab, preparation_time=0.5)
             assert lab.clock.time() == pytest.approx(1.5)
 
@@ -175,7 +172,7 @@ class TestStartPosition:
 def fixture_readings():
     """Position, velocity and torque of a hardware cell that hangs, one row a new sample."""
     rows = []
-    with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+    with make_lab("hardware", **AT_ONCE) as lab:
         client, token = experiment(lab)
         for _ in range(10_000):
             lab.clock.advance(0.002)
@@ -196,7 +193,7 @@ class TestReadings:
 
     def test_elbow_has_the_worse_sensor(self):
         rows, angles = [], []
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab, "DoublePendulum", initial_position=[1.0, 0.0])
             for _ in range(3000):
                 lab.clock.advance(0.005)
@@ -215,13 +212,13 @@ class TestReadings:
 
     def test_share_of_stale_repeats_is_the_measured_one(self):
         """In the public swings of 10 s, 44.1 to 44.7 % of the rows at 1 kHz repeat the last."""
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 10.0, 0.001, "get_velocity")
         assert np.mean(np.diff(velocity) == 0.0) == pytest.approx(0.445, abs=0.015)
 
     def test_new_samples_come_after_one_or_two_milliseconds(self):
-        with make_lab("hardware", get_time=(0.0, 0.0), set_time=(0.0, 0.0)) as lab:
+        with make_lab("hardware", **AT_ONCE) as lab:
             client, token = experiment(lab)
             velocity = track(lab, client, token, 5.0, 0.0005, "get_velocity")
         gaps = np.diff(np.flatnonzero(np.diff(velocity)))
@@ -237,13 +234,12 @@ class TestReadings:
         reference = 0.006 / 4e-4 * (1 - math.exp(-4e-4 / INERTIA * (0.2 - LAG)))
         assert velocity == pytest.approx(reference, abs=0.003)  # 0.038 less than it is
 
-    def test_ideal_readings_are_the_truth(self):
-        with make_lab() as lab:
-            client, token = experiment(lab, initial_position=[1.0])
-            track(lab, client, token, 0.4)
-            cell = lab._bookings.cells[0]
-            readings = [getattr(client, f"get_{what}")(token) for what in NAMES]
-            assert readings == [*cell.position, *cell.velocity, *cell.torque]
+    def test_ideal_readings_are_the_truth(self, lab):
+        client, token = experiment(lab, initial_position=[1.0])
+        track(lab, client, token, 0.4)
+        cell = lab._bookings.cells[0]
+        readings = [getattr(client, f"get_{what}")(token) for what in NAMES]
+        assert readings == [*cell.position, *cell.velocity, *cell.torque]
 
 
 class TestFriction:
@@ -286,11 +282,10 @@ class TestNetwork:
         assert np.mean(both > 10.0) == pytest.approx(0.002, abs=0.0015)
         assert both.max() < 55.0
 
-    def test_ideal_calls_take_no_time(self):
-        with make_lab() as lab:
-            client, token = experiment(lab)
-            client.get_position(token)
-            assert lab.clock.time() == 0.0
+    def test_ideal_calls_take_no_time(self, lab):
+        client, token = experiment(lab)
+        client.get_position(token)
+        assert lab.clock.time() == 0.0
 
 
 class TestSeeds:
@@ -304,6 +299,5 @@ class TestSeeds:
         assert readings[1][0] == readings[1][1]
         assert readings[1][0] != readings[2][0]
 
-    def test_token_of_a_user_does_not_matter(self):
-        with make_lab() as lab:
-            Client(lab).start_experiment(TOKEN * 2, "SimplePendulum", 1)
+    def test_token_of_a_user_does_not_matter(self, lab):
+        Client(lab).start_experiment(TOKEN * 2, "SimplePendulum", 1)

@@ -215,17 +215,19 @@ class TestDisturbances:
         track(lab, client, token, 0.6, 0.2)
         assert abs(client.get_position(token)) > 0.1
 
-    def test_position_at_a_time(self, lab):
-        pull = TimedPositionDisturbance(0.5, [0.8], duration=1.0)
-        client, token = experiment(lab, disturbances=pull)
-        track(lab, client, token, 1.4, 0.2)
-        assert client.get_position(token) == pytest.approx(0.72, abs=0.05)  # it sags
-
-    def test_pull_to_rest_by_default(self, lab):
-        pull = TimedPositionDisturbance(0.5, duration=1.0)
-        client, token = experiment(lab, initial_position=[1.0], disturbances=[pull])
-        track(lab, client, token, 1.4, 0.2)
-        assert client.get_position(token) == pytest.approx(0.0, abs=0.05)
+    @pytest.mark.parametrize(
+        ("pull", "begin", "duration", "expected"),
+        [
+            (TimedPositionDisturbance(0.5, [0.8], duration=1.0), 0.0, 1.4, 0.72),  # it sags
+            (TimedPositionDisturbance(0.5, duration=1.0), 1.0, 1.4, 0.0),
+            (StateDependentPositionDisturbance([0.0], [0.5], duration=1.0), 1.0, 1.1, 0.44),
+        ],
+        ids=["at a time", "to rest", "at a position"],
+    )
+    def test_pulls(self, lab, pull, begin, duration, expected):
+        client, token = experiment(lab, initial_position=[begin], disturbances=pull)
+        track(lab, client, token, duration, 0.1)
+        assert client.get_position(token) == pytest.approx(expected, abs=0.05)
 
     def test_torque_at_a_position(self, lab):
         push = StateDependentTorqueDisturbance([0.0], 0.1, [0.05], tolerance=0.2, earliest=0.5)
@@ -235,12 +237,6 @@ class TestDisturbances:
             lab.clock.advance(0.05)
             pair = client.get_velocity(token), calm.get_velocity(quiet)
         assert abs(pair[0] - pair[1]) > 1.0
-
-    def test_position_at_a_position(self, lab):
-        pull = StateDependentPositionDisturbance([0.0], [0.5], duration=1.0)
-        client, token = experiment(lab, initial_position=[1.0], disturbances=[pull])
-        track(lab, client, token, 1.1, 0.1)
-        assert client.get_position(token) == pytest.approx(0.44, abs=0.05)
 
     def test_pull_without_a_position(self, lab):
         pull = StateDependentPositionDisturbance([0.0, 0.0], duration=1.0)

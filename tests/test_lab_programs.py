@@ -1,36 +1,17 @@
 """Whole programs in the lab: one in the form of the published tutorial, and the examples."""
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from example_tools import run_example
 
 from fmugym.lab import Client, Lab, ManualClock
 
-HERE = Path(__file__).parent
-EXAMPLES = HERE.parent / "examples"
 LENGTH = 0.10  # m
 TOLERANCE = {"ideal": 0.015, "hardware": 0.03}
 
 each_preset = pytest.mark.parametrize("preset", TOLERANCE)
-
-
-def run(script, *arguments, folder, **environment):
-    done = subprocess.run(
-        [sys.executable, "-W", "error", script, *map(str, arguments)],
-        cwd=folder,
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
 
 
 FOR_THE_REAL_LAB = """
@@ -73,7 +54,8 @@ def test_a_program_for_the_real_lab_runs_with_another_import(tmp_path, temp_root
     (tmp_path / "program.py").write_text(
         FOR_THE_REAL_LAB.replace("cloudpendulumclient", "fmugym.lab")
     )
-    printed = run("program.py", folder=tmp_path, HOME=str(tmp_path), USERPROFILE=str(tmp_path))
+    home = {"HOME": str(tmp_path), "USERPROFILE": str(tmp_path)}
+    printed = run_example(tmp_path / "program.py", folder=tmp_path, **home)
     assert printed.startswith("1000 3600.0 20 20\n")
     length = float(printed.rpartition("length ")[2])
     assert length == pytest.approx(LENGTH, rel=TOLERANCE["hardware"])
@@ -81,11 +63,8 @@ def test_a_program_for_the_real_lab_runs_with_another_import(tmp_path, temp_root
 
 
 @pytest.fixture(name="identification")
-def fixture_identification(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXAMPLES))
-    import lab_identification
-
-    return lab_identification
+def fixture_identification(example):
+    return example("lab_identification")
 
 
 class TestIdentification:
@@ -120,7 +99,7 @@ class TestIdentification:
 
     @each_preset
     def test_as_a_program(self, tmp_path, preset):
-        printed = run(EXAMPLES / "lab_identification.py", "--fast", "--preset", preset,
+        printed = run_example("lab_identification.py", "--fast", "--preset", preset,
                       folder=tmp_path)  # fmt: skip
         assert "12 swings" in printed
         lengths = [float(cm) / 100 for cm in re.findall(r"length = ([.\d]+) cm", printed)]
@@ -134,7 +113,7 @@ class TestEpisodes:
     )
     def test_learns_to_swing_higher(self, tmp_path, preset, seed, gain):
         arguments = f"--fast --preset {preset} --seed {seed}".split()
-        printed = run(EXAMPLES / "lab_episodes.py", *arguments, folder=tmp_path)
+        printed = run_example("lab_episodes.py", *arguments, folder=tmp_path)
         first, best = map(
             float, re.findall(r"([.\d]+) rods at first, ([.\d]+) at best", printed)[0]
         )
@@ -144,7 +123,7 @@ class TestEpisodes:
 
     def test_gives_a_video_if_asked(self, tmp_path):
         pytest.importorskip("PIL", reason="writes videos")
-        printed = run(EXAMPLES / "lab_episodes.py", "--fast", "--videos", "seen", folder=tmp_path)
+        printed = run_example("lab_episodes.py", "--fast", "--videos", "seen", folder=tmp_path)
         (video,) = (tmp_path / "seen").iterdir()
         assert video.as_uri() in printed
         assert video.stat().st_size > 1000

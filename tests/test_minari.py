@@ -1,8 +1,6 @@
 """Datasets of Minari hold what recordings hold, and give it back."""
 
 import json
-import subprocess
-import sys
 
 import gymnasium as gym
 import numpy as np
@@ -12,20 +10,6 @@ import fmugym
 from fmugym import ConfigError, Recorder, Recording
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
-
-WITHOUT_MINARI = """
-import sys
-sys.modules["minari"] = None
-import fmugym.minari
-"""
-
-
-def test_without_minari_the_import_names_the_extra():
-    command = [sys.executable, "-c", WITHOUT_MINARI]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install '.[minari]'" in done.stderr
-
 
 minari = pytest.importorskip("minari", reason="needs Minari: the extra minari")
 
@@ -132,26 +116,23 @@ def test_observations_of_several_parts():
 
 
 class TestMistakes:
-    def test_no_recordings(self):
-        env = fmugym.load(GOALS)
+    def test_no_recordings(self, load):
+        env = load(GOALS)
         with pytest.raises(ConfigError, match="at least one"):
             write_dataset("test/none-v0", [], env)
-        env.close()
 
-    def test_another_task(self):
-        env, other = gym.make("fmugym/CartPole-v0"), fmugym.load(GOALS)
+    def test_another_task(self, load):
+        env, other = gym.make("fmugym/CartPole-v0"), load(GOALS)
         with pytest.raises(ConfigError, match="recording"):
             write_dataset("test/other-v0", played(env, 1, 5), other)
         env.close()
-        other.close()
 
-    def test_a_name_that_exists(self):
-        env = fmugym.load(GOALS)
+    def test_a_name_that_exists(self, load):
+        env = load(GOALS)
         recordings = played(env, 1)
         write_dataset("test/twice-v0", recordings, env)
         with pytest.raises(ConfigError, match="test/twice-v0"):
             write_dataset("test/twice-v0", recordings, env)
-        env.close()
 
     def test_a_dataset_that_is_missing(self):
         with pytest.raises(ConfigError, match=r"nothing-v0.*there are: none"):

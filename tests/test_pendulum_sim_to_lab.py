@@ -1,17 +1,13 @@
 """The example that takes a policy from the FMU to cells of the lab that it has not seen."""
 
-import subprocess
-import sys
-from pathlib import Path
-
 import gymnasium
 import numpy as np
 import pytest
+from example_tools import EXAMPLES, run_example
 from PIL import Image
 
 import fmugym
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
 CELLS = {
     "heavy": {"plant": {"m": 0.085}},
     "light": {"plant": {"m": 0.045}},
@@ -87,19 +83,10 @@ def test_a_pendulum_that_hangs_or_whose_episode_broke_off_is_not_upright(example
 
 
 def test_as_a_program(tmp_path):
-    command = [sys.executable, "-W", "error", EXAMPLES / "pendulum_sim_to_lab.py"]
-    options = ["--fast", "--seeds=2", "--envs=8", "--output=curves.png"]
-    done = subprocess.run(
-        [*command, *options],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "random FMUs: upright in 8 of 8" in done.stdout
-    assert "lab: upright in 2 of 2" in done.stdout
+    options = "--fast", "--seeds=2", "--envs=8", "--output=curves.png"
+    printed = run_example("pendulum_sim_to_lab.py", *options, folder=tmp_path)
+    assert "random FMUs: upright in 8 of 8" in printed
+    assert "lab: upright in 2 of 2" in printed
     assert [path.name for path in tmp_path.iterdir()] == ["curves.png"]
     with Image.open(tmp_path / "curves.png") as picture:
         assert picture.size == (700, 450)

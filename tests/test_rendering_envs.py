@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import RecordVideo
 
-import fmugym
-
 IDS = [
     "fmugym/CartPole-v0",
     "fmugym/CloudPendulum-v0",
@@ -62,31 +60,4 @@ def test_the_picture_shows_the_torque():
         env.step(np.array([torque], np.float32))
         pictures.append(env.render())
     assert not np.array_equal(*pictures)
-    env.close()
-
-
-def test_render_modes_are_checked_and_render_without_one_warns():
-    with pytest.raises(
-        fmugym.ConfigError, match="render mode 'rgb_aray'; did you mean 'rgb_array'"
-    ):
-        fmugym.envs.CartPoleEnv(render_mode="rgb_aray")
-    env = fmugym.envs.CartPoleEnv()
-    env.reset()
-    with pytest.warns(UserWarning, match="no render_mode"):
-        assert env.render() is None
-    env.close()
-
-
-def test_a_class_with_modes_but_no_scene_says_so():
-    class Sceneless(fmugym.FMUEnv):
-        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
-
-        def _is_done(self):
-            return False
-
-    config = {"model_input_names": "f", "model_output_names": "x", "time_step": 0.1}
-    env = Sceneless(fmugym.bundled_fmu("CartPole"), config, render_mode="rgb_array")
-    env.reset()
-    with pytest.raises(fmugym.SimulationError, match="no _get_scene"):
-        env.render()
     env.close()

@@ -7,8 +7,6 @@ import pickle
 import subprocess
 import sys
 
-import fuzz_driver
-import fuzz_rendering
 import numpy as np
 import pygame
 import pytest
@@ -431,14 +429,6 @@ class TestWindow:
         first.render(UPRIGHT)
         open_window().render(UPRIGHT)
         assert pygame.display.get_surface() is not None
-
-
-def test_odd_arguments_raise_nothing_but_our_own_errors():
-    """A short form of ``python tests/fuzz_rendering.py``."""
-    tally = fuzz_driver.run(fuzz_rendering.program, 300, seed="tests")
-    assert tally.failures == []
-    assert tally.total("accepted") + tally.total("refused") == 300
-    assert min(tally.total("accepted"), tally.total("refused")) > 5
 
 
 def test_a_window_without_a_display_says_so_each_time(monkeypatch):

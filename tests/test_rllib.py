@@ -18,19 +18,6 @@ from fmugym import ConfigError, bundled_fmu
 from fmugym.envs import PendulumEnv
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "train_rllib.py"
-WITHOUT_RAY = """
-import sys
-sys.modules["ray"] = None
-import fmugym.rllib
-"""
-
-
-def test_without_ray_the_import_names_the_extra():
-    done = subprocess.run([sys.executable, "-c", WITHOUT_RAY], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install '.[rllib]'" in done.stderr
-
-
 pytest.importorskip("ray.rllib", reason="needs RLlib: the extra rllib")
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, and those of torch
 

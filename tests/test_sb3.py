@@ -1,37 +1,18 @@
 """Stable-Baselines3 trains on the environments as it does on single ones, only faster."""
 
-import subprocess
-import sys
 import warnings
-from functools import partial
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from example_tools import run_example
 from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv, Uniform
 from fmugym.envs import CartPoleEnv, PendulumEnv
 
-WHY = "needs Stable-Baselines3: the extra test-sb3"
-EXAMPLE = Path(__file__).parent.parent / "examples" / "train_sb3.py"
-
-WITHOUT_SB3 = """
-import sys
-sys.modules["stable_baselines3"] = None
-import fmugym.sb3
-"""
-
-
-def test_without_sb3_the_import_names_the_extra():
-    done = subprocess.run([sys.executable, "-c", WITHOUT_SB3], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install '.[sb3]'" in done.stderr
-
-
-sb3 = pytest.importorskip("stable_baselines3", reason=WHY)
+sb3 = pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
 # ruff: noqa: E402  (what follows needs SB3)
 
 import torch
@@ -42,9 +23,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
-    SubprocVecEnv,
     VecMonitor,
-    VecNormalize,
     is_vecenv_wrapped,
 )
 
@@ -185,23 +164,6 @@ def test_it_is_the_equal_of_single_environments_in_sb3s_dummy_vec_env(env, overl
     theirs.close()
 
 
-def test_an_episode_cut_short_tells_what_the_value_is_bootstrapped_from(make):
-    venv = make("fmugym/Pendulum-v0", max_episode_steps=5)
-    venv.seed(0)
-    venv.reset()
-    for step in range(1, 11):
-        before = venv.get_attr("state")
-        observations, _, dones, infos = venv.step(np.zeros((3, 1), np.float32))
-        assert dones.tolist() == [step % 5 == 0] * 3
-        for index, info in enumerate(infos):
-            assert info["TimeLimit.truncated"] == (step % 5 == 0)
-            assert ("terminal_observation" in info) == (step % 5 == 0)
-            if step % 5 == 0:
-                terminal = info["terminal_observation"]
-                assert not np.array_equal(terminal, observations[index])
-                assert abs(terminal[2] - before[index][1]) < 1  # the velocity a step before
-
-
 def test_an_episode_that_ends_by_itself_in_the_last_step_is_not_cut_short(make):
     class FallsAtTen(CartPoleEnv):
         def _is_done(self):
@@ -273,13 +235,6 @@ def test_an_attribute_that_was_set_is_what_the_hooks_use(make):
     venv.set_attr("x_threshold", 0.0, indices=1)
     venv.reset()
     assert venv.step(np.zeros(3, np.int64))[2].tolist() == [False, True, False]
-
-
-def test_an_attribute_of_all_may_be_one_that_hooks_branch_on(make):
-    venv = make("fmugym/CartPole-v0")
-    venv.set_attr("sutton_barto_reward", True)
-    venv.reset()
-    assert venv.step(np.zeros(3, np.int64))[1].tolist() == [0.0] * 3
 
 
 def test_parameters_of_all_and_of_some_take_effect_with_the_next_episode(make):
@@ -380,42 +335,10 @@ def test_a_vector_environment_of_ones_own_and_an_id_with_a_module(make):
     assert make("fmugym:fmugym/CartPole-v0").spec.id == "fmugym/CartPole-v0"
 
 
-def test_monitor_counts_as_the_monitor_of_single_environments(make):
-    ours = make("fmugym/CartPole-v0", monitor=True)
-    assert is_vecenv_wrapped(ours, VecMonitor)
-    assert ours.env_is_wrapped(Monitor) == [False] * 3
-    theirs = singles(lambda: Monitor(gym.make("fmugym/CartPole-v0")), 3)
-    rng = np.random.default_rng(0)
-    for env in (ours, theirs):
-        env.seed(0)
-        env.reset()
-    told = []
-    for _ in range(200):
-        actions = rng.integers(2, size=3)
-        results = [env.step(actions)[3] for env in (ours, theirs)]
-        told += [[i.get("episode", {}) for i in infos] for infos in zip(*results, strict=True)]
-    told = [(mine, other) for mine, other in told if mine or other]
-    assert len(told) > 10
-    for mine, other in told:
-        assert (mine["r"], mine["l"]) == (other["r"], other["l"])
-    theirs.close()
-
-
-def test_normalize_sees_the_same_as_over_single_environments(make):
-    pair = [
-        VecNormalize(make("fmugym/Pendulum-v0")),
-        VecNormalize(singles("fmugym/Pendulum-v0", 3)),
-    ]
-    for env in pair:
-        env.seed(1)
-        env.reset()
-    rng = np.random.default_rng(0)
-    for _ in range(250):
-        actions = rng.uniform(-2, 2, (3, 1)).astype(np.float32)
-        ours, theirs = (env.step(actions) for env in pair)
-        for mine, other in zip(ours, theirs, strict=True):
-            assert_same(mine, other)
-    pair[1].close()
+def test_monitor_is_that_of_vector_environments(make):
+    env = make("fmugym/CartPole-v0", monitor=True)
+    assert is_vecenv_wrapped(env, VecMonitor)
+    assert env.env_is_wrapped(Monitor) == [False] * 3
 
 
 class Recorder(BaseCallback):
@@ -483,14 +406,12 @@ def test_a_model_is_saved_loaded_and_goes_on(make, tmp_path):
 @pytest.fixture(scope="module", name="quick")
 def fixture_quick(tmp_path_factory):
     folder = tmp_path_factory.mktemp("quick")
-    command = [sys.executable, "-X", "utf8", EXAMPLE, "--quick", "--steps", "1600", "--seeds", "1"]
-    output = {"capture_output": True, "text": True, "encoding": "utf-8"}
-    return folder, subprocess.run(command, cwd=folder, timeout=300, **output)
+    options = "--quick", "--steps", "1600", "--seeds", "1"
+    return folder, run_example("train_sb3.py", *options, folder=folder, warnings="default")
 
 
 def test_the_example_ends_well_and_writes_one_picture(quick):
-    folder, ended = quick
-    assert (ended.returncode, ended.stderr) == (0, "")
+    folder, _ = quick
     files = [path.relative_to(folder).as_posix() for path in folder.rglob("*.*")]
     assert files == ["results/sb3_learning_curves.png"]
     with Image.open(folder / files[0]) as picture:
@@ -500,7 +421,7 @@ def test_the_example_ends_well_and_writes_one_picture(quick):
 
 
 def test_the_examples_policies_score_the_same_on_both_sides(quick):
-    rows = [line for line in quick[1].stdout.splitlines() if line.startswith(("│ FMU", "│ Gym"))]
+    rows = [line for line in quick[1].splitlines() if line.startswith(("│ FMU", "│ Gym"))]
     assert len(rows) == 4
     for row in rows:
         _, on_fmu, on_gymnasium, _, same, *_ = (cell.strip() for cell in row.strip("│").split("│"))
@@ -518,83 +439,3 @@ def test_environments_that_do_not_exist(env):
 def test_seeds_that_do_not_fit(seed):
     with pytest.raises(ConfigError, match="seed"):
         make_sb3_env(CartPoleEnv, 2, seed=seed)
-
-
-def test_a_task_file_gives_what_the_class_gives():
-    config = str(EXAMPLE.parent / "cart_pole.toml")
-    ours = make_sb3_env("fmugym/FMU-v0", 3, seed=1, config=config)
-    twin = make_sb3_env("fmugym/CartPole-v0", 3, seed=1)
-    np.testing.assert_array_equal(ours.reset(), twin.reset())
-    for _ in range(60):
-        actions = np.random.default_rng(0).integers(2, size=3)
-        first, second = ours.step(actions), twin.step(actions)
-        for one, other in zip(first[:3], second[:3], strict=True):
-            np.testing.assert_array_equal(one, other)
-    ours.close()
-    twin.close()
-
-
-def test_ppo_learns_the_same_on_a_task_file_as_on_the_class():
-    weights = []
-    config = str(EXAMPLE.parent / "cart_pole.toml")
-    for env_id, arguments in (("FMU-v0", {"config": config}), ("CartPole-v0", {})):
-        venv = make_sb3_env(f"fmugym/{env_id}", 4, seed=3, **arguments)
-        model = sb3.PPO("MlpPolicy", venv, n_steps=64, batch_size=64, seed=3, device="cpu")
-        model.learn(512)
-        weights.append([tensor.numpy() for tensor in model.policy.state_dict().values()])
-        venv.close()
-    for one, other in zip(*weights, strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def task_file(folder):
-    """A task file with a warm-up, a sensor and figures."""
-    path = folder / "task.toml"
-    path.write_text(
-        """
-        fmu = { bundled = "Pendulum" }
-        time_step = "50ms"
-        episode_length = "0.5s"
-        warm_up = { period = "0.2s", controller = "pid of=q setpoint=goal kp=0.01" }
-        reward = "-abs(goal_error)"
-        [variables]
-        tau = { min = -0.01, max = 0.01, delay = "0.1s" }
-        q = { min = -4, max = 4, noise = 0.1, drop_out = 0.1 }
-        [setpoints]
-        goal = { value = { distribution = "uniform", low = -1, high = 1 }, of = "q" }
-        [agent]
-        actions = ["tau"]
-        observations = ["q", "goal_error"]
-        [kpis]
-        worst = { max = "abs(goal_error)" }
-        """
-    )
-    return path
-
-
-def test_a_task_file_in_spawned_workers(tmp_path):
-    """Stable-Baselines3's own workers, started anew, play what our vector environment plays."""
-    make = partial(gym.make, "fmugym:fmugym/FMU-v0", config=str(task_file(tmp_path)))
-    theirs = SubprocVecEnv([make, make], start_method="spawn")
-    ours = make_sb3_env("fmugym/FMU-v0", 2, config=str(tmp_path / "task.toml"))
-    theirs.seed(3)
-    ours.seed(3)
-    np.testing.assert_array_equal(theirs.reset(), ours.reset())
-    rng = np.random.default_rng(0)
-    for _ in range(25):
-        actions = rng.uniform(-0.01, 0.01, (2, 1)).astype(np.float32)
-        first, second = theirs.step(actions), ours.step(actions)
-        for one, other in zip(first[:3], second[:3], strict=True):
-            np.testing.assert_array_equal(one.astype(np.float32), other.astype(np.float32))
-        for one, other in zip(first[3], second[3], strict=True):
-            assert one["kpis"] == other["kpis"]
-    theirs.close()
-    ours.close()
-
-
-def test_an_agent_learns_on_a_task_file(tmp_path):
-    env = make_sb3_env("fmugym/FMU-v0", 4, config=str(task_file(tmp_path)))
-    model = sb3.PPO("MlpPolicy", env, n_steps=16, batch_size=32, seed=0, device="cpu")
-    model.learn(128)
-    assert model.num_timesteps == 128
-    env.close()

@@ -1,31 +1,15 @@
 """TorchRL sees what single environments would show it, as one batch."""
 
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from example_tools import run_example
 from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
-
-EXAMPLE = Path(__file__).parent.parent / "examples" / "train_torchrl.py"
-WITHOUT_TORCHRL = """
-import sys
-sys.modules["torch"] = None
-import fmugym.torchrl
-"""
-
-
-def test_without_torchrl_the_import_names_the_extra():
-    done = subprocess.run([sys.executable, "-c", WITHOUT_TORCHRL], capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "pip install '.[torchrl]'" in done.stderr
-
 
 pytest.importorskip("torchrl", reason="needs TorchRL: the extra torchrl")
 pytestmark = pytest.mark.filterwarnings("ignore")  # TorchRL's own, and those of torch
@@ -172,12 +156,6 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_the_example_trains():
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", EXAMPLE, "--steps", "20480"],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    mean = float(done.stdout.splitlines()[-1].split(":")[1].split()[0])
+    printed = run_example("train_torchrl.py", "--steps", "20480", warnings="ignore")
+    mean = float(printed.splitlines()[-1].split(":")[1].split()[0])
     assert mean > 60  # a random policy has 22

@@ -458,6 +458,8 @@ class TestRefusals:
                 function(envs, snapshot, zeros)
             with pytest.raises(ConfigError, match="save_state"):
                 function(envs, None, zeros)
+        with pytest.raises(ConfigError, match="step"):
+            fmugym.derivatives(envs, snapshot[0], zeros, step=-1.0)
         envs.close()
         for function in (linearize_along, fmugym.derivatives):
             with pytest.raises(SimulationError, match="closed"):

@@ -10,7 +10,6 @@ import mistakes
 import numpy as np
 import pytest
 from fmu_tools import PlainEnv, probe_config, probe_fmu
-from gymnasium import spaces
 
 import fmugym
 from fmugym import (
@@ -119,7 +118,6 @@ def test_unknown_arguments_are_type_errors_of_the_family(make, names):
         (lambda: Connection("a.y", "b.u", gaim=2), "gaim", "gain"),
         (lambda: FMU("a.fmu", sise={}), "sise", "sizes"),
         (lambda: ArchiveLimits(max_entry=3), "max_entry", "max_entries"),
-        (lambda: Uniform(lo=0, high=1), "lo", "low"),
         (lambda: Choice([1, 2], probability=[1, 0]), "probability", "probabilities"),
         (lambda: PID("y", 1.0, offsett=2), "offsett", "offset"),
     ],
@@ -171,7 +169,7 @@ def test_names_in_bounds_are_listed_in_the_order_of_the_config(probe):
         PlainEnv(probe(2), config)
 
 
-@pytest.mark.parametrize("seed", [-1, 1.0, 0.5, "1", True, [1], np.ones(2), np.array([1]), 1j, {}])
+@pytest.mark.parametrize("seed", [1.0, True, [1], np.ones(2), np.array([1]), 1j, {}])
 def test_seeds_that_are_none(make_env, seed):
     env, twin = make_env(), make_env()
     env.reset(seed=5)
@@ -313,19 +311,15 @@ class TestActions:
     @pytest.mark.parametrize(
         ("names", "action", "match"),
         [
-            ("a", math.nan, "action nan .* finite"),
             ("a", [math.inf], "makes a = inf; every input must be finite"),
             (["a", "b"], [0.0, -math.inf], r"makes a = 0\.0, b = -inf; every input must be finite"),
             (["a", "on"], [0.0, math.nan], r"action \[0\.0, nan\] .* finite"),
-            ("a", [0.0, 0.0], r"makes 2 values, expected 1, one for each input \(a\)"),
             (["b", "a"], [0.0], r"makes 1 values, expected 2, one for each input \(b, a\)"),
             (["b", "a"], 0.0, "makes 1 values, expected 2"),
             ("a", [], "makes 0 values, expected 1"),
-            ("a", "left", "action 'left' does not make numbers"),
-            ("a", {"a": 1.0}, "does not make numbers"),
+            ("a", "0.5", "action '0.5' does not make numbers"),
             ("a", 1j, "does not make numbers"),
             ("a", 10**400, "number"),
-            ("a", None, "None"),
             ("n", 11, r"action 11 is not in Discrete\(11\)"),
             ("n", -1, r"action -1 is not in Discrete\(11\)"),
             ("n", 1.0, r"action 1\.0 is not in Discrete"),
@@ -346,18 +340,8 @@ class TestActions:
         env.step(env.action_space.sample())  # the episode goes on with a better action
         assert env.step_count == 1
 
-    def test_text_is_no_number(self, make_env):
-        env = make_env()
-        env.reset()
-        with pytest.raises(ConfigError, match="does not make numbers"):
-            env.step("0.5")
-
 
 class TestOrder:
-    def test_step_before_reset(self, make_env):
-        with pytest.raises(SimulationError, match="step was called before the first reset"):
-            make_env().step(0.0)
-
     def test_step_after_the_end(self, make_env):
         env = make_env(max_episode_steps=2)
         env.reset()
@@ -419,17 +403,10 @@ class TestResetOptions:
     @pytest.mark.parametrize(
         ("options", "match"),
         [
-            ({"parameters": {}}, "unknown reset option 'parameters'; did you mean"),
             ({"model_parameters": [1]}, "option 'model_parameters' must be a dict"),
-            ({"model_parameters": {"gian": 1.0}}, "'gian'; did you mean 'gain'"),
-            ({"model_parameters": {"seven": 1.0}}, "'seven' cannot be set"),
-            ({"model_parameters": {"sum": 1.0}}, "'sum' cannot be set"),
-            ({"model_parameters": {"double_gain": 1.0}}, "'double_gain' cannot be set"),
+            ("gain", "option"),
+            (["gain"], "option"),
             ({"model_parameters": {"gain": math.nan}}, "'gain' must be finite"),
-            ({"model_parameters": {"gain": None}}, "'gain' must be a number"),
-            ({"model_parameters": {"leaky": 0.3}}, "'leaky' is a Boolean"),
-            ({"model_parameters": {"fault": 2**31}}, "'fault' is of type Integer"),
-            ({"model_parameters": {"label": 3}}, "'label' is a String, got 3"),
             ({"model_parameters": {"leaky": fmugym.Uniform(0, 1)}}, "'leaky' is a Boolean, got 0"),
         ],
     )
@@ -440,11 +417,6 @@ class TestResetOptions:
             env.reset(options=options)
         env.reset()
         env.step(0.0)
-
-    @pytest.mark.parametrize("options", [3, "gain", ["gain"]])
-    def test_no_dict(self, make_env, options):
-        with pytest.raises(ConfigError, match=r"option"):
-            make_env().reset(options=options)
 
     def test_an_fmu_that_cannot_be_initialized(self, make_env):
         env = make_env()
@@ -521,17 +493,9 @@ class TestHooks:
 
 
 class TestBundled:
-    def test_unknown_model_and_version(self):
-        with pytest.raises(ConfigError, match="unknown bundled model 'Cartpole'; did you mean"):
-            fmugym.bundled_fmu("Cartpole")
+    def test_unknown_version(self):
         with pytest.raises(ConfigError, match=r"unknown FMI version '4\.0'"):
             fmugym.bundled_fmu("CartPole", 4)
-
-    def test_keywords_of_gym_make(self):
-        with pytest.raises(ConfigError, match=r"unknown FMI version '2\.1'; did you mean"):
-            gymnasium.make("fmugym/CartPole-v0", fmi_version="2.1")
-        with pytest.raises(ConfigError, match="unknown variable of CartPole 'mpole'"):
-            gymnasium.make("fmugym/CartPole-v0", model_parameters={"mpole": 1.0})
 
     @pytest.mark.parametrize(
         ("name", "options"),
@@ -553,13 +517,6 @@ class TestBundled:
         env.reset()
         env.close()
 
-    def test_an_action_out_of_range(self):
-        env = fmugym.envs.CartPoleEnv()
-        env.reset()
-        with pytest.raises(ConfigError, match=r"action 2 is not in Discrete\(2\)"):
-            env.step(2)
-        env.close()
-
 
 def test_a_step_smaller_than_the_internal_one_is_warned_of(tmp_path, caplog):
     flag = 'canHandleVariableCommunicationStepSize="true"'
@@ -575,12 +532,3 @@ def test_errors_survive_pickling():
         copy = pickle.loads(pickle.dumps(error))
         assert (type(copy), str(copy)) == (type(error), str(error))
         assert isinstance(copy, fmugym.FMUGymError)
-
-
-def test_spaces_are_checked_when_hooks_override_them(make_env):
-    class Odd(PlainEnv):
-        def _get_observation_space(self):
-            return spaces.Discrete(3)
-
-    with pytest.raises(ConfigError, match="2 outputs do not make an element of Discrete"):
-        make_env(cls=Odd)
