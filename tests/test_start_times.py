@@ -215,7 +215,8 @@ def test_a_single_environment(sun, interface):
 
 
 @pytest.mark.parametrize(
-    ("interface", "mode"), [("CoSimulation", "next_step"), ("ModelExchange", "same_step")]
+    ("interface", "mode"),
+    [("CoSimulation", "next_step"), ("CoSimulation", "disabled"), ("ModelExchange", "same_step")],
 )
 @all_ways
 def test_many_environments_equal_single_ones(sun, way, interface, mode):
