@@ -158,7 +158,13 @@ class Subject:
         self.values = np.ones((len(start), self.n))
         self.outputs = tuple(map(fmu.variable, outputs))
         self.snapshot = self.bundled = None
+        self.playing = threading.Lock()
         self.reset()
+
+    def run(self, name):
+        """Call a method; one thread plays at a time, as the guard of environments sees to it."""
+        with self.playing if name in PLAYING else contextlib.nullcontext():
+            getattr(self, name)()
 
     def mask(self):
         return self.rng.random(self.n) < 0.3
@@ -295,6 +301,9 @@ ACTIONS = (
 )
 
 
+PLAYING = frozenset({"play", "prepare_play", "reset_by", "roll_out"})
+
+
 class Ring:
     """The subjects, of which closed ones are replaced."""
 
@@ -313,7 +322,7 @@ class Ring:
     def act(self, rng):
         index, name = int(rng.integers(len(self.subjects))), str(rng.choice(ACTIONS))
         try:
-            getattr(self.subjects[index], name)()
+            self.subjects[index].run(name)
         except SimulationError as error:
             if "closed" in str(error):
                 self.subjects[index] = self._make(self.recipes[index])

@@ -216,7 +216,7 @@ class TestRefused:
             ({"model_input_names": "mix"}, "'mix' cannot be an input: it is a continuous output"),
             ({"model_input_names": "gain"}, "'gain' cannot be an input: it is a fixed parameter"),
             ({"model_input_names": "seven"}, "'seven' cannot be an input: it is a constant"),
-            ({"model_input_names": "double_gain"}, "it is a fixed calcul"),
+            ({"model_input_names": "double_gain"}, "cannot be an input: it is a fixed"),
             ({"model_input_names": "label"}, "'label' cannot be an input: it is of type String"),
             ({"model_output_names": "label"}, "'label' cannot be an output: it is of type String"),
             ({"model_parameters": {"mix": 1}}, "'mix' cannot be set: it is a continuous output"),

@@ -9,6 +9,7 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import Choice, ConfigError, EnvConfig, LogUniform, Normal, Uniform
+from fmugym.config import FOREIGN
 
 TYPES = [
     int,
@@ -173,7 +174,7 @@ def test_no_numbers(value):
 )
 def test_numbers_too_large_for_the_fmu(name, value):
     with pytest.raises(ConfigError, match=name):
-        _brake(**{name: value})
+        _brake(**({"foreign": {name: value}} if name in FOREIGN.keys else {name: value}))
 
 
 def _brake(**changes):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -78,12 +79,19 @@ def _simulate(arguments: argparse.Namespace) -> None:
             say_json({"task": arguments.task, "output": arguments.output, "runs": told, **only})
 
     try:
+        for player in players.values() if len(players) > 1 else ():
+            with closing(player.make_env(_maker(arguments))) as env:
+                player.make_policy(env)  # so that no mistake comes up after another has played
         with shown_in_any_case(show):
             for name, player in players.items():
                 _play(arguments, recording, name, player, runs)
     except FMUGymError:
         recording.finish(arguments.seed)
         raise
+
+
+def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
+    return maker_of(arguments.task, arguments.scenario, arguments.master)
 
 
 def _play(
@@ -94,10 +102,9 @@ def _play(
     runs: dict[str, list[Summary]],
 ) -> None:
     """Play the episodes of one who acts."""
-    make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
     label = f"{name}: " if len(runs) > 1 else ""
     with (
-        closing(player.make_env(make_env)) as env,
+        closing(player.make_env(_maker(arguments))) as env,
         progress(_steps_of(env, arguments), name) as advance,
     ):
         policy = player.make_policy(env)

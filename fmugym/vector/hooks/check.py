@@ -258,7 +258,9 @@ class _Comparison(NamedTuple):
         if self.alone or failures == count or (failures and may_fail):
             return None  # if it fails either way, the first step will tell
         together, changed = self._call(some(self.batch))
-        if changed == "out" or changed in _READ_ONLY:
+        if changed in {"state", "out"}:  # the same arrays
+            return "changes the arrays in self.state and self.out in place"
+        if changed in _READ_ONLY:
             return f"changes the arrays in self.{changed} in place"
         if type(together) is _Failure:
             return f"fails on arrays ({together.text})"
