@@ -22,6 +22,7 @@ import sys
 
 import numpy as np
 from fuzz_driver import Case, main, require
+from program_tools import code, constants
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
@@ -36,7 +37,7 @@ from fmugym.pool.health import no_counts
 from fmugym.pool.process.channel import Channel
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.supervisor import Supervisor
-from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
+from fmugym.vector.hooks.program import SLOT
 
 LOG = logging.getLogger("fmugym.fuzz")
 ODD = (0, 1, 2, 3, 7, 255, -1, -2, 2**31 - 1, 2**31, 2**32 - 1, 2**32, 2**61, 2**63 - 1, -(2**63))
@@ -188,10 +189,9 @@ def program_form(rng):
         ("store_seen", 0, 0, 5),
         ("store_row", 1, 0, 2),
     ]
-    code = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in rows]
     form = form_of_program(
-        np.array(code, np.uint16).tobytes(),
-        np.array([(0, 0, 8, 0)], CONSTANT).tobytes(),
+        code(*rows),
+        constants(0.0),
         np.array([(0, 0, 1, 1)], SLOT).tobytes(),
         (0, 1),
         (np.arange(4.0),),

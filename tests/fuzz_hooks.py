@@ -18,9 +18,9 @@ import gymnasium
 import numpy as np
 from fuzz_driver import Case, main, require
 from odd_values import circular, hostile
+from vector_tools import Drawing
 
-import fmugym
-from fmugym import FMUGymError, FMUVectorEnv, Normal, Uniform
+from fmugym import FMUGymError, FMUVectorEnv, Normal
 
 WAYS = ("single", "compiled", "array", "per_env", "auto")
 NUM_ENVS = 3
@@ -115,19 +115,8 @@ def odd_result(rng):
     return fail
 
 
-class Swing(fmugym.FMUEnv):
+class Swing(Drawing):
     """A pendulum whose hooks are element-wise arithmetic."""
-
-    def __init__(self, **changes):
-        config = {
-            "model_input_names": ["tau"],
-            "model_output_names": ["q", "q_dot"],
-            "model_parameters": {"q_0": Uniform(-1.0, 1.0)},
-            "bounds": {"tau": (-0.01, 0.01)},
-            "time_step": 0.02,
-            "max_episode_steps": 3,
-        }
-        super().__init__(fmugym.bundled_fmu("Pendulum"), config | changes)
 
     def _is_done(self):
         return self.state[0] > 100.0

@@ -27,14 +27,15 @@ from pathlib import Path
 
 import numpy as np
 from exchange_tools import exchange_fmu
+from program_tools import DISCRETE, code, constants, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
 from fmugym.pool import PoolSpec
-from fmugym.pool.form import form_of_draws, form_of_program
+from fmugym.pool.form import form_of_program
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import SOLVERS, ResetMethod
 from fmugym.task.values import UNFILLED, LateDict
-from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, TYPES
+from fmugym.vector.hooks.program import TYPES
 
 THREADS = 6
 PATIENCE = 120.0
@@ -43,18 +44,6 @@ PATIENCE = 120.0
 counts = collections.Counter()
 ending = threading.Event()
 """Set when the interpreter is about to end: receivers are silent then, and temporary files go."""
-
-
-def code(*rows):
-    """Instructions: operation, extra, the register to write, operands."""
-    numbered = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in rows]
-    return np.array(numbered, np.uint16).tobytes()
-
-
-def constants(*values):
-    """Registers that keep a value."""
-    rows = [(np.float64(value).view("u8"), register, 8, 0) for register, value in values]
-    return np.array(rows, CONSTANT).tobytes()
 
 
 def programs(pool, variables):
@@ -74,32 +63,12 @@ def programs(pool, variables):
         ("store_row", 1, 0, 4),
     )
     rows = pool.outputs[0], variables[0]
-    pushing = form_of_program(push, constants((0, 3.0)), b"", (0,), (), 4, 0, ())
-    judging = form_of_program(
-        judge, constants((0, 0.2), (1, 0.0)), b"", (0, 1), (), 7, 0, (5, 1, 4)
-    )
+    pushing = form_of_program(push, constants(3.0), b"", (0,), (), 4, 0, ())
+    judging = form_of_program(judge, constants(0.2, 0.0), b"", (0, 1), (), 7, 0, (5, 1, 4))
     return (pushing, (pool.inputs[0],)), (judging, rows)
 
 
-DISCRETE = {
-    "shape": (),
-    "letter": "q",
-    "size": 8,
-    "check": 1,
-    "lowest": 0,
-    "highest": 1,
-    "none": np.zeros(1, np.int64),
-}
-
-
-def draws(*rows):
-    """Uniform numbers from [0, 1), one for each row of the start values."""
-    kind = _native.distributions().index("uniform")
-    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
-    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
-
-
-DRAWS = draws(0)
+DRAWS = uniform_draws(0)
 
 
 def tell(drawn, mask):

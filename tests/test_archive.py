@@ -6,6 +6,7 @@ import pathlib
 import re
 import shutil
 import zipfile
+from functools import partial
 
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
@@ -136,7 +137,41 @@ class TestGoodArchives:
         assert str(fmu_path) in repr(FMU(fmu_path))
 
 
+def zeros_after(name, distance, content):
+    """50 bytes are lost behind a name."""
+    place = content.index(name) + distance
+    return content[:place] + bytes(50) + content[place + 50 :]
+
+
+def encrypted(content):
+    """The flag in the central directory is set."""
+    place = content.rindex(b"PK\x01\x02") + 8
+    return content[:place] + bytes([content[place] | 1]) + content[place + 1 :]
+
+
+DAMAGES = {
+    "the library": (partial(zeros_after, b"binaries/", 2000), "is damaged: "),
+    "the model description": (partial(zeros_after, b"modelDescription.xml", 40), "is damaged: "),
+    "cut out": (lambda c: c[:500] + c[1500:], "is damaged|is not all there|is not an FMU"),
+    "cut off": (lambda c: c[:-30], "is not an FMU"),
+    "a header": (lambda c: c.replace(b"PK\x03\x04", b"PK\0\0"), "is damaged: Bad magic number"),
+    "a size": (
+        lambda c: c.replace((2**20).to_bytes(4, "little"), b"\x10\0\0\0"),
+        "is damaged: Bad CRC-32",
+    ),
+    "encrypted": (encrypted, "encrypted"),
+}
+
+
 class TestBadArchives:
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_damaged(self, fmu_path, tmp_path, damage):
+        """By disks, and by downloads that lose a piece or the end."""
+        change, match = DAMAGES[damage]
+        path = edited_fmu(fmu_path, tmp_path, add={"resources/zeros": bytes(2**20)})
+        path.write_bytes(change(path.read_bytes()))
+        refused(path, match, max_ratio=2000)
+
     def test_missing_file(self, tmp_path):
         refused(tmp_path / "absent.fmu", "there is no FMU at")
 
@@ -159,11 +194,6 @@ class TestBadArchives:
     def test_not_a_zip(self, tmp_path, content):
         path = tmp_path / "some.fmu"
         path.write_bytes(content)
-        refused(path, "is not an FMU")
-
-    def test_cut_off_zip(self, fmu_path, tmp_path):
-        path = tmp_path / "cut.fmu"
-        path.write_bytes(fmu_path.read_bytes()[:-30])
         refused(path, "is not an FMU")
 
     def test_no_model_description(self, tmp_path):
@@ -191,13 +221,6 @@ class TestBadArchives:
         assert FMU(path).runs_here
         monkeypatch.setattr(safe_zip, "_has_devices", True)
         refused(path, "'resources/nul.txt' has the name of a device of Windows")
-
-    def test_encryption(self, fmu_path, tmp_path):
-        content = bytearray(edited_fmu(fmu_path, tmp_path).read_bytes())
-        content[content.rindex(b"PK\x01\x02") + 8] |= 1  # the flag in the central directory
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content)
-        refused(path, "encrypted")
 
     @pytest.mark.parametrize("folds", [True, False])
     def test_names_that_differ_in_case(self, fmu_path, tmp_path, monkeypatch, folds):
@@ -271,46 +294,11 @@ class TestBadArchives:
         assert path.stat().st_size < 200_000
         refused(path, r"unpacks to \d+ times its size")
 
-    def test_damaged_contents(self, fmu_path, tmp_path):
-        content = bytearray(edited_fmu(fmu_path, tmp_path).read_bytes())
-        middle = content.index(b"binaries/") + 2000  # inside of the compressed library
-        content[middle : middle + 50] = bytes(50)
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content)
-        refused(path, "is damaged: ")
-
-    def test_contents_cut_out(self, fmu_path, tmp_path):
-        """As after a download that lost a piece in the middle."""
-        content = edited_fmu(fmu_path, tmp_path).read_bytes()
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content[:500] + content[1500:])
-        refused(path, "is damaged|is not all there|is not an FMU")
-
-    def test_a_header_that_is_not_there(self, fmu_path, tmp_path):
-        content = edited_fmu(fmu_path, tmp_path).read_bytes()
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content.replace(b"PK\x03\x04", b"PK\x00\x00"))
-        refused(path, "is damaged: Bad magic number")
-
-    def test_a_file_that_unpacks_to_more_than_it_says(self, fmu_path, tmp_path):
-        path = edited_fmu(fmu_path, tmp_path, add={"resources/zeros": bytes(2**20)})
-        content = path.read_bytes()
-        path.write_bytes(content.replace((2**20).to_bytes(4, "little"), b"\x10\0\0\0"))
-        refused(path, "is damaged: Bad CRC-32")
-
     def test_other_ways_of_compression(self, fmu_path, tmp_path):
         path = edited_fmu(fmu_path, tmp_path)
         with zipfile.ZipFile(path, "a", zipfile.ZIP_LZMA) as file:
             file.writestr("resources/table.csv", "1,2")
         refused(path, "'resources/table.csv' is compressed by method 14; FMI allows")
-
-    def test_damaged_model_description(self, fmu_path, tmp_path):
-        content = bytearray(edited_fmu(fmu_path, tmp_path).read_bytes())
-        start = content.index(b"modelDescription.xml") + 40
-        content[start : start + 50] = bytes(50)
-        path = tmp_path / "Probe.fmu"
-        path.write_bytes(content)
-        refused(path, "is damaged: ")
 
     def test_a_file_that_is_also_a_folder(self, fmu_path, tmp_path):
         more = {"resources/a": "x", "resources/a/b": ""}

@@ -8,18 +8,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from fmu_tools import probe_fmu
+from vector_tools import ABSURD, IDS, Cart, Reaching
 
 import fmugym
 from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
 from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.testing import check_fmu_env
-
-ENV_IDS = [
-    "fmugym/CartPole-v0",
-    "fmugym/CloudPendulum-v0",
-    "fmugym/ModelicaCartPole-v0",
-    "fmugym/Pendulum-v0",
-]
 
 
 class Swing(fmugym.FMUEnv):
@@ -40,26 +34,8 @@ class Swing(fmugym.FMUEnv):
         return self.out["q"] > 2.0
 
 
-class Cart(fmugym.FMUEnv):
-    """A cart-pole that fails (Discard) under an absurd force."""
-
-    def __init__(self, **config):
-        defaults = {
-            "model_input_names": "f",
-            "model_output_names": ["x", "x_dot"],
-            "time_step": 0.02,
-        }
-        super().__init__(fmugym.bundled_fmu("CartPole"), defaults | config)
-
-    def _is_done(self):
-        return False
-
-
-ABSURD = 1e308
-
-
 @pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
-@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("env_id", IDS)
 def test_contract(env_id, fmi_version):
     env = gym.make(env_id, fmi_version=fmi_version)
     check_fmu_env(env)
@@ -372,28 +348,10 @@ def test_faults_are_logged(caplog):
 
 
 def test_goal_task():
-    class Reach(Swing):
-        def _get_observation_space(self):
-            box = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-            return gym.spaces.Dict({"observation": box, "achieved_goal": box, "desired_goal": box})
-
-        def _get_observation(self):
-            return {
-                "observation": np.array([self.out["q_dot"]]),
-                "achieved_goal": np.array([self.out["q"]]),
-                "desired_goal": np.array([self.variables["target"]]),
-            }
-
-        def _goal_reward(self, achieved_goal, desired_goal):
-            return -abs(achieved_goal - desired_goal).sum(-1)
-
-        def _is_done(self):
-            return False
-
-    env = Reach(episode_variables={"target": 0.5})
-    env.reset()
-    _, reward, *_ = env.step(0.0)
-    assert reward == -abs(env.out["q"] - 0.5)
+    env = Reaching()
+    env.reset(seed=1)
+    _, reward, *_ = env.step(env.action_space.sample())
+    assert reward == -(abs(env.out["q"] - env.variables["goal"]) > 0.5)
     goals = np.array([[0.0], [1.0]]), np.array([[1.0], [1.0]])
     assert env.compute_reward(*goals, {}).tolist() == [-1.0, 0.0]
     check_fmu_env(env)
@@ -444,15 +402,6 @@ def test_the_class_may_be_subclassed_for_a_relative_path(tmp_path, monkeypatch):
     with pytest.raises(fmugym.FMULoadError, match="somewhere"):
         Mine("Other.fmu")
     sys.modules.pop("my_relative_env")
-
-
-def test_register_makes_an_id():
-    fmugym.register("tests/Swing-v0", Swing, max_episode_steps=2)
-    env = gym.make("tests/Swing-v0")
-    env.reset()
-    assert [env.step(np.zeros(1, np.float32))[3] for _ in range(2)] == [False, True]
-    env.close()
-    gym.registry.pop("tests/Swing-v0")
 
 
 class TestTolerance:

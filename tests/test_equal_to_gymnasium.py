@@ -206,17 +206,6 @@ def test_the_checker_has_nothing_more_to_say_than_on_gymnasiums_own():
         assert texts[0] <= texts[1]
 
 
-def test_two_instances_live_side_by_side():
-    first, second = (gym.make("fmugym/CartPole-v0") for _ in range(2))
-    a, _ = first.reset(seed=1)
-    second.reset(seed=2)
-    second.step(0)
-    assert first.step(1)[0].tolist() != a.tolist()
-    first.close()
-    assert np.isfinite(second.step(1)[0]).all()
-    second.close()
-
-
 def test_version_argument_is_checked():
     with pytest.raises(fmugym.ConfigError, match=r"FMI version '2.1'; did you mean '2.0'"):
         gym.make("fmugym/CartPole-v0", fmi_version="2.1")

@@ -1,6 +1,7 @@
 """Event mode in co-simulation, clocks, early return: FMI 3.0."""
 
 import contextlib
+import functools
 
 import clocks_tools
 import exchange_tools
@@ -11,7 +12,6 @@ import wine_tools
 from pool_tools import KINDS, open_pool, reset, start, step
 from vector_tools import require_same_alone
 
-import fmugym
 from fmugym import FMU, ConfigError
 from fmugym.tools.skeleton import Skeleton
 
@@ -24,17 +24,13 @@ both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelEx
 
 @pytest.fixture(scope="session")
 def fmu_path(tmp_path_factory):
-    folder, made = tmp_path_factory.mktemp("clocks"), {}
-
+    @functools.cache
     def make(
         interface="CoSimulation", event_mode=True, building=contextlib.nullcontext, arrays=False
     ):
-        key = interface, event_mode, building, arrays
-        if key not in made:
-            path = folder / f"clocks{len(made)}.fmu"
-            with building():
-                made[key] = clocks_tools.clocks_fmu(path, interface, event_mode, arrays=arrays)
-        return made[key]
+        path = tmp_path_factory.mktemp("clocks") / "Clocks.fmu"
+        with building():
+            return clocks_tools.clocks_fmu(path, interface, event_mode, arrays=arrays)
 
     return make
 
@@ -221,11 +217,6 @@ class TestStates:
         np.testing.assert_array_equal(first, again)
 
 
-class Env(fmugym.FMUEnv):
-    def _is_done(self):
-        return False
-
-
 class TestEnvironments:
     CONFIG = {  # noqa: RUF012
         "model_input_names": ["strike", "command"],
@@ -238,19 +229,21 @@ class TestEnvironments:
     @pytest.mark.parametrize("isolation", ["none", "process"])
     def test_single_and_vector_environments_agree(self, fmu_path, isolation):
         path = fmu_path()
-        require_same_alone(lambda: Env(path, self.CONFIG, isolation=isolation), 15)
+        require_same_alone(lambda: fmu_tools.PlainEnv(path, self.CONFIG, isolation=isolation), 15)
 
 
 class TestRefusals:
     @pytest.mark.parametrize("name", [*TIMED, "bell"])
     def test_clocks_that_tick_by_themselves_are_no_inputs(self, fmu_path, name):
         with pytest.raises(ConfigError, match=f"'{name}'.*triggered"):
-            Env(fmu_path(), {"model_input_names": [name], "model_output_names": ["x"]})
+            fmu_tools.PlainEnv(
+                fmu_path(), {"model_input_names": [name], "model_output_names": ["x"]}
+            )
 
     def test_clocks_need_event_mode(self, fmu_path):
         config = {"model_input_names": ["strike"], "model_output_names": ["x"]}
         with pytest.raises(ConfigError, match=r"'strike'.*event mode"):
-            Env(fmu_path(event_mode=False), config)
+            fmu_tools.PlainEnv(fmu_path(event_mode=False), config)
 
     def test_clocks_have_no_start_values(self, fmu_path):
         config = {
@@ -259,7 +252,7 @@ class TestRefusals:
             "model_parameters": {"strike": 1},
         }
         with pytest.raises(ConfigError, match=r"'strike'.*clock"):
-            Env(fmu_path(), config)
+            fmu_tools.PlainEnv(fmu_path(), config)
 
 
 class TestProposals:

@@ -10,10 +10,10 @@ from process_tools import FaultyEnv, faulty_fmu, start_values
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
     CART_POLE,
-    MODES,
     Drawing,
+    each_mode,
     require_equal,
-    require_same_infos,
+    results_of_both,
     run_side_by_side,
 )
 
@@ -23,23 +23,17 @@ from fmugym.pool.around import PlayAround
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 
-each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
-
 
 @pytest.fixture(name="make")
-def fixture_make():
-    made = []
-
+def fixture_make(opened):
     def make(cls, num_envs=5, hooks="compiled", workers=2, **options):
         if workers:
             options |= {"isolation": "process", "workers": workers}
-        made.append(FMUVectorEnv(cls, num_envs, hooks=hooks, **options))
-        assert isinstance(made[-1].inside.pool, ProcessPool) == bool(workers)
-        return made[-1]
+        envs = opened(FMUVectorEnv(cls, num_envs, hooks=hooks, **options))
+        assert isinstance(envs.inside.pool, ProcessPool) == bool(workers)
+        return envs
 
-    yield make
-    for envs in made:
-        envs.close()
+    return make
 
 
 class Short(Drawing):
@@ -98,7 +92,7 @@ def test_results_are_those_of_one_process(make, cls, mode):
     isolated = make(cls, 70, autoreset_mode=mode)
     here = make(cls, 70, workers=None, autoreset_mode=mode)
     assert isolated.inside.engine.way == "compiled"
-    assert run_side_by_side(isolated, here, mode, 40)
+    list(results_of_both(isolated, here))
     for name in ("variables", "previous_state", "action", "inputs", "step_count"):
         np.testing.assert_equal(isolated.get_attr(name), here.get_attr(name))
 
@@ -115,7 +109,7 @@ def test_one_hook_may_stay_in_python(make, mode):
     isolated = make(Halves, hooks="auto", autoreset_mode=mode)
     here = make(Halves, hooks="auto", workers=None, autoreset_mode=mode)
     assert isolated.inside.engine._left
-    assert run_side_by_side(isolated, here, mode, 40)
+    assert run_side_by_side(isolated, here, 40)
 
 
 @pytest.mark.parametrize("cls", [Short, Tracking])
@@ -208,12 +202,6 @@ def test_refused_actions_change_nothing(make):
     with pytest.raises(ConfigError):
         envs.step([0, 2, 1])
     require_equal(envs.step([1, 1, 0])[0], expected[0])
-
-
-def test_infos_tell_of_draws(make):
-    isolated, here = make(Short), make(Short, workers=None)
-    for _ in range(2):
-        require_same_infos(*(envs.reset(seed=5)[1] for envs in (isolated, here)))
 
 
 def test_a_pool_without_a_library_steps_nothing(make):

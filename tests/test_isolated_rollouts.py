@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from process_tools import FaultyEnv, faulty_fmu, start_values
 from test_isolated_hooks import Sampled, Short, TwoPendulums
-from test_vector_tasks import Delayed, Goal, Outside, Tables, Tracking
+from test_vector_program import Task
+from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import CART_POLE, require_equal
 
 import fmugym
@@ -18,18 +19,13 @@ N, HORIZON = 7, 25
 
 
 @pytest.fixture(name="make")
-def fixture_make():
-    made = []
-
+def fixture_make(opened):
     def make(cls, num_envs=N, workers=3, **options):
         if workers:
             options |= {"isolation": "process", "workers": workers}
-        made.append(FMUVectorEnv(cls, num_envs, **({"hooks": "compiled"} | options)))
-        return made[-1]
+        return opened(FMUVectorEnv(cls, num_envs, **({"hooks": "compiled"} | options)))
 
-    yield make
-    for envs in made:
-        envs.close()
+    return make
 
 
 @pytest.fixture(name="in_workers")
@@ -159,6 +155,19 @@ def test_a_rollout_may_take_longer_than_a_call(make, tmp_path):
     )
     assert found.lengths.tolist() == [6, 6, 6]
     assert envs.inside.pool.health()["deaths"].tolist() == [0, 0, 0]
+
+
+class Outside(Task):
+    """Looks values up in a table that is too short for long episodes."""
+
+    def __init__(self):
+        super().__init__(max_episode_steps=20)
+
+    def _is_done(self):
+        return self.state[0] > 90.0
+
+    def _reward_policy(self):
+        return np.take([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0], self.step_count)
 
 
 def test_an_index_outside_of_its_table(make):

@@ -5,8 +5,6 @@ import gc
 import logging
 import os
 import pickle
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -15,20 +13,17 @@ import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, library_name, probe_config, probe_fmu
 from gymnasium import spaces
+from process_tools import run_python
 
 import fmugym
 from fmugym import FMI2CSEnv, FMULoadError, bundled_fmu
 
 every_version = pytest.mark.parametrize("version", MAJOR_VERSIONS)
-HERE = Path(__file__).parent
 
 
 def run(code, *arguments):
     """Run code in another interpreter; returns what it wrote to stdout and stderr."""
-    command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
-    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH")]))
-    environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    done = run_python("-W", "error", "-c", code, *map(str, arguments))
     assert done.returncode == 0, done.stderr
     return done.stdout, done.stderr
 

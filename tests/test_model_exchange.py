@@ -1,5 +1,6 @@
 """Model exchange: solvers, events, pools and environments."""
 
+import functools
 import math
 import re
 
@@ -29,14 +30,11 @@ with_states = pytest.mark.parametrize("version", [2, 3])
 @pytest.fixture(scope="session")
 def fmu_path(tmp_path_factory):
     """Write FMUs of the models, each once."""
-    folder, made = tmp_path_factory.mktemp("exchange"), {}
 
+    @functools.cache
     def make(model, version=2, interfaces=("ModelExchange",), flags="", tools=exchange_tools):
-        key = model, version, interfaces, flags, tools
-        if key not in made:
-            path = folder / f"{model}_{len(made)}.fmu"
-            made[key] = tools.exchange_fmu(path, model, version, interfaces, flags)
-        return made[key]
+        path = tmp_path_factory.mktemp("exchange") / f"{model}.fmu"
+        return tools.exchange_fmu(path, model, version, interfaces, flags)
 
     return make
 

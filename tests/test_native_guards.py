@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import zoo_tools
 from process_tools import run_python
+from program_tools import DISCRETE, code, uniform_draws
 from test_native_pool import LOG, make, on_linux
 
 import fmugym
@@ -16,11 +17,11 @@ from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi.status import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.form import form_of_draws, form_of_program, form_of_programs
+from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
 from fmugym.pool.records import record_in
-from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT
+from fmugym.vector.hooks.program import CONSTANT, SLOT
 
 
 @pytest.fixture
@@ -192,37 +193,19 @@ class TestStates:
 # Programs
 
 
-def program(*code, rows=(), results=(), registers=4, seen=0, slots=(), tables=(), **changes):
+def program(*rows, numbers=(), results=(), registers=4, seen=0, slots=(), tables=(), **changes):
     """A program with rows of operation, extra, register to write, and three operands."""
     parts = {
-        "code": np.array(code, np.uint16).tobytes(),
+        "code": code(*rows),
         "constants": b"",
         "slots": np.array(list(slots), SLOT).tobytes(),
-        "rows": range(len(rows)),
+        "rows": range(len(numbers)),
         "tables": tables,
         "registers": registers,
         "seen": seen,
         "results": results,
     }
-    return form_of_program(**(parts | changes)), tuple(rows)
-
-
-def operation(name, *rest):
-    return [OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))]
-
-
-def actions_of(n):
-    return {
-        "shape": (),
-        "letter": "q",
-        "size": 8,
-        "check": 1,
-        "lowest": 0,
-        "highest": 1,
-        "current": None,
-        "previous": None,
-        "none": np.zeros(1, np.int64),
-    }
+    return form_of_program(**(parts | changes)), tuple(numbers)
 
 
 def surroundings(pool):
@@ -238,19 +221,12 @@ def surroundings(pool):
     }
 
 
-def uniform_draws(*rows):
-    """Uniform numbers from [0, 1), one for each row of the start values."""
-    kind = _native.distributions().index("uniform")
-    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
-    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
-
-
 def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
     n = pool.num_instances
     return pool.prepare_play(
         (pool.variable("theta_0"),),
         (inputs, judgement or program(results=(0, 0, 0))),
-        actions_of(n) | changes.pop("actions", {}),
+        DISCRETE | changes.pop("actions", {}),
         np.zeros((1, n)),
         draws or (uniform_draws(*rows), np.zeros((n, 6), np.uint64)),
         (np.zeros(n, np.int64), np.ones(n, np.bool_), 10),
@@ -258,7 +234,7 @@ def prepare(pool, inputs, judgement=None, rows=(0,), draws=None, **changes):
     )
 
 
-ACTION = operation("load_action")
+ACTION = ("load_action",)
 
 
 class TestPrograms:
@@ -288,7 +264,7 @@ class TestPrograms:
     )
     def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
         with pytest.raises(ValueError, match="a program is not sound"):
-            prepare(cart_poles, program(ACTION, operation(*row)))
+            prepare(cart_poles, program(ACTION, row))
 
     @pytest.mark.parametrize(
         "changes",
@@ -318,13 +294,12 @@ class TestPrograms:
         ("table", "name"), [(np.zeros(0), "take"), (np.zeros(5), "interpolate")]
     )
     def test_tables_that_are_too_short(self, cart_poles, table, name):
-        code = ACTION, operation(name, 0, 1)
         with pytest.raises(ValueError, match="a program is not sound"):
-            prepare(cart_poles, program(*code, tables=(table,)))
+            prepare(cart_poles, program(ACTION, (name, 0, 1), tables=(table,)))
 
     def test_rows_of_another_length(self, cart_poles):
         with pytest.raises(ValueError, match="a row of a program must be a vector of"):
-            prepare(cart_poles, program(ACTION, rows=(np.zeros(1),)))
+            prepare(cart_poles, program(ACTION, numbers=(np.zeros(1),)))
 
     @pytest.mark.parametrize(
         "actions",

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from program_tools import code, constants
 
 from fmugym.pool.form import form_of_program
-from fmugym.vector.hooks.program import CONSTANT, OPERATIONS, SLOT, TYPES
+from fmugym.vector.hooks.program import SLOT, TYPES
 
 LENGTHS = (1, 15, 16, 17, 64, 127, 128, 129, 260)
 
@@ -15,21 +16,19 @@ def cast(source, target):
     return TYPES.index(source) * len(TYPES) + TYPES.index(target)
 
 
-def evaluate(code, rows, actions, results=(), seen=(), constants=(), slots=(), tables=()):
-    """Run a program whose first registers hold the constants."""
+def evaluate(lines, rows, actions, results=(), seen=(), kept=(), slots=(), tables=()):
+    """Run a program whose first registers hold constants."""
     from fmugym import _native
 
-    lines = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in code]
-    filled = [(np.float64(value).view("u8"), i, 8, 0) for i, value in enumerate(constants)]
     form = form_of_program(
-        np.array(lines, np.uint16).tobytes(),
-        np.array(filled, CONSTANT).tobytes(),
+        code(*lines),
+        constants(*kept),
         np.array(list(slots), SLOT).tobytes(),
         range(len(rows)),
         tables,
         16,
         len(seen),
-        range(len(constants), len(constants) + len(results)),
+        range(len(kept), len(kept) + len(results)),
     )
     parts = form, tuple(rows)
     return _native.evaluate(parts, len(actions), 1, actions, actions, tuple(results), tuple(seen))
@@ -41,7 +40,7 @@ def test_runs_of_any_length(n):
     x, y, action = rng.normal(size=(3, n))
     counts = rng.integers(-5, 5, n)
     flags, numbers, seen = np.zeros(n, np.bool_), np.zeros(n), np.zeros((n, 2), np.float32)
-    code = (
+    lines = (
         ("load_row", 0, 3),
         ("load_row", 1, 4),
         ("load_action", 0, 5),
@@ -60,7 +59,7 @@ def test_runs_of_any_length(n):
     slots = (0, 0, 2, TYPES.index("f")), (0, 1, 2, TYPES.index("f"))
     stored = np.zeros(n)
     rows = x, y, counts, stored
-    evaluate(code, rows, action, (flags, numbers), (seen,), (3.0,), slots)
+    evaluate(lines, rows, action, (flags, numbers), (seen,), (3.0,), slots)
     expected = np.array([math.tan(value) for value in x]) * 3.0
     chosen = np.where(expected < action, y, counts)
     np.testing.assert_array_equal(stored, expected)
@@ -74,13 +73,13 @@ def test_rows_that_a_program_both_reads_and_writes(n):
     rng = np.random.default_rng(n)
     first, second = rng.normal(size=(2, n))
     before = first.copy(), second.copy()
-    code = (
+    lines = (
         ("load_row", 0, 0),
         ("load_row", 1, 1),
         ("store_row", 0, 0, 1),
         ("store_row", 1, 0, 0),
     )
-    evaluate(code, (first, second), np.zeros(n))
+    evaluate(lines, (first, second), np.zeros(n))
     np.testing.assert_array_equal(first, before[1])
     np.testing.assert_array_equal(second, before[0])
 
@@ -157,8 +156,8 @@ def test_interpolation_is_that_of_numpy(xs, ys):
     x = np.concatenate([special, rng.uniform(-4.0, 4.0, 1000), rng.integers(-4, 5, 100)])
     stored = np.zeros(len(x))
     table = np.array([*xs, *ys, -7.0, 7.0])
-    code = ("load_row", 0, 0), ("interpolate", 0, 1, 0), ("store_row", 1, 0, 1)
-    evaluate(code, (x, stored), np.zeros(len(x)), tables=(table,))
+    lines = ("load_row", 0, 0), ("interpolate", 0, 1, 0), ("store_row", 1, 0, 1)
+    evaluate(lines, (x, stored), np.zeros(len(x)), tables=(table,))
     expected = [np.interp(value, xs, ys, left=-7.0, right=7.0) for value in x.tolist()]
     np.testing.assert_array_equal(stored, expected)
 
@@ -168,7 +167,7 @@ def test_interpolation_is_that_of_numpy(xs, ys):
 )
 def test_constants_stay_and_every_operand_exists(line):
     with pytest.raises(ValueError, match="a program is not sound"):
-        evaluate((line,), (np.zeros(3),), np.zeros(3), constants=(1.0,))
+        evaluate((line,), (np.zeros(3),), np.zeros(3), kept=(1.0,))
 
 
 def test_a_row_that_is_not_aligned():
@@ -181,8 +180,8 @@ def results_of(operation, *rows):
     """What an operation makes of rows."""
     loads = [("load_row", place, place) for place in range(len(rows))]
     stored, to = np.zeros_like(rows[0]), len(rows)
-    code = *loads, (operation, 0, to, 0, to - 1), ("store_row", to, 0, to)
-    evaluate(code, (*rows, stored), np.zeros(len(stored)))
+    lines = *loads, (operation, 0, to, 0, to - 1), ("store_row", to, 0, to)
+    evaluate(lines, (*rows, stored), np.zeros(len(stored)))
     return stored
 
 

@@ -9,6 +9,7 @@ import pytest
 from fmpy.container_fmu import cli
 from fmpy.container_fmu.config import Component, Configuration, Connection
 from fmpy.model_description import CoSimulation, ModelDescription, ModelVariable
+from fmu_tools import PlainEnv
 
 import fmugym
 
@@ -101,11 +102,6 @@ class _Mapping:
         return self._pairs
 
 
-class Env(fmugym.FMUEnv):
-    def _is_done(self):
-        return False
-
-
 def by_hand(x, u, k=2.0):
     """Each step of the container is one of each part, with 100 Euler steps; then outputs move on.
 
@@ -120,7 +116,7 @@ def by_hand(x, u, k=2.0):
 
 @pytest.mark.parametrize("way", list(WAYS))
 def test_single(container, way):
-    env = Env(container, CONFIG, **WAYS[way])
+    env = PlainEnv(container, CONFIG, **WAYS[way])
     for _ in range(2):  # episodes
         x = np.array(env.reset(seed=1)[0], float).reshape(2, 1)
         for u in (1.0, 0.0, -1.0, 0.5):
@@ -132,7 +128,7 @@ def test_single(container, way):
 
 @pytest.mark.parametrize("way", list(WAYS))
 def test_vector(container, way):
-    envs = fmugym.FMUVectorEnv(lambda: Env(container, CONFIG, **WAYS[way]), num_envs=3)
+    envs = fmugym.FMUVectorEnv(lambda: PlainEnv(container, CONFIG, **WAYS[way]), num_envs=3)
     x = np.array(envs.reset(seed=1)[0], float).T
     for u in np.random.default_rng(1).uniform(-1, 1, (5, 3)).astype(np.float32):
         found = envs.step(u[:, None])[0]

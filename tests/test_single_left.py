@@ -6,7 +6,13 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_single_compiled import require_readings, same
+from test_single_compiled import (
+    require_readings,
+    require_same,
+    require_same_snapshots,
+    same,
+    with_hooks,
+)
 from vector_tools import Drawing
 
 import fmugym
@@ -130,42 +136,29 @@ LEFT = {
 
 
 def pair(cls):
-    one, other = cls(), cls()
-    other.inside.way = "python"
+    one, other = cls(), with_hooks(cls, "python")
     one.reset(seed=5)
     other.reset(seed=5)
     return one, other
 
 
+def where_possible(cls):
+    return lambda hooks: with_hooks(cls, "auto" if hooks == "compiled" else hooks)
+
+
 @pytest.mark.parametrize("cls", LEFT)
 def test_it_equals_python(cls):
-    one, other = pair(cls)
-    ends = compiled = 0
-    one.action_space.seed(1)
-    for index in range(120):
-        action = one.action_space.sample()
-        first, second = one.step(action), other.step(action)
-        assert same(first, second), (index, first, second)
-        compiled += one.inside.player is not None
-        if index % 4 == 0:
-            require_readings(one, other)
-        if first[2] or first[3]:
-            ends += 1
-            require_readings(one, other)
-            assert same(one.reset(), other.reset())
-    assert set(one.inside.player.left) == LEFT[cls]
+    compiled, ends = require_same(where_possible(cls), 120, reads=4)
     assert ends > 5
     assert compiled > 80
-    one.close()
-    other.close()
 
 
-@pytest.mark.parametrize("cls", [Truncated, Reward, Observation, Both, Flags, GoalSeen])
+@pytest.mark.parametrize("cls", LEFT)
 def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
     env = cls()
     env.reset(seed=5)
     env.step(env.action_space.sample())
-    assert env.inside.player is not None
+    assert set(env.inside.player.left) == LEFT[cls]
     calls = []
     for name in LEFT[cls]:
         hook = getattr(cls, name)
@@ -183,6 +176,9 @@ def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
         expected = ["_get_observation"]  # ``_goal_reward`` gets the same one
     assert calls == expected
     env.close()
+
+
+ACTION = np.float32([0.004])
 
 
 class TestFaults:
@@ -203,14 +199,27 @@ class TestFaults:
 
         one, other = pair(Bad)
         for _ in range(4):
-            first, second = one.step(np.float32([0.004])), other.step(np.float32([0.004]))
+            first, second = one.step(ACTION), other.step(ACTION)
             assert same(first, second)
         assert "fault" in first[4]
         require_readings(one, other)
         assert same(one.reset(), other.reset())
-        assert same(one.step(np.float32([0.004])), other.step(np.float32([0.004])))
+        assert same(one.step(ACTION), other.step(ACTION))
         one.close()
         other.close()
+
+    @staticmethod
+    def fail_in_the_third_step(cls, error, match):
+        """Both raise the same error after two good steps; returns both."""
+        envs, texts = pair(cls), []
+        for env in envs:
+            env.step(ACTION)
+            env.step(ACTION)
+            with pytest.raises(error, match=match) as caught:
+                env.step(ACTION)
+            texts.append(str(caught.value))
+        assert texts[0] == texts[1]
+        return envs
 
     @pytest.mark.parametrize("cls", [Truncated, Reward, Observation])
     def test_exceptions_end_the_episode(self, cls):
@@ -221,16 +230,12 @@ class TestFaults:
                 raise ZeroDivisionError("three")
             return getattr(cls, hook)(self)
 
-        one, other = pair(type("Failing", (cls,), {hook: failing}))
-        for env in (one, other):
-            env.step(np.float32([0.004]))
-            env.step(np.float32([0.004]))
-            with pytest.raises(ZeroDivisionError, match="three"):
-                env.step(np.float32([0.004]))
+        failing_class = type("Failing", (cls,), {hook: failing})
+        one, other = self.fail_in_the_third_step(failing_class, ZeroDivisionError, "three")
         require_readings(one, other)
         for env in (one, other):
             with pytest.raises(SimulationError, match="reset"):
-                env.step(np.float32([0.004]))
+                env.step(ACTION)
         assert same(one.reset(), other.reset())
         one.close()
         other.close()
@@ -252,17 +257,8 @@ class TestFaults:
             good = getattr(cls, hook)(self)
             return value if self.step_count == 3 else good
 
-        one, other = pair(type("Bad", (cls,), {hook: bad}))
-        texts = []
-        for env in (one, other):
-            env.step(np.float32([0.004]))
-            env.step(np.float32([0.004]))
-            with pytest.raises(ConfigError, match=hook) as error:
-                env.step(np.float32([0.004]))
-            texts.append(str(error.value))
-        assert texts[0] == texts[1]
-        one.close()
-        other.close()
+        for env in self.fail_in_the_third_step(type("Bad", (cls,), {hook: bad}), ConfigError, hook):
+            env.close()
 
     def test_hooks_may_not_draw(self):
         class Drawn(Reward):
@@ -271,14 +267,8 @@ class TestFaults:
                     return super()._reward_policy()
                 return float(self.np_random.uniform())
 
-        one, other = pair(Drawn)
-        for env in (one, other):
-            env.step(np.float32([0.004]))
-            env.step(np.float32([0.004]))
-            with pytest.raises(SimulationError, match="random"):
-                env.step(np.float32([0.004]))
-        one.close()
-        other.close()
+        for env in self.fail_in_the_third_step(Drawn, SimulationError, "random"):
+            env.close()
 
 
 def test_each_hook_is_named_once(caplog):
@@ -339,32 +329,8 @@ class Unsteady(Task):
 @pytest.mark.parametrize("cls", [Noting, Filling, Writing, Unsteady, Inputs])
 def test_other_hooks_keep_all_in_python(cls):
     """Above all, hooks that change something: compiled hooks may read it."""
-    one, other = pair(cls)
-    for _ in range(30):
-        action = one.action_space.sample()
-        first, second = one.step(action), other.step(action)
-        assert same(first, second)
-        assert one.inside.player is None
-        if first[2] or first[3]:
-            assert same(one.reset(), other.reset())
-    assert one.inside.player is None
-    one.close()
-    other.close()
+    assert require_same(where_possible(cls), 30)[0] == 0
 
 
 def test_snapshots_and_attributes():
-    one, other = pair(Both)
-    actions = [one.action_space.sample() for _ in range(6)]
-    for action in actions[:3]:
-        one.step(action)
-        other.step(action)
-    saved = one.save_state(), other.save_state()
-    ahead = [[env.step(action) for action in actions[3:]] for env in (one, other)]
-    assert same(tuple(ahead[0]), tuple(ahead[1]))
-    assert same(one.restore_state(saved[1]), other.restore_state(saved[0]))
-    require_readings(one, other)
-    again = [[env.step(action) for action in actions[3:]] for env in (one, other)]
-    assert same(tuple(again[0]), tuple(ahead[0]))
-    assert same(tuple(again[1]), tuple(ahead[0]))
-    one.close()
-    other.close()
+    require_same_snapshots(*pair(Both))

@@ -377,16 +377,10 @@ class TestRefusals:
             envs.save_state()
         envs.close()
 
-    def test_of_another_fmu_or_config(self, halfway):
+    def test_of_another_config(self, halfway):
         snapshot = halfway().save_state()
-        for other, name in (
-            (Track(fmi_version="3.0"), "FMU"),
-            (Track(time_step=0.01), "time_step"),
-            (Track(model_parameters={"m": 0.1}), "model_parameters"),
-        ):
-            other.reset(seed=0)
-            with other, pytest.raises(ConfigError, match=name):
-                other.restore_state(snapshot)
+        with Track(time_step=0.01) as other, pytest.raises(ConfigError, match="time_step"):
+            other.restore_state(snapshot)
         with Track(on_fault="raise", leak_limit=None) as other:  # no state depends on these
             other.restore_state(snapshot)
 

@@ -19,6 +19,7 @@ import test_strings
 import values_tools
 import wine_tools
 from pythonfmu import FmuBuilder
+from values_tools import fixture_feedthrough  # noqa: F401  # the fixture "feedthrough"
 from vector_tools import require_same_alone
 
 import fmugym
@@ -50,13 +51,6 @@ class Echo(test_strings.Reading):
 
     def _get_info(self):
         return {"told": self.out["String_told"]}
-
-
-@pytest.fixture(scope="module")
-def feedthrough(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("strings")
-    versions = test_strings.VERSIONS
-    return {v: values_tools.feedthrough_fmu(folder / f"F{v}.fmu", v) for v in versions}
 
 
 @versions
@@ -109,11 +103,12 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     while env.out["String_told"] == word:
         env.reset()
     env.restore_state(saved)
-    assert env.out["String_told"] == word
+    assert env.out["String_told"] == env.parameters["String_parameter"] == word
     assert env.step(0)[4]["told"] == word
     envs = FMUVectorEnv(lambda: Echo(feedthrough[3], **options), 2)
     envs.reset()
     envs.restore_state(saved)
+    assert [one["String_parameter"] for one in envs.get_attr("parameters")] == [word] * 2
     assert envs.step(np.zeros(2, np.int64))[4]["told"].tolist() == [word] * 2
     env.restore_state(envs.save_state()[1])
     assert env.out["String_told"] == word

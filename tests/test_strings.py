@@ -1,14 +1,18 @@
 """Strings that episodes begin with: constant, drawn, and given for one episode."""
 
 import pickle
+from functools import partial
 
 import numpy as np
 import pytest
-import values_tools
 from fmu_tools import grouped
 from gymnasium import spaces
 from process_tools import run_python
-from values_tools import VERSIONS, pools, versions
+from values_tools import (
+    fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
+    pools,
+    versions,
+)
 from vector_tools import require_same_alone
 
 import fmugym
@@ -53,12 +57,6 @@ class Telling(Reading):
         return {"long": self.out["length"] > 3}
 
 
-@pytest.fixture(scope="module")
-def feedthrough(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("strings")
-    return {v: values_tools.feedthrough_fmu(folder / f"F{v}.fmu", v) for v in VERSIONS}
-
-
 def drawn_words(seed, count):
     """What numpy draws with the same generator."""
     rng = np.random.default_rng(seed)
@@ -81,38 +79,17 @@ def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
 
 
 @pools
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
-def test_vector_environments_draw_what_single_ones_do(feedthrough, options, hooks):
+@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@pytest.mark.parametrize(
+    ("cls", "hooks"),
+    [(Reading, "compiled"), (Telling, "auto"), (Telling, "array"), (Telling, "per_env")],
+)
+def test_vector_environments_draw_what_single_ones_do(feedthrough, options, mode, cls, hooks):
+    """Compiled hooks draw numbers; ``Telling`` has one hook in Python."""
     drawn = {"String_parameter": CHOICE, "Float64_parameter": Uniform(0, 1)}
     config = {"model_parameters": drawn, "model_output_names": ["length", "Float64_told"]}
-    assert require_same_alone(
-        lambda: Telling(feedthrough[3], max_episode_steps=2, **config, **options), 9, hooks=hooks
-    )
-
-
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
-@pytest.mark.parametrize("cls", [Reading, Telling])
-def test_episodes_that_follow_in_the_pass(feedthrough, mode, cls):
-    """Compiled hooks draw numbers; ``Telling`` has one hook in Python."""
-
-    def make():
-        return cls(feedthrough[3], max_episode_steps=2)
-
-    envs = FMUVectorEnv(make, 2, autoreset_mode=mode)
-    words = [drawn_words(5, 6), drawn_words(6, 6)]
-    envs.reset(seed=5)
-    episode = 1
-    for _ in range(10):
-        observations, rewards, _, _, infos = envs.step(np.zeros(2, np.int64))
-        if "drawn" in infos:
-            expected = [row[episode] for row in words]
-            assert infos["drawn"]["String_parameter"].tolist() == expected
-            assert observations[:, 0].tolist() == [SIZES[word] for word in expected]
-            episode += 1
-        elif cls is Telling:
-            assert rewards.tolist() == [2.0 * (row[episode - 1] == "a") for row in words]
-    assert episode > 3
-    envs.close()
+    make = partial(cls, feedthrough[3], max_episode_steps=2, **config, **options)
+    assert require_same_alone(make, 9, mode, hooks=hooks)
 
 
 @pools
@@ -148,34 +125,6 @@ def test_each_environment_has_its_own_text(feedthrough, options, hooks):
     assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
     with pytest.raises(ConfigError, match=r"'String_parameter'.*String.*3"):
         envs.set_attr("String_parameter", ["a", "b", 3])
-    envs.close()
-
-
-@pools
-def test_snapshots_hold_the_text(feedthrough, options):
-    """The FMU has no states, so that snapshots play episodes again."""
-
-    def make():
-        return Reading(feedthrough[3], **options)
-
-    env, envs = make(), FMUVectorEnv(make, 2)
-    env.reset(seed=4)
-    env.step(0)
-    saved = pickle.loads(pickle.dumps(env.save_state()))
-    assert saved == env.save_state()
-    word = env.parameters["String_parameter"]
-    while env.parameters["String_parameter"] == word:
-        env.reset()
-    env.restore_state(saved)
-    assert env.parameters["String_parameter"] == word
-    assert env.step(0)[0].tolist() == [SIZES[word]]
-    envs.reset(seed=1)
-    envs.restore_state(saved)
-    assert [one["String_parameter"] for one in envs.get_attr("parameters")] == [word] * 2
-    assert envs.step(np.zeros(2, np.int64))[0].tolist() == [[SIZES[word]]] * 2
-    env.restore_state(envs.save_state()[1])
-    assert env.parameters["String_parameter"] == word
-    env.close()
     envs.close()
 
 

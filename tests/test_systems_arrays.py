@@ -6,6 +6,7 @@ import ssp_tools
 import values_tools
 from fmpy import extract, read_model_description
 from fmpy.fmi3 import FMU3Slave
+from fmu_tools import PlainEnv
 from gymnasium import spaces
 from scipy.linalg import expm
 from system_tools import (
@@ -20,7 +21,6 @@ from fmugym import (
     Component,
     ConfigError,
     Connection,
-    FMUEnv,
     FMUSystem,
     FMUVectorEnv,
     Uniform,
@@ -223,7 +223,7 @@ def slave(path, folder, values):
 # The system's own arrays, and what an environment does with them
 
 
-class Plant(FMUEnv):
+class Plant(PlainEnv):
     """A plant whose matrix is drawn, pushed by an array."""
 
     def __init__(self, fmu, **changes):
@@ -236,9 +236,6 @@ class Plant(FMUEnv):
             "max_episode_steps": 5,
         }
         super().__init__(fmu, config | changes)
-
-    def _is_done(self):
-        return False
 
 
 def own_arrays(path, **options):

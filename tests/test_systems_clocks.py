@@ -4,6 +4,7 @@ import clocks_tools
 import numpy as np
 import pytest
 import ssp_tools
+from fmu_tools import PlainEnv
 from pool_tools import open_pool, start, step
 from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
@@ -12,7 +13,7 @@ from system_tools import (
 )
 from vector_tools import require_same_alone
 
-from fmugym import FMU, Component, ConfigError, FMUEnv, FMUSystem
+from fmugym import FMU, Component, ConfigError, FMUSystem
 from fmugym.tools import cli
 
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
@@ -95,7 +96,7 @@ def test_a_restored_state_goes_on_with_the_same_ticks(make, fmus):
     assert np.array_equal(first, [step(pool, *action) for action in actions[13:]])
 
 
-class Env(FMUEnv):
+class Env(PlainEnv):
     def __init__(self, fmu, inputs="c.strike", outputs=("c.x", "c.bell", "c.strike", "f.y2")):
         config = {
             "model_input_names": inputs,
@@ -104,9 +105,6 @@ class Env(FMUEnv):
             "max_episode_steps": 8,
         }
         super().__init__(fmu, config)
-
-    def _is_done(self):
-        return False
 
 
 def test_environments_set_and_see_clocks(fmus):

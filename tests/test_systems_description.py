@@ -4,8 +4,9 @@ import pickle
 from itertools import pairwise
 
 import pytest
+from fmu_tools import PlainEnv
 
-from fmugym import Component, Connection, FMUEnv, FMUSystem, bundled_fmu
+from fmugym import Component, Connection, FMUSystem, bundled_fmu
 from fmugym.archive.structure import Feedthrough
 from fmugym.archive.units import conversion_of_link
 from fmugym.errors import ArgumentError, ConfigError, FMULoadError
@@ -127,13 +128,10 @@ def logic(tmp_path_factory):
     return FmuBuilder.build_FMU(folder / "logic.py", dest=folder)
 
 
-class Env(FMUEnv):
+class Env(PlainEnv):
     def __init__(self, system, **changes):
         config = {"model_input_names": "a.u", "model_output_names": "b.T_air", "time_step": 60.0}
         super().__init__(system, config | changes)
-
-    def _is_done(self):
-        return False
 
 
 class TestDrivenVariables:

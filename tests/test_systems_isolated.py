@@ -4,7 +4,6 @@ What a system computes does not depend on where it runs.
 """
 
 import contextlib
-import logging
 import pickle
 from dataclasses import replace
 
@@ -17,6 +16,7 @@ import quirk_table
 import source_tools
 import ssp_tools
 import values_tools
+from pool_tools import open_pool, reset, start, step
 from process_tools import (
     faulty_fmu,
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
@@ -26,7 +26,6 @@ from system_tools import linear, linear_fmu, masses, system
 
 import fmugym
 from fmugym import Component, ConfigError, Connection, FMULoadError, FMUSystem, bundled_fmu
-from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.native import NativePool
 from fmugym.pool.process.pool import ProcessPool
@@ -35,10 +34,8 @@ from fmugym.systems.fmu import SystemFMU
 from fmugym.systems.plan import Component as Planned
 from fmugym.systems.plan import Connector, End, Link, Loop
 from fmugym.tools import cli
-from fmugym.trial import opening
 from fmugym.wine.loader import can_run_windows
 
-LOG = logging.getLogger("fmugym.test")
 MASSES = ["first.y1", "second.y2"]
 
 
@@ -50,19 +47,14 @@ def compiled(tmp_path_factory):
 
 
 @pytest.fixture(name="make")
-def closing_pools():
+def closing_pools(opened):
     """Make pools of plans as environments do; they are closed after the test."""
-    with contextlib.ExitStack() as stack:
 
-        def make(plan, outputs, inputs=(), count=2, time_step=0.1, spec=None, **options):
-            fmu = SystemFMU(plan)
-            variables = tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs))
-            whole = PoolSpec(*variables, time_step, **(spec or {}))
-            pool = opening.make_pool(fmu, whole, count, LOG, **options)
-            pool.variable = fmu.variable
-            return stack.enter_context(contextlib.closing(pool))
+    def make(plan, outputs, inputs=(), count=2, time_step=0.1, spec=None, **options):
+        fmu = SystemFMU(plan)
+        return opened(open_pool(fmu, inputs, outputs, time_step, count, options, **(spec or {})))
 
-        yield make
+    return make
 
 
 def isolated(plan):
@@ -71,21 +63,11 @@ def isolated(plan):
     return replace(plan, components=(*others, replace(last, isolate=True)))
 
 
-def reset(pool, names=(), values=None):
-    variables = tuple(map(pool.variable, names))
-    values = np.zeros((0, pool.num_instances)) if values is None else np.array(values, float)
-    return pool.reset(variables, values)[1]
-
-
 def play(pool, steps=10, inputs=None):
     """Reset and step; the outputs, shape (steps + 1, k, N)."""
-    assert not reset(pool).any(), pool.failure(0)
-    rows = [pool.outputs.copy()]
-    for step in range(steps):
-        outputs, statuses = pool.step(None if inputs is None else inputs[step])
-        assert not statuses.any(), pool.failure(0)
-        rows.append(outputs.copy())
-    return np.array(rows)
+    rows = [start(pool).outputs.copy()]
+    given = [()] * steps if inputs is None else inputs
+    return np.array(rows + [step(pool, *given[k]) for k in range(steps)])
 
 
 # The plan of a system, the names of its outputs and inputs, and what the pool does, each a function
@@ -216,7 +198,7 @@ class TestResults:
         rows = []
         for one in (plan, isolated(plan)):
             pool = make(one, MASSES, ["push"])
-            assert not reset(pool, ["second.x1_0"], [[0.3, -0.2]]).any()
+            start(pool, {"second.x1_0": [0.3, -0.2]})
             for k in range(6):
                 pool.step(np.array([[0.1 * k, -0.2]]))
                 rows.append(pool.outputs.tobytes())
@@ -228,21 +210,9 @@ class TestResults:
         assert rows[:8] == rows[8:]
 
     def test_states(self, make, fmus):
-        """Snapshots, and states that go to another pool as bytes."""
+        """They go to another pool as bytes."""
         plan = masses([fmus[2], fmus[2]])
         here, there = make(plan, MASSES), make(isolated(plan), MASSES)
-        later = []
-        for pool in (here, there):
-            play(pool, 3)
-            snapshot = pool.save()
-            first = [pool.step()[0].copy() for _ in range(3)]
-            pool.restore(snapshot, np.array([True, False]))
-            again = [pool.step()[0].copy() for _ in range(3)]
-            assert all(
-                a[:, 0].tobytes() == b[:, 0].tobytes() for a, b in zip(first, again, strict=True)
-            )
-            later.append(pool.outputs.tobytes())
-        assert later[0] == later[1]
         for pool in (here, there):
             pool.save_by(lambda: SaveMethod.STATE)
             play(pool, 2)
@@ -260,14 +230,14 @@ class TestResults:
         for one in (plan, isolated(plan)):
             pool = make(one, ["loud.sum"])
             caplog.clear()
-            assert not reset(pool, ["loud.log_status"], [[-1.0, 1.0]]).any(), pool.failure(0)
+            start(pool, {"loud.log_status": [-1.0, 1.0]})
             pool.step()
             told.append([r.getMessage() for r in caplog.records if "loud" in r.getMessage()])
         assert any("system_1.loud" in text and "Ümlaut is 100%" in text for text in told[0])
         assert sorted(told[0]) == sorted(told[1])
 
 
-class Telling(fmugym.FMUEnv):
+class Telling(fmu_tools.PlainEnv):
     """Reads a text that an FMU gives."""
 
     def __init__(self, source):
@@ -282,9 +252,6 @@ class Telling(fmugym.FMUEnv):
             "bounds": {"f.Float64_in": (-1, 1), "f.Float64_out": (-1, 1)},
         }
         super().__init__(source, config)
-
-    def _is_done(self):
-        return False
 
 
 class Chain(fmugym.FMUEnv):
@@ -360,9 +327,10 @@ class TestFaults:
         pool = make(plan, ("bad.y", "sound.y1"), count=4, time_step=0.5, **options)
 
         def values(*faults):
-            return np.array([list(start_values(one).values()) for one in faults], float).T
+            given = np.array([list(start_values(one).values()) for one in faults], float).T
+            return dict(zip(self.NAMES, given, strict=True))
 
-        assert not reset(pool, self.NAMES, values(fault, "none", "none", "none")).any()
+        start(pool, values(fault, "none", "none", "none"))
         pool.step()
         before = pool.outputs.copy()
         _, statuses = pool.step()
@@ -371,7 +339,7 @@ class TestFaults:
         for text in (cause, "this is fault"):
             assert text in pool.failure(0)
         mask = np.array([True, True, False, False])
-        pool.reset(tuple(map(pool.variable, self.NAMES)), values(*["none"] * 4), mask)
+        reset(pool, values(*["none"] * 4), mask)
         assert not pool.step()[1].any()
         assert pool.outputs[0, 0] == pool.outputs[0, 1] == before[0, 0]
 

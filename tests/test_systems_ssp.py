@@ -1,16 +1,15 @@
 """SSP archives: what is read of them, compared with FMPy's reader."""
 
 import copy
-import logging
 import random
 import sys
 import zipfile
 from contextlib import closing
-from itertools import pairwise
 from types import MappingProxyType
 
 import model_tools
 import numpy as np
+import pool_tools
 import pytest
 import system_tools
 from fmpy.ssp.ssd import find_components, get_connections, read_ssd, read_ssm, read_ssv
@@ -32,17 +31,13 @@ from ssp_tools import (
 
 import fmugym
 from fmugym import (
+    FMU,
     ConfigError,
     FMUGymError,
     FMULoadError,
     FMUSystem,
     bundled_fmu,
 )
-from fmugym.archive.structure import Feedthrough
-from fmugym.pool import PoolSpec
-from fmugym.pool.local import local_pool
-from fmugym.systems.order import order_of
-from fmugym.systems.plan import Link, Loop
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum", "3.0")
 
@@ -110,6 +105,12 @@ NESTED = system(
         connection("east.T", "T"),
     ],
 )
+
+
+def one_house(*wires, ports=None, more="", **attributes):
+    """A system of a house; the wires are pairs of ends, with a transformation after them or not."""
+    house = component("h", HOUSE_PORTS, more=more, **attributes)
+    return system("r", ports or {}, [house], [connection(*wire) for wire in wires])
 
 
 def links_of(system):
@@ -183,7 +184,7 @@ class TestReading:
             '<ssd:ParameterBinding source="resources/p.ssv">'
             '<ssd:ParameterMapping source="resources/p.ssm"/></ssd:ParameterBinding>'
         )
-        root = system("root", {}, [component("h", HOUSE_PORTS, more=bindings(binding))])
+        root = one_house(more=bindings(binding))
         path = pack(root, p_ssv=parameter_set(own), p_ssm=mapping(entries))
         assert starts_of(FMUSystem.read(path)) == {"h": {"A_f": 121.0, "solver": 2.0}}
         theirs = read_ssv(str(path), "resources/p.ssv")
@@ -197,7 +198,7 @@ class TestReading:
 
     def test_items_of_enumerations_and_booleans(self, pack):
         item = {"solver": '<ssv:Enumeration value="rk4"/>'}
-        root = system("r", {}, [component("h", HOUSE_PORTS, more=bindings(values(item)))])
+        root = one_house(more=bindings(values(item)))
         assert starts_of(FMUSystem.read(pack(root))) == {"h": {"solver": 2.0}}
 
     def test_what_is_ignored_is_told(self, pack):
@@ -206,17 +207,13 @@ class TestReading:
             "</ssd:Annotations>"
         )
         shape = '<ssd:ElementGeometry x1="0" y1="0" x2="1" y2="1"/>'
-        root = system(
-            "root",
-            {"idle": "input"},
-            [component("h", HOUSE_PORTS, more=shape + note)],
-        )
+        root = one_house(ports={"idle": "input"}, more=shape + note)
         findings = " ".join(FMUSystem.read(pack(root)).findings)
         for fact in ("org.example", "ElementGeometry", "idle"):
             assert fact in findings
 
     def test_the_default_experiment_and_the_interface(self, pack):
-        root = system("r", {}, [component("h", HOUSE_PORTS, implementation="CoSimulation")])
+        root = one_house(implementation="CoSimulation")
         experiment = '<ssd:DefaultExperiment startTime="3" stopTime="9.5"/>'
         plan = FMUSystem.read(pack(root, experiment)).plan
         assert (plan.start_time, plan.stop_time) == (3.0, 9.5)
@@ -227,9 +224,7 @@ class TestReading:
             '<ssd:Units><ssc:Unit name="odd"><ssc:BaseUnit kg="1" m="2" s="-3" factor="7"/>'
             "</ssc:Unit></ssd:Units>"
         )
-        root = system(
-            "r", {"q": "input odd"}, [component("h", HOUSE_PORTS)], [connection("q", "h.Q_int")]
-        )
+        root = one_house(("q", "h.Q_int"), ports={"q": "input odd"})
         (connector,) = FMUSystem.read(pack(root, unit)).plan.connectors
         assert connector.ends[0].gain == 7.0
 
@@ -340,94 +335,42 @@ class TestMistakes:
         ("root", "error", "facts"),
         [
             (
-                system("r", {}, [component("h", HOUSE_PORTS, source="resources/Hause.fmu")]),
+                one_house(source="resources/Hause.fmu"),
                 FMULoadError,
                 ["'h'", "resources/Hause.fmu"],
             ),
+            (one_house(source="../House.fmu"), FMULoadError, ["../House.fmu"]),
             (
-                system("r", {}, [component("h", HOUSE_PORTS, source="../House.fmu")]),
-                FMULoadError,
-                ["../House.fmu"],
-            ),
-            (
-                system("r", {}, [component("h", HOUSE_PORTS, type="application/x-ssp-package")]),
+                one_house(type="application/x-ssp-package"),
                 FMULoadError,
                 ["application/x-ssp-package"],
             ),
+            (one_house(("h.Q_em", "h.Q_in")), ConfigError, ["Q_in", "Q_int"]),
+            (one_house(("h.Q_em", "i.Q_int")), FMULoadError, ["'i'"]),
+            (one_house(("q", "h.Q_int")), FMULoadError, ["'q'"]),
             (
-                system(
-                    "r",
-                    {},
-                    [component("h", HOUSE_PORTS)],
-                    [connection("h.Q_em", "h.Q_in")],
-                ),
-                ConfigError,
-                ["Q_in", "Q_int"],
-            ),
-            (
-                system("r", {}, [component("h", HOUSE_PORTS)], [connection("h.Q_em", "i.Q_int")]),
-                FMULoadError,
-                ["'i'"],
-            ),
-            (
-                system("r", {}, [component("h", HOUSE_PORTS)], [connection("q", "h.Q_int")]),
-                FMULoadError,
-                ["'q'"],
-            ),
-            (
-                system("r", {}, [component("h", HOUSE_PORTS)], [connection("h.Q_em", "h.T_air")]),
+                one_house(("h.Q_em", "h.T_air")),
                 FMULoadError,
                 ["h.Q_em", "h.T_air", "both give"],
             ),
             (
-                system(
-                    "r",
-                    {"q": "input", "p": "input"},
-                    [component("h", HOUSE_PORTS)],
-                    [connection("q", "h.Q_int"), connection("p", "h.Q_int")],
-                ),
+                one_house(("q", "h.Q_int"), ("p", "h.Q_int"), ports={"q": "input", "p": "input"}),
                 ConfigError,
                 ["h.Q_int", "q, p"],
             ),
+            (system("r", {}, [component("h", HOUSE_PORTS)] * 2), FMULoadError, ["'h'"]),
             (
-                system("r", {}, [component("h", HOUSE_PORTS), component("h", HOUSE_PORTS)]),
-                FMULoadError,
-                ["'h'"],
-            ),
-            (
-                system(
-                    "r",
-                    {},
-                    [
-                        component("h", HOUSE_PORTS),
-                        '<ssd:SignalDictionaryReference name="bus" dictionary="d"/>',
-                    ],
-                ),
+                system("r", {}, ['<ssd:SignalDictionaryReference name="bus" dictionary="d"/>']),
                 FMULoadError,
                 ["signal dictionaries"],
             ),
             (
-                system(
-                    "r",
-                    {},
-                    [component("h", HOUSE_PORTS)],
-                    [connection("h.Q_em", "h.Q_int", linear("much"))],
-                ),
+                one_house(("h.Q_em", "h.Q_int", linear("much"))),
                 FMULoadError,
                 ["factor", "much"],
             ),
             (
-                system(
-                    "r",
-                    {},
-                    [
-                        component(
-                            "h",
-                            HOUSE_PORTS,
-                            more=bindings(values({"T_air": real(1)})),
-                        )
-                    ],
-                ),
+                one_house(more=bindings(values({"T_air": real(1)}))),
                 ConfigError,
                 ["h.T_air"],
             ),
@@ -465,7 +408,7 @@ class TestMistakes:
     @pytest.mark.parametrize("kind", ["input", "output"])
     def test_units_with_a_factor_of_0(self, pack, kind):
         ends = ("q", "h.Q_int") if kind == "input" else ("h.Q_em", "q")
-        root = system("r", {"q": f"{kind} odd"}, [component("h", HOUSE_PORTS)], [connection(*ends)])
+        root = one_house(ends, ports={"q": f"{kind} odd"})
         unit = '<ssc:Unit name="odd"><ssc:BaseUnit kg="1" m="2" s="-3" factor="0"/></ssc:Unit>'
         with pytest.raises(FMULoadError, match=r"line 3.*'odd' is 0"):
             FMUSystem.read(pack(root, f"<ssd:Units>{unit}</ssd:Units>"))
@@ -513,7 +456,7 @@ class TestDamaged:
             '<ssd:Annotations><ssc:Annotation type="fmugym"><x steps="2"/></ssc:Annotation>'
             "</ssd:Annotations>"
         )
-        return system("r", {}, [component("h", HOUSE_PORTS, more=own + steps)])
+        return one_house(more=own + steps)
 
     def damaged(self, draw, root):
         for _ in range(draw.randint(1, 4)):
@@ -557,21 +500,15 @@ class TestNestedConnectors:
         assert {"pair.warmth", "pair.east.Q_int"} <= inputs
         assert not inputs & {"pair.east.T_out", "pair.west.T_out"}
 
-    def test_it_reaches_all_components(self, pack):
+    def test_it_reaches_all_components(self, pack, opened):
         """As if each were set by hand, converted and scaled on the way."""
         fmu = FMUSystem.read(self.archive(pack)).as_fmu()
         names = ["pair.east.T_out", "pair.west.T_out", "pair.out", "pair.west.T_air"]
-        spec = PoolSpec((fmu.variable("pair.warmth"),), tuple(map(fmu.variable, names)), 900.0)
-        pool = local_pool(fmu, spec, 1, logging.getLogger("fmugym.test"))
-        try:
-            pool.reset((), np.zeros((0, 1)))
-            rows = pool.step(np.array([[7.0]]))[0][:, 0]
-        finally:
-            pool.close()
-        unit = bundled_input_unit()
-        there = 7.0 + (273.15 if unit == "K" else 0.0)
-        assert rows[:2] == pytest.approx([there, 0.5 * there + 1.0], abs=1e-9)
-        assert rows[2] == pytest.approx(rows[3] - (273.15 if unit == "K" else 0.0), abs=1e-9)
+        pool = opened(pool_tools.open_pool(fmu, ["pair.warmth"], names, 900.0))
+        rows = pool_tools.step(pool_tools.start(pool), 7.0)[:, 0]
+        kelvin = 273.15 if FMU(HOUSE).variable("T_out").unit == "K" else 0.0
+        assert rows[:2] == pytest.approx([7.0 + kelvin, 0.5 * (7.0 + kelvin) + 1.0], abs=1e-9)
+        assert rows[2] == pytest.approx(rows[3] - kelvin, abs=1e-9)
 
     def test_an_output_has_the_name_of_the_connector(self, pack):
         fmu = FMUSystem.read(self.archive(pack)).as_fmu()
@@ -607,12 +544,6 @@ class TestNestedConnectors:
         assert made.as_fmu().variable("pair.warmth.T_out").causality == "input"
 
 
-def bundled_input_unit():
-    from fmugym import FMU
-
-    return FMU(HOUSE).variable("T_out").unit
-
-
 class TestLarge:
     """Systems of many components."""
 
@@ -625,46 +556,26 @@ class TestLarge:
         starts = {f"c{i}.T_m_0": real(290.0) for i in range(count)}
         return system("root", {"T": "input degC"}, inner, wires, bindings(values(starts)))
 
-    @staticmethod
-    def lines_to_order(count):
-        """The lines that run for a chain, in which all act at once on the next."""
-        names = [f"c{i}" for i in range(count)]
-        links = [Link(a, "y", b, "u") for a, b in pairwise(names)]
-        through = Feedthrough({"y": frozenset("u")}, {"y": frozenset("u")}, True)
-        counted = 0
+    def test_opening_takes_as_many_lines_for_each_component(self, pack):
+        def lines(count):
+            path, counted = pack(self.chain(count)), 0
 
-        def trace(frame, event, what):
-            nonlocal counted
-            counted += event == "line"
-            return trace
+            def trace(frame, event, what):
+                nonlocal counted
+                counted += event == "line"
+                return trace
 
-        before = sys.gettrace()
-        sys.settrace(trace)
-        try:
-            order_of(names, links, dict.fromkeys(names, through), Loop())
-        finally:
-            sys.settrace(before)
-        return counted
-
-    def test_the_order_takes_as_long_for_each_component(self):
-        first, second, third = map(self.lines_to_order, (100, 200, 400))
-        assert first > 1000
-        assert third - second == pytest.approx(2 * (second - first), rel=0.02)
-
-    def test_opening_takes_as_many_calls_for_each_component(self, pack):
-        def calls(count):
-            path, counted = pack(self.chain(count)), []
-            sys.setprofile(lambda frame, event, what: counted.append(None))
+            before = sys.gettrace()
+            sys.settrace(trace)
             try:
                 fmu = FMUSystem.read(path).as_fmu(probe_timeout=None)
-                spec = PoolSpec((), (fmu.variable("c1.T_air"),), 60.0)
-                local_pool(fmu, spec, 1, logging.getLogger("fmugym.test")).close()
+                pool_tools.open_pool(fmu, (), ["c1.T_air"], 60.0).close()
             finally:
-                sys.setprofile(None)
-            return len(counted)
+                sys.settrace(before)
+            return counted
 
-        calls(20)  # what is imported and kept only once
-        first, second, third = map(calls, (20, 40, 80))
+        lines(20)  # what is imported and kept only once
+        first, second, third = map(lines, (20, 40, 80))
         assert third - second == pytest.approx(2 * (second - first), rel=0.02)
 
     def test_a_file_is_read_once(self, pack):

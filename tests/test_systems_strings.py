@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import ssp_tools
 import values_tools
+from fmu_tools import PlainEnv
 from system_tools import (
     closing_pools,  # noqa: F401  # the fixture "make"
     play,
 )
 
-from fmugym import Component, ConfigError, Connection, FMUEnv, FMUSystem, FMUVectorEnv
+from fmugym import Component, ConfigError, Connection, FMUSystem, FMUVectorEnv
 from fmugym.tools import cli
 
 VERSIONS = (1, 2, 3)
@@ -38,7 +39,7 @@ def labelled(fmus, **starts):
     return three(fmus, [f"label -> {name}.String_parameter" for name in "ac"], **starts)
 
 
-class Env(FMUEnv):
+class Env(PlainEnv):
     def __init__(self, fmu, **parameters):
         config = {
             "model_input_names": [],
@@ -47,9 +48,6 @@ class Env(FMUEnv):
             "time_step": 0.1,
         }
         super().__init__(fmu, config)
-
-    def _is_done(self):
-        return False
 
     def _get_action_space(self):
         return gymnasium.spaces.Discrete(1)

@@ -163,16 +163,21 @@ def test_another_thread_is_refused_while_the_fmu_steps(hooks):
 @WAYS
 @pytest.mark.parametrize("cls", [CartPoleEnv, Left])
 def test_threads_at_once_leave_it_whole(hooks, cls):
-    """They get results or a refusal; afterwards, everything is as it was."""
     env = begin(cls(hooks=hooks), hooks)
-    snapshot, stop, wrong = env.save_state(), time.monotonic() + 0.5, []
-    calls = quiet_methods(env, snapshot) | {f"step {i}": lambda: env.step(1) for i in range(2)}
+    calls = quiet_methods(env, env.save_state())
+    call_at_once([*calls.values(), *[lambda: env.step(1)] * 2])
+    require_whole(env)
+
+
+def call_at_once(calls):
+    """Call functions at random in three threads; they return, or refuse to work."""
+    stop, wrong = time.monotonic() + 0.5, []
 
     def play(seed):
         rng = np.random.default_rng(seed)
         while time.monotonic() < stop:
             try:
-                calls[str(rng.choice(list(calls)))]()
+                calls[rng.integers(len(calls))]()
             except SimulationError:
                 continue
             except BaseException as error:
@@ -181,7 +186,6 @@ def test_threads_at_once_leave_it_whole(hooks, cls):
 
     run_together([lambda seed=seed: play(seed) for seed in range(3)])
     assert wrong == []
-    require_whole(env)
 
 
 def quiet_methods(env, snapshot):

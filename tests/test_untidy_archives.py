@@ -174,35 +174,35 @@ class TestEntries:
 
 
 class TestLibraries:
+    @pytest.fixture
+    def named(self, make):
+        """Pack the probe with a library of another name."""
+
+        def pack_named(name="Other", version=2, **more):
+            other = library_name(version, name)
+            return make(version, lambda n: other if n.endswith(SUFFIX) else n, **more)
+
+        return pack_named
+
     @pytest.mark.parametrize("version", [2, 3])
     @pytest.mark.parametrize("name", ["Other", "probe", "lib Probe-1.0"])
-    def test_of_another_name(self, make, capsys, version, name):
-        other = library_name(version, name)
-        path = make(version, lambda n: other if n.endswith(SUFFIX) else n)
-        runs(path)
+    def test_of_another_name(self, named, capsys, caplog, version, name):
+        path, other = named(name, version), library_name(version, name)
+        with caplog.at_level("INFO", "fmugym"):
+            runs(path)
+        assert other in caplog.text
         assert f"the library is {other!r}, expected {library_name(version)!r}" in findings(path)
         assert main(["info", str(path)]) == 0
         out = capsys.readouterr().out
         assert other in out
         assert ": runs here" in out
 
-    def test_of_another_name_is_logged(self, make, caplog):
-        path = make(2, lambda n: library_name(2, "Other") if n.endswith(SUFFIX) else n)
-        with caplog.at_level("INFO", "fmugym"):
-            FMU(path)
-        assert "Other" in caplog.text
+    def test_of_another_name_in_a_process(self, named):
+        runs(named(), isolation="process")
 
-    def test_of_another_name_in_a_process(self, make):
-        path = make(2, lambda n: library_name(2, "Other") if n.endswith(SUFFIX) else n)
-        env = PlainEnv(path, probe_config(isolation="process"))
-        env.reset()
-        assert env.step([1.0])[0][0] == pytest.approx(0.1)
-        env.close()
-
-    def test_two_of_other_names_are_named(self, make, probe):
+    def test_two_of_other_names_are_named(self, named, probe):
         library = read_fmu(probe(2))[library_name(2)]
-        names = [library_name(2, name) for name in ("One", "Two")]
-        path = make(2, lambda n: names[0] if n.endswith(SUFFIX) else n, after=[(names[1], library)])
+        path = named("One", after=[(library_name(2, "Two"), library)])
         refused(
             path, rf"2 libraries .*\(One{SUFFIX}, Two{SUFFIX}\), but none is named Probe{SUFFIX}"
         )

@@ -9,9 +9,9 @@ from gymnasium import spaces
 from scipy.linalg import expm
 from values_tools import (
     STEP,
-    VERSIONS,
     Env,
     Writing,
+    fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
     pools,
     state_space_env,
     versions,
@@ -32,12 +32,6 @@ B = np.array([[1.0], [0.5]])
 C = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
 
 D = np.array([[0.0], [0.0], [0.25]])
-
-
-@pytest.fixture(scope="module")
-def feedthrough(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("feedthrough")
-    return {v: values_tools.feedthrough_fmu(folder / f"F{v}.fmu", v) for v in VERSIONS}
 
 
 @pytest.fixture(scope="module")
@@ -200,16 +194,7 @@ def test_hooks_on_arrays_of_environments(state_space):
             model_parameters={"x_0": [1, Uniform(0, 1)], "A": [[-1, 0.5], [0, -2]]},
         )
 
-    envs, env = FMUVectorEnv(make, 2, hooks="array"), make()
-    envs.reset(seed=1)
-    env.reset(seed=1)
-    for _ in range(3):
-        action = np.array([0.5], np.float32)
-        one, many = env.step(action), envs.step(np.stack([action, action]))
-        assert many[0][0].tolist() == np.float32(one[0]).tolist()
-        assert many[1][0] == one[1]
-    envs.close()
-    env.close()
+    require_same_alone(make, 3, hooks="array")
 
 
 @pools

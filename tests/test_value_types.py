@@ -6,9 +6,9 @@ import pytest
 import values_tools
 from gymnasium import spaces
 from values_tools import (
-    VERSIONS,
     Env,
     Writing,
+    fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
     pools,
     versions,
 )
@@ -26,12 +26,6 @@ LIMITS = {
     "Real": (-1e30, 1e30),
     "Float64": (-1e30, 1e30),
 }
-
-
-@pytest.fixture(scope="module")
-def feedthrough(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("feedthrough")
-    return {v: values_tools.feedthrough_fmu(folder / f"F{v}.fmu", v) for v in VERSIONS}
 
 
 @versions
@@ -99,24 +93,6 @@ def test_enumerations_are_discrete(feedthrough, version, options):
     assert env.action_space == env.observation_space == spaces.Discrete(2)
     env.reset()
     assert [env.step(action)[0] for action in (0, 1, 0)] == [0, 1, 0]
-    env.close()
-
-
-@versions
-@pools
-def test_strings_are_set(feedthrough, version, options):
-    env = Writing(
-        feedthrough[version],
-        [],
-        model_input_names=[],
-        model_output_names="length",
-        model_parameters={"String_parameter": "bluish", "String_in": "green"},
-        **options,
-    )
-    for _ in range(3):
-        env.reset()
-        env.step(0)
-        assert env.state == (len("bluish"),)
     env.close()
 
 

@@ -3,27 +3,16 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from vector_tools import Drawing, each_way
+from odd_values import Unspeakable
+from vector_tools import Drawing, each_way, require_equal
 
 from fmugym import ConfigError
 from fmugym.vector import FMUVectorEnv
 
-
-class Unshowable:
-    def __repr__(self):
-        raise RuntimeError("no repr")
-
-    def __array__(self, *given, **keywords):
-        raise RuntimeError("no array")
-
-    def __index__(self):
-        raise RuntimeError("no index")
-
-
 SEEDS = (
     *([1, 2], [1, 2, 3, 4], 1.5, True, -1, "123", b"abc", {1, 2, 3}, {1: 1, 2: 2, 3: 3}),
     *([1, 2, 2.0], [1, 2, True], [1, 2, -3], [1, 2, "3"], [[1], [2], [3]], np.ones(3)),
-    *(np.ones((3, 3), int), np.array([True] * 3), iter([1, 2, 3]), object(), Unshowable()),
+    *(np.ones((3, 3), int), np.array([True] * 3), iter([1, 2, 3]), object(), Unspeakable()),
 )
 
 
@@ -62,19 +51,23 @@ def test_seeds_may_be_any_sequence_of_integers(seeds):
         np.ones(3, object),
         1,
         True,
-        Unshowable(),
+        Unspeakable(),
     ],
     ids=lambda mask: type(mask).__name__,
 )
 def test_masks_that_do_not_fit(mask):
-    vector = FMUVectorEnv(Drawing, 3)
+    vector, twin = FMUVectorEnv(Drawing, 3), FMUVectorEnv(Drawing, 3)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="must be a Boolean array of shape"):
         vector.reset(options={"reset_mask": mask})
+    twin.reset(seed=0)
+    actions = np.zeros((3, 1), np.float32)
+    require_equal(vector.step(actions)[0], twin.step(actions)[0])
     vector.close()
+    twin.close()
 
 
-@pytest.mark.parametrize("options", [5, "reset_mask", ["reset_mask"], {3: 1}, Unshowable()])
+@pytest.mark.parametrize("options", [5, "reset_mask", ["reset_mask"], {3: 1}, Unspeakable()])
 def test_options_that_are_no_dict(options):
     vector = FMUVectorEnv(Drawing, 3)
     with pytest.raises(ConfigError, match="the options of reset must be a dict"):
@@ -102,7 +95,7 @@ def test_unknown_ways_and_modes():
         FMUVectorEnv(lambda: gym.make("CartPole-v1").unwrapped, 2)
 
 
-@pytest.mark.parametrize("num_envs", [0, -1, 2.5, 2.0, True, None, "2", [2], Unshowable()])
+@pytest.mark.parametrize("num_envs", [0, -1, 2.5, 2.0, True, None, "2", [2], Unspeakable()])
 def test_numbers_of_environments_that_make_no_sense(num_envs):
     with pytest.raises(ConfigError, match="num_envs must be a positive integer"):
         FMUVectorEnv(Drawing, num_envs)
@@ -124,14 +117,14 @@ def test_memory_that_runs_out_is_blamed_on_the_number(monkeypatch):
 
 
 BAD = (
-    *(("threads", value) for value in (0, -1, 1.5, True, "2", [1], Unshowable())),
-    *(("workers", value) for value in (0, -1, 1.5, True, "2", [1], Unshowable())),
-    *(("call_timeout", value) for value in (0, -1, "1", True, float("nan"), [1], Unshowable())),
-    *(("private_libraries", value) for value in (0, 1, "yes", [True], Unshowable())),
-    *(("isolation", value) for value in (1, "proces", ["process"], np.ones(2), Unshowable())),
-    *(("max_episode_steps", value) for value in (0, -1, 1.5, True, "2", [1], Unshowable())),
-    *(("hooks", value) for value in (None, 1, ["array"], np.ones(2), Unshowable())),
-    *(("autoreset_mode", value) for value in (None, 1, ["next_step"], np.ones(2), Unshowable())),
+    *(("threads", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
+    *(("workers", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
+    *(("call_timeout", value) for value in (0, -1, "1", True, float("nan"), [1], Unspeakable())),
+    *(("private_libraries", value) for value in (0, 1, "yes", [True], Unspeakable())),
+    *(("isolation", value) for value in (1, "proces", ["process"], np.ones(2), Unspeakable())),
+    *(("max_episode_steps", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
+    *(("hooks", value) for value in (None, 1, ["array"], np.ones(2), Unspeakable())),
+    *(("autoreset_mode", value) for value in (None, 1, ["next_step"], np.ones(2), Unspeakable())),
     *(("make_env", value) for value in (None, 1, "fmugym.envs:CartPoleEnv", [Drawing])),
 )
 

@@ -3,15 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import SyncVectorEnv
 from vector_tools import (
     CART_POLE,
     Drawing,
-    each_mode,
     each_way,
     require_equal,
+    results_of_both,
     run_side_by_side,
-    sampled_actions,
 )
 
 from fmugym import ConfigError, Uniform
@@ -42,9 +41,7 @@ def test_attributes_for_each_environment(hooks):
             for force, limit in zip(forces, limits, strict=True)
         ]
     )
-    assert run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 100) > 5
-    vector.close()
-    theirs.close()
+    assert run_side_by_side(vector, theirs, 100) > 5
 
 
 @pytest.mark.parametrize("values", [[0.5, 1.5, -2.0], [1, 2, 3], [True, False, True], [2.0] * 3])
@@ -58,43 +55,13 @@ def test_hooks_stay_compiled_with_attributes_for_each_environment(values):
             return self.weight * self.state[0] + (self.weight > 1)
 
     ways = [FMUVectorEnv(Weighted, 3, hooks=hooks) for hooks in ("compiled", "array")]
-    for vector in ways:
-        vector.reset(seed=1)
     for now in ([4.0, 5.0, 6.0], values):
         for vector in ways:
             vector.set_attr("weight", now)
-        for actions in sampled_actions(ways[0], 5):
-            first, second = (vector.step(actions) for vector in ways)
-            require_equal(first[1], second[1])
+        list(results_of_both(*ways, 5))
         for vector in ways:
             assert vector.get_attr("weight") == tuple(now)
     assert [vector.inside.engine.way for vector in ways] == ["compiled", "array"]
-    for vector in ways:
-        vector.close()
-
-
-@each_mode
-def test_done_is_that_of_the_last_step_in_all_ways_of_calling_hooks(mode):
-    """Compiled, it stayed False: a program keeps no array of it."""
-    ways = [
-        FMUVectorEnv(CART_POLE, 6, hooks=hooks, autoreset_mode=mode, max_episode_steps=12)
-        for hooks in ("auto", "array", "per_env")
-    ]
-    for vector in ways:
-        vector.reset(seed=0)
-    number = 0
-    for actions in sampled_actions(ways[0], 40):
-        results = [vector.step(actions) for vector in ways]
-        done, *others = [vector.get_attr("done") for vector in ways]
-        assert others == [done, done]
-        number += sum(done)
-        ended = results[0][2] | results[0][3]
-        if mode is AutoresetMode.DISABLED and ended.any():
-            for vector in ways:
-                vector.reset(options={"reset_mask": ended})
-            done, *others = [vector.get_attr("done") for vector in ways]
-            assert others == [done, done]
-    assert (number > 0) == (mode is not AutoresetMode.SAME_STEP)
     for vector in ways:
         vector.close()
 
@@ -115,7 +82,7 @@ def test_parameters_for_each_environment(hooks):
             for m, g in zip(masses, frictions, strict=True)
         ]
     )
-    assert run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 100) > 5
+    assert any((result[2] | result[3]).any() for result in results_of_both(vector, theirs))
     assert [p["m_pole"] for p in vector.get_attr("parameters")] == masses
     options = {"model_parameters": {"m_pole": 0.3}}
     require_equal(vector.reset(options=options)[0], theirs.reset(options=dict(options))[0])
@@ -138,9 +105,7 @@ def test_parameters_that_the_config_does_not_name_or_draws(hooks):
             for b, q in ((0.0, 0.1), (1e-4, 0.2), (2e-4, 0.3))
         ]
     )
-    run_side_by_side(vector, theirs, AutoresetMode.NEXT_STEP, 20)
-    vector.close()
-    theirs.close()
+    run_side_by_side(vector, theirs, 20)
 
 
 @each_way

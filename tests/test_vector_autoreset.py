@@ -8,32 +8,6 @@ from fmugym import ConfigError, SimulationError
 from fmugym.vector import FMUVectorEnv
 
 
-@each_way
-def test_a_partial_reset_leaves_the_others_alone(hooks):
-    vector, untouched = (FMUVectorEnv(Drawing, 3, hooks=hooks) for _ in range(2))
-    vector.reset(seed=0)
-    untouched.reset(seed=0)
-    actions = sampled_actions(vector, 3)
-    vector.step(actions[0])
-    last = untouched.step(actions[0])[0]
-    mask = np.array([False, True, False])
-    options = {"reset_mask": mask, "model_parameters": {"q_0": 0.5}}
-    observations, infos = vector.reset(options=options)
-    assert observations[[0, 2]].tolist() == last[[0, 2]].tolist()
-    assert observations[1, 0] == np.float32(0.5)
-    assert options.keys() == {"reset_mask", "model_parameters"}
-    assert mask.tolist() == infos["_drawn"].tolist() == [False, True, False]
-    mask[:] = True
-    assert infos["_drawn"].tolist() == [False, True, False]
-    for action in actions[1:]:
-        first, second = vector.step(action), untouched.step(action)
-        assert first[0][[0, 2]].tolist() == second[0][[0, 2]].tolist()
-        assert first[3][[0, 2]].tolist() == second[3][[0, 2]].tolist()
-    assert first[3].tolist() == [True, False, True]
-    vector.close()
-    untouched.close()
-
-
 def test_the_first_reset_is_of_all():
     vector = FMUVectorEnv(Drawing, 2)
     with pytest.raises(ConfigError, match="first reset must be of all"):

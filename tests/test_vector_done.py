@@ -9,8 +9,7 @@ from vector_tools import (
     PushedCart,
     each_mode,
     require_equal,
-    require_same_infos,
-    sampled_actions,
+    results_of_both,
 )
 
 import fmugym
@@ -54,21 +53,13 @@ def pair(task, hooks, mode, num_envs=6):
 def test_done_is_that_of_single_environments(task, mode, hooks):
     ours, theirs = pair(task, hooks, mode)
     seen = set()
-    for envs in ours, theirs:
-        envs.reset(seed=1)
-    for actions in sampled_actions(ours, 40):
-        result, _ = ours.step(actions), theirs.step(actions)
+    for result in results_of_both(ours, theirs):
         done = ours.get_attr("done")
         assert done == theirs.get_attr("done")
         assert all(type(value) is bool for value in done)
         if mode is not AutoresetMode.SAME_STEP:
             assert list(done) == result[2].tolist()
         seen |= set(zip(result[2].tolist(), result[3].tolist(), strict=True))
-        ended = result[2] | result[3]
-        if mode is AutoresetMode.DISABLED and ended.any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
-            assert ours.get_attr("done") == theirs.get_attr("done") == (False,) * 6
     assert len(seen) > 1
     ours.close()
     theirs.close()
@@ -77,14 +68,11 @@ def test_done_is_that_of_single_environments(task, mode, hooks):
 @each_kind
 def test_the_callers_array_is_not_done(hooks):
     ours, theirs = pair(CART_POLE, hooks, AutoresetMode.NEXT_STEP)
-    for envs in ours, theirs:
-        envs.reset(seed=1)
-    for actions in sampled_actions(ours, 30):
-        terminated = ours.step(actions)[2]
-        expected = tuple(terminated.tolist())
-        terminated[:] = ~terminated
-        theirs.step(actions)
+    for result in results_of_both(ours, theirs):
+        expected = tuple(result[2].tolist())
+        result[2][:] = ~result[2]
         assert ours.get_attr("done") == theirs.get_attr("done") == expected
+        result[2][:] = expected
     ours.close()
     theirs.close()
 
@@ -116,7 +104,7 @@ def test_snapshots_have_done(hooks):
     theirs.close()
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array"])
+@each_kind
 def test_rollouts_leave_done(hooks):
     envs = FMUVectorEnv(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
     envs.reset(seed=0)
@@ -131,23 +119,15 @@ def test_rollouts_leave_done(hooks):
 @each_kind
 def test_an_error_in_episodes_with_options_leaves_no_other_done(hooks):
     """Such episodes are played on arrays, and an error may come within a step."""
-    ours, theirs = (
-        FMUVectorEnv(Raising, 3, autoreset_mode=AutoresetMode.DISABLED, hooks=way)
-        for way in (hooks, "per_env")
-    )
+    ours, theirs = pair(Raising, hooks, AutoresetMode.DISABLED, 3)
     for envs in ours, theirs:
         envs.reset(seed=4, options={"model_parameters": {"m_cart": 2.0}})
         envs.step(np.zeros(3, np.int64))
         with pytest.raises(SimulationError, match="environment 1"):
             envs.step(np.array([0, 1, 0]))
-        envs.reset(seed=5)
-    for _ in range(12):
-        result, _ = (envs.step(np.zeros(3, np.int64)) for envs in (ours, theirs))
+    for _ in results_of_both(ours, theirs, [np.zeros(3, np.int64)] * 12, seed=5):
         for name in ("done", "action", "step_count", "previous_state"):
             assert ours.get_attr(name) == theirs.get_attr(name)
-        if (ended := result[2] | result[3]).any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
     ours.close()
     theirs.close()
 
@@ -168,37 +148,26 @@ TASK = {
 @each_mode
 def test_costs_in_a_series_have_the_done_of_their_step(mode, hooks):
     """They come from the infos; where ``done`` is a cost, it is what the row says of the end."""
-    rows = []
-    for way in (hooks, "per_env"):
-        inner = FMUVectorEnv(
-            lambda: fmugym.load(TASK), 3, max_episode_steps=9, autoreset_mode=mode, hooks=way
+    ours, theirs = (
+        RecordVectorSeries(
+            FMUVectorEnv(
+                lambda: fmugym.load(TASK), 3, max_episode_steps=9, autoreset_mode=mode, hooks=way
+            )
         )
-        envs = RecordVectorSeries(inner)
-        envs.reset(seed=2)
-        for actions in sampled_actions(envs, 40):
-            result = envs.step(actions)
-            ended = result[2] | result[3]
-            if mode is AutoresetMode.DISABLED and ended.any():
-                envs.reset(options={"reset_mask": ended})
-        rows.append(
-            {name: envs.series[name] for name in [column.name for column in envs.series.columns]}
-        )
-        assert rows[-1]["costs.last"].any()
-        is_step = rows[-1]["step"] > 0
-        np.testing.assert_array_equal(
-            rows[-1]["costs.last"][is_step], rows[-1]["terminated"][is_step]
-        )
-        envs.close()
+        for way in (hooks, "per_env")
+    )
+    list(results_of_both(ours, theirs))
+    rows = [{c.name: envs.series[c.name] for c in envs.series.columns} for envs in (ours, theirs)]
     require_equal(*rows)
+    is_step = rows[0]["step"] > 0
+    assert rows[0]["costs.last"].any()
+    np.testing.assert_array_equal(rows[0]["costs.last"][is_step], rows[0]["terminated"][is_step])
+    ours.close()
+    theirs.close()
 
 
-class Judged(PushedCart):
+class Judged(Faulty):
     """Rewards are not numbers at times; the info tells what a hook reads then."""
-
-    policy = "terminate"
-
-    def __init__(self):
-        super().__init__(max_episode_steps=5, on_fault=self.policy, fault_reward=-7.0)
 
     def _get_inputs(self):
         return self.action
@@ -210,10 +179,8 @@ class Judged(PushedCart):
         return {"done": self.done}
 
 
-class Cut(Judged):
+class Cut(Judged, Truncating):
     """A fault is not the end of the task."""
-
-    policy = "truncate"
 
 
 class Broken(Faulty):
@@ -232,10 +199,8 @@ class Broken(Faulty):
         return {"done": self.done}
 
 
-class BrokenCut(Broken):
+class BrokenCut(Broken, Truncating):
     """A fault is not the end of the task."""
-
-    policy = "truncate"
 
 
 class Doomed(Broken):
@@ -254,18 +219,7 @@ class Doomed(Broken):
 def test_observations_have_done(task, mode, hooks):
     """Of a step whose FMU failed it is what the fault makes it; of a start, it is False."""
     ours, theirs = pair(task, hooks, mode)
-    seen = set()
-    require_equal(ours.reset(seed=1)[0], theirs.reset(seed=1)[0])
-    for actions in sampled_actions(ours, 30):
-        mine, other = ours.step(actions), theirs.step(actions)
-        for one, expected in zip(mine[:4], other[:4], strict=True):
-            require_equal(one, expected)
-        require_same_infos(mine[4], other[4])
-        seen |= set(mine[0][:, 1].tolist())
-        ended = mine[2] | mine[3]
-        if mode is AutoresetMode.DISABLED and ended.any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
+    seen = {flag for result in results_of_both(ours, theirs) for flag in result[0][:, 1].tolist()}
     assert seen == ({0.0} if mode is AutoresetMode.SAME_STEP else {0.0, 1.0})
     ours.close()
     theirs.close()
@@ -276,19 +230,7 @@ def test_observations_have_done(task, mode, hooks):
 @pytest.mark.parametrize("task", [Judged, Cut])
 def test_infos_of_faults_have_done(task, mode, hooks):
     ours, theirs = pair(task, hooks, mode)
-    faults = 0
-    for envs in ours, theirs:
-        envs.reset(seed=1)
-    for actions in sampled_actions(ours, 30):
-        mine, other = ours.step(actions), theirs.step(actions)
-        require_equal(mine[2], other[2])
-        require_same_infos(mine[4], other[4])
-        infos = mine[4].get("final_info", mine[4])
-        faults += int(np.count_nonzero(infos.get("_fault", False)))
-        ended = mine[2] | mine[3]
-        if mode is AutoresetMode.DISABLED and ended.any():
-            for envs in ours, theirs:
-                envs.reset(options={"reset_mask": ended})
-    assert faults
+    infos = [result[4].get("final_info", result[4]) for result in results_of_both(ours, theirs)]
+    assert any(np.any(told.get("_fault", False)) for told in infos)
     ours.close()
     theirs.close()

@@ -5,7 +5,7 @@ import threading
 import gymnasium as gym
 import numpy as np
 import pytest
-from vector_tools import Drawing, each_way, require_equal, run_side_by_side
+from vector_tools import Drawing, each_way, require_equal, require_pair_equal
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -89,15 +89,6 @@ class WithHelper(Drawing):
             self.many.close()
 
 
-@each_way
-def test_constructors_may_make_and_use_environments(hooks):
-    vector = FMUVectorEnv(WithHelper, 3, hooks=hooks)
-    theirs = gym.vector.SyncVectorEnv([WithHelper] * 3)
-    run_side_by_side(vector, theirs, vector.autoreset_mode, 12)
-    vector.close()
-    theirs.close()
-
-
 class UsesItself(Drawing):
     """Its constructor plays an episode."""
 
@@ -111,12 +102,9 @@ class UsesItself(Drawing):
 
 
 @each_way
-def test_constructors_may_play(hooks):
-    vector = FMUVectorEnv(UsesItself, 3, hooks=hooks)
-    theirs = gym.vector.SyncVectorEnv([UsesItself] * 3)
-    run_side_by_side(vector, theirs, vector.autoreset_mode, 12)
-    vector.close()
-    theirs.close()
+@pytest.mark.parametrize("cls", [WithHelper, UsesItself])
+def test_constructors_may_make_and_use_environments(cls, hooks):
+    require_pair_equal(cls, 12, num_envs=3, hooks=hooks)
 
 
 @pytest.mark.parametrize("hooks", ["array", "per_env"])

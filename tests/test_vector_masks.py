@@ -12,7 +12,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 from vector_tools import CART_POLE, Drawing, PushedCart, require_equal
 
-from fmugym import ConfigError, FMUVectorEnv, SimulationError, Uniform
+from fmugym import FMUVectorEnv, SimulationError, Uniform
 from fmugym.vector.engines.batch import BatchEngine
 
 
@@ -156,19 +156,6 @@ def test_one_call_of_the_pool_does_it(task, monkeypatch):
     envs.close()
 
 
-def test_environments_that_go_on_keep_their_observations():
-    envs = made(CART_POLE)
-    last = envs.step(np.ones(5, np.int64))[0].copy()
-    observations, infos = envs.reset(options={"reset_mask": np.array([0, 1, 0, 1, 1], np.bool_)})
-    kept = np.array([True, False, True, False, False])
-    require_equal(observations[kept], last[kept])
-    assert (observations[~kept] != last[~kept]).any(1).all()
-    require_equal(infos["_drawn"], ~kept)
-    require_equal(infos["drawn"]["x_0"][kept], np.zeros(2))
-    require_equal(infos["drawn"]["x_0"][~kept].astype(np.float32), observations[~kept, 0])
-    envs.close()
-
-
 @pytest.mark.parametrize("task", [CART_POLE, Pictured, Nested])
 def test_what_the_caller_holds_does_not_change(task):
     """Infos are read only at the end, when their memory could have served many resets more."""
@@ -239,53 +226,6 @@ def test_masks_of_every_form(form):
     require_same(quick, second.reset(options={"reset_mask": mask.tolist()}))
     first.close()
     second.close()
-
-
-@pytest.mark.parametrize(
-    "mask",
-    [
-        np.zeros(5, np.bool_),
-        np.ones(4, np.bool_),
-        np.ones((5, 1), np.bool_),
-        np.ones(5, np.int64),
-        np.ones(5),
-        "all",
-        5,
-    ],
-)
-def test_a_mask_that_does_not_fit_changes_nothing(mask):
-    envs, twin = made(CART_POLE), made(CART_POLE)
-    with pytest.raises(ConfigError, match=r"reset_mask.*\(5,\).*True"):
-        envs.reset(options={"reset_mask": mask})
-    actions = np.ones(5, np.int64)
-    require_same(tuple(envs.step(actions)), tuple(twin.step(actions)))
-    envs.close()
-    twin.close()
-
-
-def test_ends_that_are_left_have_to_be_reset():
-    envs = FMUVectorEnv(CART_POLE, 3, autoreset_mode=AutoresetMode.DISABLED, max_episode_steps=2)
-    envs.reset(seed=0)
-    actions = np.zeros(3, np.int64)
-    envs.step(actions)
-    assert envs.step(actions).truncated.all()
-    envs.reset(options={"reset_mask": np.array([True, False, True])})
-    with pytest.raises(SimulationError, match="environment 1"):
-        envs.step(actions)
-    envs.reset(options={"reset_mask": np.array([False, True, False])})
-    envs.step(actions)
-    envs.close()
-
-
-@pytest.mark.parametrize("ready", ["never", "closed"])
-def test_a_reset_with_a_mask_needs_a_reset_of_all(ready):
-    envs = FMUVectorEnv(CART_POLE, 3)
-    if ready == "closed":
-        envs.reset(seed=0)
-        envs.close()
-    with pytest.raises((ConfigError, SimulationError), match=r"all environments|closed"):
-        envs.reset(options={"reset_mask": np.array([True, False, True])})
-    envs.close()
 
 
 def test_parameters_given_before_count():

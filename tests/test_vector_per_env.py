@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
     RingError,
     Ringing,
     handler,  # noqa: F401  # the fixture "handler"
+    make_pair,
+    results_of_both,
 )
 
 import fmugym
@@ -202,34 +205,15 @@ class Breaking(Drawing):
 def test_a_number_that_breaks_is_a_fault_as_in_single_environments(form, monkeypatch):
     """Also where the hooks end the episode in that step; the variables are as before it."""
     monkeypatch.setattr(Breaking, "form", form)
-    envs = FMUVectorEnv(Breaking, 6, hooks="per_env", autoreset_mode="disabled")
-    alone = [Breaking() for _ in range(6)]
-    envs.reset(seed=0)
-    for seed, env in enumerate(alone):
-        env.reset(seed=seed)
+    ours, theirs = make_pair(Breaking, AutoresetMode.DISABLED, 6, "per_env")
     faults = 0
-    for _ in range(25):
-        seen, rewards, terminated, truncated, infos = envs.step(np.zeros((6, 1), np.float32))
-        for index, env in enumerate(alone):
-            row, *rest, info = env.step(np.zeros(1, np.float32))
-            assert rest == [rewards[index], terminated[index], truncated[index]]
-            for name in row if form == "dict" else [...]:
-                expected = row[name] if form == "dict" else row
-                np.testing.assert_array_equal(seen[name][index], expected)
-            if info:
-                assert infos["fault"][index] == info["fault"]
-                assert infos["fault_rate"][index] == info["fault_rate"]
-                faults += 1
-        assert envs.get_attr("variables") == tuple(env.variables for env in alone)
-        assert envs.get_attr("state") == tuple(env.state for env in alone)
-        ended = terminated | truncated
-        if ended.any():
-            envs.reset(options={"reset_mask": ended})
-            for index in np.flatnonzero(ended):
-                alone[index].reset()
+    for result in results_of_both(ours, theirs, [np.zeros((6, 1), np.float32)] * 25, seed=0):
+        faults += np.count_nonzero(result[4].get("_fault", False))
+        for name in ("variables", "state"):
+            assert ours.get_attr(name) == theirs.get_attr(name)
     assert faults >= 6
-    for env in (envs, *alone):
-        env.close()
+    ours.close()
+    theirs.close()
 
 
 class Replacing(Drawing):

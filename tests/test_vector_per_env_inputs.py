@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from gymnasium import spaces
+from vector_tools import make_pair, results_of_both
 
 import fmugym
 from fmugym import ConfigError
@@ -55,22 +56,13 @@ ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (4, len(FORMS), 2)).astype
 @pytest.mark.parametrize("forms", [FORMS, (None,) * 6, (np.float32,) * 6, (list,) * 6])
 def test_inputs_of_any_form_are_those_of_single_environments(forms):
     """An array that all environments return must not mix their inputs."""
-    count = len(forms)
-    envs = FMUVectorEnv(TwoTorques, count, hooks="per_env")
-    alone = [TwoTorques() for _ in forms]
-    envs.reset(seed=0)
-    envs.set_attr("form", list(forms))
-    for index, (env, form) in enumerate(zip(alone, forms, strict=True)):
-        env.reset(seed=index)
-        env.form = form
-    for actions in ACTIONS:
-        observations, _, _, _, infos = envs.step(actions)
-        steps = [env.step(action) for env, action in zip(alone, actions, strict=True)]
-        np.testing.assert_array_equal(observations, [step[0] for step in steps])
-        assert envs.get_attr("inputs") == tuple(env.inputs for env in alone)
-        np.testing.assert_array_equal(infos["first"], [env.inputs[0] for env in alone])
-    for env in (envs, *alone):
-        env.close()
+    ours, theirs = make_pair(TwoTorques, num_envs=len(forms), hooks="per_env")
+    for envs in (ours, theirs):
+        envs.set_attr("form", list(forms))
+    for _ in results_of_both(ours, theirs, list(ACTIONS)):
+        assert ours.get_attr("inputs") == theirs.get_attr("inputs")
+    ours.close()
+    theirs.close()
 
 
 @pytest.mark.parametrize("form", [None, np.float32, list])

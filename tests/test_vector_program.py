@@ -9,7 +9,7 @@ from vector_tools import (
     Drawing,
     require_equal,
     require_pair_equal,
-    require_same_infos,
+    results_of_both,
     sampled_actions,
 )
 
@@ -28,19 +28,11 @@ from fmugym.vector.views import some
 def require_same(cls, num_envs=40, steps=25, mode="next_step", ways=("compiled", "array")):
     """Step two vector environments with the same actions; return the ended episodes."""
     first, second = (FMUVectorEnv(cls, num_envs, hooks=way, autoreset_mode=mode) for way in ways)
-    with np.errstate(all="ignore"):
-        one, other = first.reset(seed=3), second.reset(seed=3)
-    require_equal(one[0], other[0])
     ended = 0
-    for actions in sampled_actions(first, steps):
-        one = first.step(actions)
-        with np.errstate(all="ignore"):  # hooks on arrays may warn
-            other = second.step(actions)
-        for a, b in zip(one[:4], other[:4], strict=True):
-            require_bits(a, b)
-        require_same_infos(one[4], other[4])
-        require_variables(first, second)
-        ended += int((one[2] | one[3]).sum())
+    with np.errstate(all="ignore"):  # hooks on arrays may warn
+        for result in results_of_both(first, second, steps, same=require_bits):
+            require_variables(first, second)
+            ended += int((result[2] | result[3]).sum())
     assert first.inside.engine.way == "compiled"
     first.close()
     second.close()

@@ -5,15 +5,25 @@ no use for them, but the caller may ask for them at any time. The reference are 
 in Python.
 """
 
+from functools import partial
+from itertools import islice
+
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
-from vector_tools import CART_POLE, Drawing, each_mode, each_way
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from vector_tools import (
+    CART_POLE,
+    Drawing,
+    each_mode,
+    each_way,
+    results_of_both,
+    sampled_actions,
+)
 
 from fmugym.vector import FMUVectorEnv
 
-COUNT, STEPS = 3, 5
+COUNT, STEPS = 3, 6
 NAMES = (
     *("action", "previous_action", "state", "previous_state"),
     *("inputs", "step_count", "done", "time"),
@@ -34,41 +44,30 @@ class Told(Drawing):
         return {name: getattr(self, name) for name in NAMES}
 
 
-def singles():
-    envs = [Told("python") for _ in range(COUNT)]
-    for index, env in enumerate(envs):
-        env.reset(seed=index)
-    return envs
+def pair(hooks, mode=AutoresetMode.NEXT_STEP, cls=Told):
+    """A vector environment, and single environments in Python."""
+    ours = FMUVectorEnv(cls, COUNT, hooks=hooks, autoreset_mode=mode)
+    return ours, SyncVectorEnv([partial(cls, "python")] * COUNT, autoreset_mode=mode)
 
 
-def advance(envs, ended, actions, mode):
-    """A step of single environments as vector environments do it; returns which have ended."""
-    for index, env in enumerate(envs):
-        if ended[index]:
-            env.reset()
-            ended[index] = False
-            if mode is AutoresetMode.NEXT_STEP:
-                continue
-        *_, terminated, truncated, _ = env.step(actions[index])
-        ended[index] = terminated or truncated
-        if ended[index] and mode is AutoresetMode.SAME_STEP:
-            env.reset()
-            ended[index] = False
+def close(envs):
+    for one in envs:
+        one.close()
 
 
 def plain(value):
     if isinstance(value, dict):
         return {name: plain(part) for name, part in value.items()}
-    return np.asarray(value).tolist()
+    return list(map(plain, value)) if isinstance(value, tuple) else np.asarray(value).tolist()
 
 
 ASKED = {
     "call": lambda envs: envs.call("told"),
-    "attributes": lambda envs: [
+    "attributes": lambda envs: tuple(
         dict(zip(NAMES, values, strict=True))
         for values in zip(*(envs.get_attr(name) for name in NAMES), strict=True)
-    ],
-    "method_taken_before": lambda envs: [told() for told in envs.get_attr("told")],
+    ),
+    "method_taken_before": lambda envs: tuple(told() for told in envs.get_attr("told")),
 }
 
 
@@ -77,42 +76,24 @@ ASKED = {
 @pytest.mark.parametrize("way", ASKED)
 @pytest.mark.parametrize("first", [1, 3])
 def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mode):
-    envs = FMUVectorEnv(Told, COUNT, hooks=hooks, autoreset_mode=mode)
-    alone, ended = singles(), [False] * COUNT
-    envs.reset(seed=0)
-    rng = np.random.default_rng(7)
-    for count in range(STEPS + 1):
+    envs = ours, theirs = pair(hooks, mode)
+    for count, _ in enumerate(results_of_both(*envs, STEPS, seed=0), 1):
         if count >= first:
-            expected = [plain(env.told()) for env in alone]
-            assert [plain(told) for told in ASKED[way](envs)] == expected, count
-        actions = rng.uniform(-0.01, 0.01, (COUNT, 1)).astype(np.float32)
-        if mode is AutoresetMode.DISABLED and any(ended):
-            envs.reset(options={"reset_mask": np.array(ended)})
-        advance(alone, ended, actions, mode)
-        envs.step(actions)
-    for env in (envs, *alone):
-        env.close()
+            assert plain(ASKED[way](ours)) == plain(theirs.call("told")), count
+    close(envs)
 
 
 @each_mode
-@pytest.mark.parametrize("hooks", ["array", "per_env", "auto"])
+@each_way
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_snapshots_hold_the_last_step(count, hooks, mode):
-    envs = FMUVectorEnv(Told, COUNT, hooks=hooks, autoreset_mode=mode)
-    alone, ended = singles(), [False] * COUNT
-    envs.reset(seed=0)
-    rng = np.random.default_rng(7)
-    for _ in range(count):
-        actions = rng.uniform(-0.01, 0.01, (COUNT, 1)).astype(np.float32)
-        advance(alone, ended, actions, mode)
-        envs.step(actions)
-    for index, env in enumerate(alone):
-        other = Told("python")
-        other.restore_state(envs.save_state(index))
-        assert plain(other.told()) == plain(env.told())
-        other.close()
-    for env in (envs, *alone):
-        env.close()
+    envs = ours, theirs = pair(hooks, mode)
+    list(islice(results_of_both(*envs, STEPS, seed=0), count))
+    for index, told in enumerate(theirs.call("told")):
+        with Told("python") as other:
+            other.restore_state(ours.save_state(index))
+            assert plain(other.told()) == plain(told)
+    close(envs)
 
 
 @each_way
@@ -123,23 +104,18 @@ def test_pictures_show_the_last_step(hooks):
     class Pictured(Told):
         metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (Gymnasium's own form)
 
-        def __init__(self):
-            super().__init__()
+        def __init__(self, hooks="auto"):
+            super().__init__(hooks)
             self.render_mode = "rgb_array"
 
         def render(self):
             seen.append(self.told())
 
-    envs = FMUVectorEnv(Pictured, COUNT, hooks=hooks)
-    alone, ended = singles(), [False] * COUNT
-    envs.reset(seed=0)
-    actions = np.full((COUNT, 1), 0.003, np.float32)
-    advance(alone, ended, actions, AutoresetMode.NEXT_STEP)
-    envs.step(actions)
-    envs.render()
-    assert [plain(told) for told in seen] == [plain(env.told()) for env in alone]
-    for env in (envs, *alone):
-        env.close()
+    envs = ours, theirs = pair(hooks, cls=Pictured)
+    list(results_of_both(*envs, 1))
+    ours.render()
+    assert plain(tuple(seen)) == plain(theirs.call("told"))
+    close(envs)
 
 
 @each_way
@@ -155,57 +131,34 @@ def test_values_set_by_methods_of_the_last_step(hooks):
         def _reward_policy(self):
             return self.bound * self.state[1]
 
-    envs = FMUVectorEnv(Bounded, COUNT, hooks=hooks)
-    alone = [Bounded("python") for _ in range(COUNT)]
-    envs.reset(seed=0)
-    actions = np.full((COUNT, 1), 0.003, np.float32)
-    rewards = []
-    for index, env in enumerate(alone):
-        env.reset(seed=index)
-        env.step(actions[index])
-        env.learn()
-        rewards.append(env.step(actions[index])[1])
-        env.close()
-    envs.step(actions)
-    envs.call("learn")
-    np.testing.assert_array_equal(envs.step(actions)[1], rewards)
-    envs.close()
+    both = pair(hooks, cls=Bounded)
+    for count, _ in enumerate(results_of_both(*both, 2)):
+        for envs in both if count == 0 else ():
+            envs.call("learn")
+    close(both)
 
 
 @each_way
 def test_integers_of_a_registered_environment(hooks):
-    envs = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
-    alone = [gym.make("fmugym/CartPole-v0", hooks="python").unwrapped for _ in range(2)]
-    envs.reset(seed=0)
-    for index, env in enumerate(alone):
-        env.reset(seed=index)
-    for actions in np.array([[0, 1], [1, 1], [1, 0]]):
-        envs.step(actions)
-        for env, action in zip(alone, actions, strict=True):
-            env.step(action)
+    ours = FMUVectorEnv(CART_POLE, 2, hooks=hooks)
+    theirs = SyncVectorEnv([lambda: gym.make("fmugym/CartPole-v0", hooks="python")] * 2)
+    list(results_of_both(ours, theirs, list(np.array([[0, 1], [1, 1], [1, 0]]))))
     for name in NAMES:
-        assert plain(envs.get_attr(name)) == [plain(getattr(env, name)) for env in alone], name
-    for env in (envs, *alone):
-        env.close()
+        assert plain(ours.get_attr(name)) == plain(theirs.get_attr(name)), name
+    close((ours, theirs))
 
 
 @each_way
 def test_a_recorded_series_tells_the_state_before(hooks):
-    envs = FMUVectorEnv(Told, COUNT, hooks=hooks)
-    envs.reset(seed=0)
-    actions = np.full((COUNT, 1), 0.003, np.float32)
-    envs.step(actions)
-
-    def function(env):
-        return [env.previous_state[0], env.previous_action[0]]
-
-    told = envs.inside.engine.evaluate(function, actions, np.arange(COUNT))
-    alone, ended = singles(), [False] * COUNT
-    advance(alone, ended, actions, AutoresetMode.NEXT_STEP)
-    expected = [[env.previous_state[0], env.previous_action[0]] for env in alone]
-    np.testing.assert_array_equal(told.T, np.array(expected, np.float64))
-    for env in (envs, *alone):
-        env.close()
+    envs = ours, theirs = pair(hooks)
+    actions = sampled_actions(ours, 1)
+    list(results_of_both(*envs, actions))
+    told = ours.inside.engine.evaluate(
+        lambda env: [env.previous_state[0], env.previous_action[0]], *actions, np.arange(COUNT)
+    )
+    for row, one in zip(told.T, theirs.call("told"), strict=True):
+        assert row.tolist() == [one["previous_state"][0], one["previous_action"][0]]
+    close(envs)
 
 
 def test_before_the_first_reset():

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import gc
+import pickle
 import weakref
 
 import gymnasium as gym
@@ -35,29 +36,35 @@ class Telling(Named):
         return {"angle": self.state[0]}
 
 
-TASKS = [CART_POLE, Named, Telling]
+each_task = pytest.mark.parametrize("task", [CART_POLE, Named, Telling])
+each_mode = pytest.mark.parametrize("mode", ["next_step", "same_step"])
 
 
-def make(task):
-    envs = FMUVectorEnv(task, NUM_ENVS, hooks="compiled")
+def make(task, mode="next_step"):
+    envs = FMUVectorEnv(task, NUM_ENVS, hooks="compiled", autoreset_mode=mode)
     envs.reset(seed=0)
     return envs
 
 
 def arrays_of(result):
-    """All arrays of a result, those of dicts, too."""
+    """All arrays of a result, those of dicts and those in arrays of objects, too."""
     for part in result:
-        yield from arrays_of(part.values()) if isinstance(part, dict) else (part,)
+        if isinstance(part, dict):
+            yield from arrays_of(part.values())
+        elif part is not None:
+            yield part
+            yield from arrays_of(part if part.dtype == object else ())
 
 
-def copies_of(result):
-    return [array.copy() for array in arrays_of(result)]
+def numbers_of(result):
+    return [array for array in arrays_of(result) if array.dtype != object]
 
 
-def played(task):
-    """What each step returns, copied at once."""
-    envs = make(task)
-    copies = [copies_of(envs.step(actions)) for actions in sampled_actions(envs, STEPS)]
+def played(task, mode="next_step"):
+    """The numbers that each step returns, copied at once."""
+    envs = make(task, mode)
+    results = map(envs.step, sampled_actions(envs, STEPS))
+    copies = [[array.copy() for array in numbers_of(result)] for result in results]
     envs.close()
     return copies
 
@@ -68,59 +75,62 @@ def require_same(first, second):
         np.testing.assert_array_equal(mine, other)
 
 
-def held_all(result, step):
-    return list(arrays_of(result))
-
-
-def held_in_turn(result, step):
+def held_in_turn(arrays, step):
     """One array of each step, so that only some of its arrays are free."""
-    arrays = list(arrays_of(result))
     return arrays[step % len(arrays) :][:1]
 
 
-def held_views(result, step):
-    return [array[...] for array in arrays_of(result)]
+def held_views(arrays, step):
+    return [array[...] for array in arrays]
 
 
-def held_buffers(result, step):
-    return [memoryview(array) for array in arrays_of(result)]
+def held_buffers(arrays, step):
+    return list(map(memoryview, arrays))
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("hold", [held_all, held_in_turn, held_views, held_buffers])
-def test_what_the_caller_holds_does_not_change(task, hold):
-    envs, kept = make(task), []
+@each_task
+@each_mode
+@pytest.mark.parametrize("hold", [held_in_turn, held_views, held_buffers])
+def test_what_the_caller_holds_does_not_change(task, mode, hold):
+    """Nor do whole results, as test_vector_infos.py shows."""
+    envs, kept = make(task, mode), []
     for step, actions in enumerate(sampled_actions(envs, STEPS)):
-        held = hold(envs.step(actions), step)
-        kept.append((held, [np.array(array) for array in held]))
+        held = hold(list(arrays_of(envs.step(actions))), step)
+        kept.append((held, contents(held)))
     envs.close()
-    for held, copies in kept:
-        require_same([np.asarray(array) for array in held], copies)
+    for held, then in kept:
+        assert contents(held) == then
+
+
+def contents(held):
+    return pickle.dumps(list(map(np.asarray, held)))
 
 
 def shrink(array):
     array.resize(1, refcheck=False)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@each_task
+@each_mode
 @pytest.mark.parametrize("change", [reshape, retype, protect, shrink, grow])
 @pytest.mark.filterwarnings("ignore:Setting the:DeprecationWarning")
-def test_what_the_caller_changes_in_place_does_not_come_back(task, change):
-    expected, envs = played(task), make(task)
+def test_what_the_caller_changes_in_place_does_not_come_back(task, mode, change):
+    expected, envs = played(task, mode), make(task, mode)
     for actions, wanted in zip(sampled_actions(envs, STEPS), expected, strict=True):
-        result = envs.step(actions)
-        require_same(arrays_of(result), wanted)
-        for array in arrays_of(result):
+        arrays = numbers_of(envs.step(actions))
+        require_same(arrays, wanted)
+        for array in arrays:
             assert array.flags.writeable
             assert array.flags.owndata
             change(array)
-        del array, result
+        del array, arrays
     envs.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_weak_references_end(task):
-    envs, references = make(task), []
+@each_task
+@each_mode
+def test_weak_references_end(task, mode):
+    envs, references = make(task, mode), []
     for actions in sampled_actions(envs, STEPS):
         result = envs.step(actions)
         assert all(weakref.getweakrefcount(array) == 0 for array in arrays_of(result))
@@ -154,7 +164,7 @@ def test_a_refused_step_and_an_error_leave_everything_in_order():
         for wrong in (np.full(NUM_ENVS, 7), np.zeros(NUM_ENVS + 1, np.int64), "abc"):
             with contextlib.suppress(ConfigError):
                 envs.step(wrong)
-        require_same(arrays_of(envs.step(actions)), wanted)
+        require_same(numbers_of(envs.step(actions)), wanted)
     envs.close()
 
 
@@ -163,43 +173,43 @@ ARRAYS = SEEN, REAL, FLAGS, FLAGS, FLAGS, DRAWN
 LATE = LateDict, UNFILLED, dict
 
 
+FITTING = {"kind": tuple, "seen": 0, "infos": (), "arrays": ARRAYS, "late": LATE}
+
+
 def test_results_that_fit_are_taken(monkeypatch):
-    require_refused((tuple, 0, (), ARRAYS, LATE), monkeypatch, refused=False)
+    require_refused(tuple(FITTING.values()), monkeypatch, refused=False)
 
 
 @pytest.mark.parametrize(
-    "results",
+    "changes",
     [
-        (tuple, 0, (), (), LATE),
-        (tuple, 0, (), ARRAYS[:-1], LATE),
-        (tuple, 0, (), ARRAYS[:3], LATE),
-        (tuple, 0, (), (((3, 5), np.float32), *ARRAYS[1:]), LATE),
-        (tuple, 0, (), (SEEN, ((3,), np.float32), *ARRAYS[2:]), LATE),
-        (tuple, 0, (), (*ARRAYS[:-2], ((4,), bool), DRAWN), LATE),
-        (tuple, 0, (), (*ARRAYS[:-1], ((5, 3), float)), LATE),
-        (tuple, (("a", 0), ("b", 1)), (), ARRAYS, LATE),
-        (dict, 0, (), ARRAYS, LATE),
-        (tuple, 0, (), 7, LATE),
-        (tuple, 9, (), ARRAYS, LATE),
-        (tuple, None, (), ARRAYS, LATE),
-        (tuple, 0, 0, ARRAYS, LATE),
-        (tuple, 0, (("a", 1),), ARRAYS, LATE),
-        (tuple, 0, (("a",),), ARRAYS, LATE),
-        (tuple, 0, ("ab",), ARRAYS, LATE),
-        (
-            tuple,
-            functools.reduce(lambda form, _: (("a", form),), range(999), 0),
-            (),
-            ARRAYS,
-            LATE,
-        ),
-        (tuple, 0, (), ARRAYS),
-        (tuple, 0, (), ARRAYS, LATE[:2]),
-        (tuple, 0, (), ARRAYS, dict),
+        {"arrays": ()},
+        {"arrays": ARRAYS[:-1]},
+        {"arrays": ARRAYS[:3]},
+        {"arrays": (((3, 5), np.float32), *ARRAYS[1:])},
+        {"arrays": (SEEN, ((3,), np.float32), *ARRAYS[2:])},
+        {"arrays": (*ARRAYS[:-2], ((4,), bool), DRAWN)},
+        {"arrays": (*ARRAYS[:-1], ((5, 3), float))},
+        {"arrays": 7},
+        {"seen": (("a", 0), ("b", 1))},
+        {"seen": 9},
+        {"seen": None},
+        {"seen": functools.reduce(lambda form, _: (("a", form),), range(999), 0)},
+        {"kind": dict},
+        {"infos": 0},
+        {"infos": (("a", 1),)},
+        {"infos": (("a",),)},
+        {"infos": ("ab",)},
+        {"late": LATE[:2]},
+        {"late": dict},
     ],
 )
-def test_results_that_do_not_fit_are_refused(results, monkeypatch):
-    require_refused(results, monkeypatch)
+def test_results_that_do_not_fit_are_refused(changes, monkeypatch):
+    require_refused(tuple((FITTING | changes).values()), monkeypatch)
+
+
+def test_results_that_are_incomplete_are_refused(monkeypatch):
+    require_refused(tuple(FITTING.values())[:-1], monkeypatch)
 
 
 def require_refused(results, monkeypatch, *, refused=True):

@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 from vector_tools import (
     Drawing,
     each_mode,
     each_way,
     make_pair,
     require_equal,
+    require_pair_equal,
     require_same_infos,
-    run_side_by_side,
+    require_same_starts,
+    results_of_both,
     sampled_actions,
 )
 
@@ -43,14 +44,15 @@ OPTIONS = (
 def test_options_take_the_streams_back(kind, hooks):
     keywords = {"model_parameters": PARAMETERS[kind], "episode_variables": VARIABLES}
     ours, theirs = make_pair(Drawing, hooks=hooks, **keywords)
-    run_side_by_side(ours, theirs, AutoresetMode.NEXT_STEP, 5)
+    list(results_of_both(ours, theirs, 5))
     for options in OPTIONS * 2:
         mask = np.array([True, False, True, True])
         for masked in ({}, {"reset_mask": mask}):
             given = None if options is None and not masked else {**(options or {}), **masked}
-            first, second = ours.reset(options=given), theirs.reset(options=given and dict(given))
-            require_equal(first[0], second[0])
-            require_same_infos(first[1], second[1])
+            require_same_starts(
+                ours.reset(options=given), theirs.reset(options=given and dict(given))
+            )
+            assert not masked or given["reset_mask"].tolist() == [True, False, True, True]
         for actions in sampled_actions(ours, 9):  # two resets each
             first, second = ours.step(actions), theirs.step(actions)
             require_equal(first[0], second[0])
@@ -138,9 +140,10 @@ def test_a_distribution_for_each_element(hooks, mode):
     """Drawn, reset, told and seen as in single environments, whatever way hooks are called."""
     way = "compiled" if hooks == "auto" else hooks
     ours, theirs = make_pair(Targets, mode, num_envs=5, hooks=way)
-    assert run_side_by_side(ours, theirs, mode, 20) >= 20
-    for first, second in zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True):
-        require_equal(dict(first), dict(second))
+    for _ in results_of_both(ours, theirs, 20):
+        variables = zip(ours.get_attr("variables"), theirs.get_attr("variables"), strict=True)
+        for first, second in variables:
+            require_equal(dict(first), dict(second))
     ours.close()
     theirs.close()
 
@@ -149,10 +152,8 @@ def test_a_distribution_for_each_element(hooks, mode):
 @each_way
 def test_elements_that_only_python_can_draw(hooks, mode):
     variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
-    ours, theirs = make_pair(Targets, mode, num_envs=3, hooks=hooks, variables=variables)
-    assert run_side_by_side(ours, theirs, mode, 12) >= 6
-    ours.close()
-    theirs.close()
+    options = {"num_envs": 3, "hooks": hooks, "variables": variables}
+    assert require_pair_equal(Targets, 12, mode, **options) >= 6
 
 
 def test_elements_are_drawn_in_the_documented_order():
@@ -181,10 +182,7 @@ def test_options_and_arrays_with_distributions(hooks):
     ours, theirs = make_pair(Targets, hooks=hooks)
     options = {"model_parameters": {"b": Uniform(0.0, 1e-5)}}
     for given in (options, {}):
-        first = ours.reset(seed=3, options=dict(given))
-        second = theirs.reset(seed=3, options=dict(given))
-        require_equal(first[0], second[0])
-        require_same_infos(first[1], second[1])
+        require_same_starts(*(envs.reset(seed=3, options=dict(given)) for envs in (ours, theirs)))
         for actions in sampled_actions(ours, 5):
             first, second = ours.step(actions), theirs.step(actions)
             require_equal(first[1], second[1])

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from test_vector_program import Task, require_same
-from vector_tools import Drawing
+from vector_tools import Drawing, run_side_by_side
 
 from fmugym.task.construction import prepare_hooks
 from fmugym.vector import FMUVectorEnv
@@ -184,7 +184,7 @@ def test_snippets_are_compiled(prototype, body):
     assert bool(compiled(prototype, body).tolerance) <= bool(uses_functions)
 
 
-def test_a_product_is_the_sum_in_the_order_of_its_terms(prototype):
+def test_a_product_is_the_sum_in_the_order_of_its_terms():
     """So it gives the same on each machine, whatever linear algebra library numpy has."""
 
     class Product(Drawing):
@@ -195,15 +195,7 @@ def test_a_product_is_the_sum_in_the_order_of_its_terms(prototype):
         def _reward_policy(self):
             return GAINS[0] * self.state[0] + GAINS[1] * self.state[1]
 
-    envs = [FMUVectorEnv(cls, 140, hooks="compiled") for cls in (Product, Sum)]
-    for one in envs:
-        one.reset(seed=0)
-    actions = np.zeros((140, 1), np.float32)
-    for _ in range(8):
-        first, second = (one.step(actions)[1] for one in envs)
-        assert first.tolist() == second.tolist()
-    for one in envs:
-        one.close()
+    run_side_by_side(*(FMUVectorEnv(cls, 140, hooks="compiled") for cls in (Product, Sum)), 8)
 
 
 NEAR = {
@@ -288,6 +280,8 @@ def test_a_table_is_the_array_that_it_stands_for():
         ("COUNTS[:, self.step_count % 3][1]", "cannot be followed"),
         ("self.state[self.step_count % 2]", "a table that is not constant"),
         ("np.maximum.reduce([self.state[0], self.state[1]])", "numpy.array around a list"),
+        ("np.sum(np.ones((600, 2)) @ self.state, axis=0)", "it multiplies large matrices"),
+        ("np.linalg.norm(self.state)", "it uses numpy.linalg.norm without one axis"),
     ],
 )
 def test_what_is_refused_says_why(prototype, body, reason):

@@ -2,12 +2,12 @@
 
 import signal
 import threading
-import time
 from contextlib import closing
 
 import numpy as np
 import pytest
-from test_threads import MANY, interrupt, run_together
+from test_threads import MANY, call_at_once, interrupt, run_together
+from vector_tools import results_of_both
 
 from fmugym import SimulationError, linearize_along
 from fmugym.envs import CartPoleEnv
@@ -73,27 +73,12 @@ def test_another_thread_is_refused_in_each_method(hooks):
 
 @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_threads_at_once_leave_it_whole(hooks):
-    """They get results or a refusal; afterwards, everything is as it was."""
     envs = FMUVectorEnv(CartPoleEnv, 3, hooks=hooks)
     envs.reset(seed=0)
-    snapshot, stop, wrong = envs.save_state(), time.monotonic() + 0.5, []
-    calls = methods(envs, snapshot)
+    calls = methods(envs, envs.save_state())
     del calls["step_async"], calls["linearize_along"]
     calls["call"] = lambda: envs.call("state")
-
-    def play(seed):
-        rng = np.random.default_rng(seed)
-        while time.monotonic() < stop:
-            try:
-                calls[str(rng.choice(list(calls)))]()
-            except SimulationError:
-                continue
-            except BaseException as error:
-                wrong.append(error)
-                return
-
-    run_together([lambda seed=seed: play(seed) for seed in range(3)])
-    assert wrong == []
+    call_at_once(list(calls.values()))
     require_whole(envs)
 
 
@@ -103,11 +88,7 @@ def require_whole(envs):
     run_together([lambda: played.append(envs.set_attr("force_mag", 10.0))])
     assert played == [None]
     with closing(FMUVectorEnv(CartPoleEnv, 3)) as other:
-        for one in (envs, other):
-            one.reset(seed=3)
-        for action in (0, 1, 1, 0):
-            first, second = (one.step(ACTIONS + action) for one in (envs, other))
-            np.testing.assert_array_equal(first.observations, second.observations)
+        list(results_of_both(envs, other, [ACTIONS + action for action in (0, 1, 1, 0)]))
         assert envs.get_attr("state") == other.get_attr("state")
     envs.close()
 

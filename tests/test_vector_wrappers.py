@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from vector_tools import IDS, Drawing, each_way, require_equal, sampled_actions
 
-import fmugym
 from fmugym import SimulationError, Uniform
 from fmugym.vector import FMUVectorEnv
 
@@ -113,13 +112,3 @@ def test_specs(env_id):
     assert repr(vector.unwrapped).startswith(f"<FMUVectorEnv of 2: <{env_id[7:-3]}Env of ")
     vector.close()
     again.close()
-
-
-def test_registered_classes_of_ones_own():
-    fmugym.register("tests/Drawing-v0", Drawing)
-    vector = gym.make_vec("tests/Drawing-v0", num_envs=2, time_step=0.05)
-    vector.reset(seed=0)
-    vector.step(np.zeros((2, 1), np.float32))
-    assert vector.get_attr("time") == (0.05, 0.05)
-    vector.close()
-    del gym.registry["tests/Drawing-v0"]

@@ -37,7 +37,6 @@ class TestInWine:
             types.test_numbers_of_every_type_come_out_as_they_went_in,
             types.test_enumerations_are_discrete,
             arrays.test_some_elements_are_inputs,
-            types.test_strings_are_set,
         ],
     )
     def test_values(self, feedthrough, version, test):

@@ -100,6 +100,13 @@ def _describe_state_space(interfaces, fixed, derivatives):
     )
 
 
+@pytest.fixture(name="feedthrough", scope="module")
+def fixture_feedthrough(tmp_path_factory):
+    """The FMU of each version of FMI whose outputs are its inputs."""
+    folder = tmp_path_factory.mktemp("feedthrough")
+    return {v: feedthrough_fmu(folder / f"F{v}.fmu", v) for v in VERSIONS}
+
+
 def feedthrough_fmu(path, version):
     """Write an FMU of ``feedthrough.c``.
 

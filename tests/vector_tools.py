@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import fmugym
 from fmugym import Uniform
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.engines.batch import BatchEngine
 
 IDS = (
     "fmugym/CartPole-v0",
@@ -19,10 +20,9 @@ IDS = (
     "fmugym/ModelicaCartPole-v0",
     "fmugym/CloudPendulum-v0",
 )
-MODES = tuple(AutoresetMode)
 ABSURD = 1e308
 each_way = pytest.mark.parametrize("hooks", ["array", "per_env", "auto"])
-each_mode = pytest.mark.parametrize("mode", MODES, ids=lambda mode: mode.name)
+each_mode = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
 CART_POLE = fmugym.envs.CartPoleEnv
 
 
@@ -62,28 +62,54 @@ def sampled_actions(env, count, seed=0):
     return [env.action_space.sample() for _ in range(count)]
 
 
-def run_side_by_side(ours, theirs, mode, steps, seed=3, rtol=0.0, method=None):
-    """Step both with the same actions; returns how many episodes have ended."""
-    first, second = ours.reset(seed=seed), theirs.reset(seed=seed)
+def results_of_both(
+    ours, theirs, steps=40, seed=3, rtol=0.0, same=require_equal, same_infos=require_same_infos
+):
+    """Reset both and step them with the same actions, after which they must tell the same.
+
+    Episodes that do not start by themselves are started again.
+
+    Args:
+        steps: How many steps, or the actions of each.
+        rtol: How far rewards may differ.
+        same: Compares observations, rewards and flags.
+        same_infos: Compares the infos of steps.
+
+    Yields:
+        The result of each step.
+    """
+    require_same_starts(ours.reset(seed=seed), theirs.reset(seed=seed))
+    for actions in sampled_actions(ours, steps) if isinstance(steps, int) else steps:
+        a, b = ours.step(actions), theirs.step(actions)
+        same(a[0], b[0])
+        require_equal(a[1], b[1], rtol) if rtol else same(a[1], b[1])
+        same(a[2], b[2])
+        same(a[3], b[3])
+        same_infos(a[4], b[4])
+        yield a
+        ended = a[2] | a[3]
+        if ours.metadata["autoreset_mode"] is AutoresetMode.DISABLED and ended.any():
+            starts = (envs.reset(options={"reset_mask": ended.copy()}) for envs in (ours, theirs))
+            require_same_starts(*starts)
+
+
+def require_same_starts(first, second):
+    """The same observations and infos of two resets."""
     require_equal(first[0], second[0])
     require_same_infos(first[1], second[1])
+
+
+def run_side_by_side(ours, theirs, steps=60, method=None, **options):
+    """Compare all results of both and close them; returns how many episodes have ended.
+
+    A method is called after each step.
+    """
     ends = 0
-    for actions in sampled_actions(ours, steps):
-        a, b = ours.step(actions), theirs.step(actions)
-        require_equal(a[0], b[0])
-        require_equal(a[1], b[1], rtol)
-        require_equal(a[2], b[2])
-        require_equal(a[3], b[3])
-        require_same_infos(a[4], b[4])
-        if method is not None:
-            require_equal(ours.call(method), theirs.call(method))
-        ended = a[2] | a[3]
-        ends += int(ended.sum())
-        if mode is AutoresetMode.DISABLED and ended.any():
-            first = ours.reset(options={"reset_mask": ended})
-            second = theirs.reset(options={"reset_mask": ended.copy()})
-            require_equal(first[0], second[0])
-            require_same_infos(first[1], second[1])
+    with contextlib.closing(ours), contextlib.closing(theirs):
+        for result in results_of_both(ours, theirs, steps, **options):
+            ends += int((result[2] | result[3]).sum())
+            if method is not None:
+                require_equal(ours.call(method), theirs.call(method))
     return ends
 
 
@@ -94,11 +120,7 @@ def make_pair(cls, mode=AutoresetMode.NEXT_STEP, num_envs=4, hooks="array", **kw
 
 
 def require_pair_equal(cls, steps=60, mode=AutoresetMode.NEXT_STEP, rtol=0.0, **keywords):
-    ours, theirs = make_pair(cls, mode, **keywords)
-    ends = run_side_by_side(ours, theirs, mode, steps, rtol=rtol)
-    ours.close()
-    theirs.close()
-    return ends
+    return run_side_by_side(*make_pair(cls, mode, **keywords), steps, rtol=rtol)
 
 
 def require_same_alone(make, steps, mode="next_step", method=None, **options):
@@ -111,8 +133,7 @@ def require_same_alone(make, steps, mode="next_step", method=None, **options):
     if options.get("hooks") == "compiled":
         assert ours.inside.engine._task.left == {}
     theirs = SyncVectorEnv([make] * 3, autoreset_mode=mode)
-    with contextlib.closing(ours), contextlib.closing(theirs):
-        return run_side_by_side(ours, theirs, mode, steps, method=method)
+    return run_side_by_side(ours, theirs, steps, method)
 
 
 class Drawing(fmugym.FMUEnv):
@@ -306,6 +327,20 @@ def handler():
     before = signal.signal(signal.SIGTERM, ring)
     yield
     signal.signal(signal.SIGTERM, before)
+
+
+@pytest.fixture(name="outside")
+def fixture_outside(monkeypatch):
+    """The episodes that Python has started, and not the pass of the native pool."""
+    calls = []
+    begin = BatchEngine._begin
+
+    def counted(self, *args):
+        calls.append(args)
+        return begin(self, *args)
+
+    monkeypatch.setattr(BatchEngine, "_begin", counted)
+    return calls
 
 
 # What callers may do to an array of results in place.

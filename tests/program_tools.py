@@ -1,0 +1,39 @@
+"""Programs and draws as the C extension gets them, written by hand."""
+
+import numpy as np
+
+from fmugym import _native
+from fmugym.pool.form import form_of_draws
+from fmugym.vector.hooks.program import CONSTANT, OPERATIONS
+
+DISCRETE = {
+    "shape": (),
+    "letter": "q",
+    "size": 8,
+    "check": 1,
+    "lowest": 0,
+    "highest": 1,
+    "current": None,
+    "previous": None,
+    "none": np.zeros(1, np.int64),
+}
+"""Actions that are 0 or 1."""
+
+
+def code(*rows):
+    """Instructions: operation, extra, the register to write, operands."""
+    numbered = [[OPERATIONS.index(name), *rest, *[0] * (5 - len(rest))] for name, *rest in rows]
+    return np.array(numbered, np.uint16).tobytes()
+
+
+def constants(*values):
+    """The first registers keep these values."""
+    rows = [(np.float64(value).view("u8"), register, 8, 0) for register, value in enumerate(values)]
+    return np.array(rows, CONSTANT).tobytes()
+
+
+def uniform_draws(*rows):
+    """Uniform numbers from [0, 1), one for each row of the start values."""
+    kind = _native.distributions().index("uniform")
+    table = np.array([[kind, row, 0, 2] for row in rows], np.int64).reshape(-1, 4)
+    return _native.Draws(form_of_draws(table, [0.0, 1.0]), 0)
