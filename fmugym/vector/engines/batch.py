@@ -546,9 +546,9 @@ class BatchEngine(Engine):
         play, checked = self._play, self._checked_before(actions, resting)
         self.has_moved = True
         self.ended[:] = resting
-        self._pool.statuses[resting] = 0
         play.before(checked)
         self._pool.step(None, resting)
+        self._pool.statuses[resting] = 0  # a fault was told when it came
         result: StepResult
         result, troubled, *_ = play.after(checked)
         if troubled or self._left_after:
