@@ -8,7 +8,7 @@ A case damages one of these:
   taken or refused with a ``ValueError``.
 * The requests to a worker. The worker answers, or it ends by itself without a fault.
 * The answers of a worker. Calls raise nothing but errors of the family, and a reset makes the pool
-  whole again.
+  whole again, unless a worker has been given up after many deaths in a row.
 
 See ``fuzz_driver.py``.
 """
@@ -328,7 +328,9 @@ def conversation(direction, noise, rng):
             require(not any(map(FAULT.search, reasons)), f"a worker has died: {reasons}")
             for _ in range(2):
                 reset(rng, pool, kept)
-            require(not pool.statuses.any(), f"lost for good: {reasons}")
+            failures = map(pool.failure, np.flatnonzero(pool.statuses).tolist())
+            lost = [one for one in failures if "given up after 5 deaths in a row" not in one]
+            require(not lost, f"lost for good: {lost}")
             if refused is not None:
                 raise refused
 
