@@ -10,6 +10,11 @@ from fmugym import vector
 
 HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.env", "fmugym.envs")
 
+OPTIONAL = (
+    *("lab", "identification", "series", "search", "systems.ssp", "sb3", "torchrl", "rllib"),
+    *("pettingzoo", "export", "logs", "minari", "episodes", "repair", "training", "tools"),
+)
+
 
 def run(program):
     """The output of a program in a new interpreter, as words."""
@@ -28,6 +33,26 @@ def test_a_class_brings_neither_vector_environments_nor_pictures():
     imported = set(run(program))
     assert "fmugym.env" in imported
     assert not {"pygame", "fmugym.vector.env", "fmugym.lab"} & imported
+
+
+def test_environments_work_without_optional_rooms():
+    program = f"""
+import sys
+for room in {OPTIONAL}:
+    sys.modules["fmugym." + room] = None  # as if it had not been installed
+import gymnasium, fmugym
+fmu = {{"bundled": "Pendulum"}}
+task = {{"fmu": fmu, "time_step": "20ms", "agent": {{"actions": ["tau"], "observations": ["q"]}}}}
+task["variables"] = {{"tau": {{"min": -1, "max": 1}}}}
+task["reward"] = "-q * q"
+make, make_vec = gymnasium.make, gymnasium.make_vec
+for env in (make("fmugym/CartPole-v0"), fmugym.load(task), make_vec("fmugym/Pendulum-v0", 2)):
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    env.close()
+print(*(name for name in sys.modules if name.startswith("fmugym.envs")))
+"""
+    assert "fmugym.envs" in run(program)
 
 
 def test_the_environments_are_registered():
