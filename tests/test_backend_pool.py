@@ -14,8 +14,9 @@ from gymnasium.wrappers import RecordVideo
 from vector_tools import run_side_by_side
 
 import fmugym
-from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, Paced, SimulationError, Status
-from fmugym.pool import BackendPool, PoolSpec
+from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
+from fmugym.fmi import Status
+from fmugym.pool import BackendPool, Paced, PoolSpec
 from fmugym.pool.backend import pool as backend_module
 from fmugym.pool.backend.clock import ManualClock
 from fmugym.pool.bundle import Bundle

@@ -35,10 +35,7 @@ def storeys_on(line):
 
 
 STOREYS, CORE = picture()
-DOORS = {
-    "fmugym": "fmugym.training.agents",
-    "fmugym.systems.system": "fmugym.systems.ssp.reading",
-}
+DOORS = {"fmugym.systems.system": "fmugym.systems.ssp.reading"}
 """Where the core opens an optional room: ``FMUSystem.read``, of archives that need it."""
 
 

@@ -27,7 +27,7 @@ from system_tools import (
 
 import fmugym
 from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import ResetMethod

@@ -12,7 +12,7 @@ from system_tools import (
     system,
 )
 
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.systems.plan import Evaluation, Group, Link, Loop, SystemPlan
 
 NAMES = ("a", "b", "c")

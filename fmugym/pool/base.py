@@ -79,7 +79,7 @@ class Pool(ABC):
     The pool returns the same two arrays for outputs and statuses each time; the next call
     overwrites them.
 
-    A status is a ``fmugym.fmi.status.Status``. A failure of an FMU is never raised, because it
+    A status is a ``fmugym.fmi.Status``. A failure of an FMU is never raised, because it
     concerns one instance only. Its status shows the failure, and ``failure`` gives the reason.
     Its outputs stay as they were before the call, and the next reset repairs or replaces the
     instance. The same holds for an instance whose inputs are not finite: it is not stepped.
