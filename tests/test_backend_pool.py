@@ -17,8 +17,8 @@ import fmugym
 from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
 from fmugym.fmi import Status
 from fmugym.pool import BackendPool, Paced, PoolSpec
-from fmugym.pool.backend import pool as backend_module
-from fmugym.pool.backend.clock import ManualClock
+from fmugym.pool.backend import backend_pool as backend_module
+from fmugym.pool.backend.clocks import ManualClock
 from fmugym.pool.bundle import Bundle
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")

@@ -6,7 +6,7 @@ import time
 import pytest
 
 from fmugym import ConfigError
-from fmugym.pool.backend.clock import ManualClock, RealClock
+from fmugym.pool.backend.clocks import ManualClock, RealClock
 
 
 class TestRealClock:

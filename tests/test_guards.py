@@ -16,7 +16,7 @@ from pool_tools import KINDS, open_pool, reset
 from fmugym import FMU, ConfigError, SimulationError
 from fmugym.config import EnvConfig
 from fmugym.fmi import Status
-from fmugym.pool.memory import grown_bytes
+from fmugym.pool.process_memory import grown_bytes
 from fmugym.vector import FMUVectorEnv
 
 MB = 2**20

@@ -2,6 +2,7 @@
 
 import ast
 import re
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def storeys_on(line):
 
 
 STOREYS, CORE = picture()
-DOORS = {"fmugym.systems.system": "fmugym.systems.ssp.reading"}
+DOORS = {"fmugym.systems.system": "fmugym.systems.ssp.archives"}
 """Where the core opens an optional room: ``FMUSystem.read``, of archives that need it."""
 
 
@@ -101,6 +102,18 @@ def test_the_core_opens_optional_rooms_in_functions_only():
         optional = [n for n in named & MODULES.keys() | at_import if room_of(n) not in CORE]
         found += [f"{module}: {name}" for name in optional]
     assert found == []
+
+
+SHARED = {
+    *("actions", "base", "env", "inputs", "inside", "opening"),
+    *("results", "rollouts", "saving", "tuning"),
+}
+"""Names of files that still occur in two or three rooms."""
+
+
+def test_the_name_of_a_file_tells_it_from_all_others():
+    often = Counter(path.stem for path in MODULES.values())
+    assert {name for name, count in often.items() if count > 1} == {"__init__", *SHARED}
 
 
 def test_no_module_imports_itself_by_a_detour():

@@ -19,9 +19,9 @@ from fmugym.pool.patience import speaks_of_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.tools.cli import main
 from fmugym.trial import rehearsal
-from fmugym.trial.episodes import Starts
 from fmugym.trial.known import known_verdict
 from fmugym.trial.subject import Subject
+from fmugym.trial.trial_episodes import Starts
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 

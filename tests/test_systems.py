@@ -31,8 +31,8 @@ from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import (
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import (
     MASTERS,
     Component,
     Connector,

@@ -13,7 +13,7 @@ from system_tools import (
 )
 
 from fmugym.fmi import Status
-from fmugym.systems.plan import Evaluation, Group, Link, Loop, SystemPlan
+from fmugym.systems.system_plan import Evaluation, Group, Link, Loop, SystemPlan
 
 NAMES = ("a", "b", "c")
 COUNT = 150

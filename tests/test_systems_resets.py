@@ -19,7 +19,7 @@ from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
 from fmugym.pool.rungs import find_rungs
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.system_fmu import SystemFMU
 from fmugym.tools import cli
 from fmugym.trial.trial import examine
 

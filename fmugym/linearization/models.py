@@ -23,7 +23,7 @@ from fmugym.pool.local import local_pool
 from fmugym.pool.patience import licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 from fmugym.task.starting import checked_value, start_values
 
 __all__ = ["LinearModel", "linearize"]

@@ -31,10 +31,10 @@ from fmugym.pool.spec import (
     ResetMethod,
     is_start_time,
 )
-from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.layout import Layout, PartLayout, array_key
-from fmugym.systems.plan import Loop
-from fmugym.wine.loader import windows_path, windows_uri
+from fmugym.systems.slots import Layout, PartLayout, array_key
+from fmugym.systems.system_description import PartVariable, SystemDescription
+from fmugym.systems.system_plan import Loop
+from fmugym.wine.installation import windows_path, windows_uri
 
 __all__ = [
     "START_TIME_TYPE",

@@ -7,7 +7,7 @@ import logging
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.attendant import Attendant
 from fmugym.pool.patience import licence_errors
-from fmugym.pool.saving import SavingPool
+from fmugym.pool.saving_pool import SavingPool
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["local_pool"]

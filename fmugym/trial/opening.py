@@ -9,22 +9,22 @@ from typing import Any
 
 from fmugym.archive.fmu import FMU
 from fmugym.pool.attendant import Attendant
-from fmugym.pool.backend.choice import pool_of_backend
+from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.local import local_pool
 from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.saving import SavingPool, offered_method
+from fmugym.pool.saving_pool import SavingPool, offered_method
 from fmugym.pool.seats import take
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes
-from fmugym.trial.episodes import Starts
 from fmugym.trial.known import is_exempt, known_resuming
 from fmugym.trial.plan import Plan, is_alone
 from fmugym.trial.resuming import method_that_works
 from fmugym.trial.trial import compare, examine
+from fmugym.trial.trial_episodes import Starts
 from fmugym.trial.verdict import Grade, Verdict
 
 __all__ = ["make_pool"]

@@ -22,11 +22,11 @@ from fmugym.pool.process.supervisor import WorkerError
 from fmugym.pool.rungs import find_rungs, offers_of
 from fmugym.pool.seats import taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.episodes import Starts, start
 from fmugym.trial.known import content_key, recall, remember, verdict_key, with_harm
 from fmugym.trial.neighbours import need_in_turn, need_of_several
 from fmugym.trial.rehearsal import Rehearsal
 from fmugym.trial.subject import CLOSING, STEP, DeathError, Subject
+from fmugym.trial.trial_episodes import Starts, start
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 __all__ = ["compare", "examine"]

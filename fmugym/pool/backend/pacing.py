@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.checks import number_of
 from fmugym.errors import ConfigError
-from fmugym.pool.backend.clock import Clock, RealClock
+from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = ["Paced", "Schedule"]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
-from fmugym.pool.backend.clock import Clock
+from fmugym.pool.backend.clocks import Clock
 
 __all__ = ["Here", "Idle", "Worker", "ask_all"]
 

@@ -55,7 +55,7 @@ from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
-from fmugym.pool.saving import SavingPool
+from fmugym.pool.saving_pool import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 

@@ -18,7 +18,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.backend.clock import Clock
+from fmugym.pool.backend.clocks import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
