@@ -664,7 +664,7 @@ class TestPacing:
         assert rig.calls == ["reset", "stop"]
         env.close()
 
-    def test_a_negative_patience(self):
+    def test_a_negative_time_until_a_hold(self):
         with pytest.raises(ConfigError, match="hold_after must be positive"):
             Paced(Held(), hold_after=0.0)
 

@@ -101,8 +101,8 @@ class BackendPool(CountedPool):
         paced, name = self._paced, f"backend-{index}"
         if paced is None:
             return Worker(name)
-        patience = paced.patience(self._spec.time_step)
-        return Worker(name, paced.clock, Idle(rig.hold, patience))
+        hold_after = paced.time_until_hold(self._spec.time_step)
+        return Worker(name, paced.clock, Idle(rig.hold, hold_after))
 
     def prepare_play(self, *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""
