@@ -24,7 +24,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.patience import failed_reset
+from fmugym.pool.licences import failed_reset
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone

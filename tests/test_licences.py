@@ -15,7 +15,7 @@ from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 import fmugym
 from fmugym.config import EnvConfig
 from fmugym.errors import LicenceError
-from fmugym.pool.patience import speaks_of_licence
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.tools.cli import main
 from fmugym.trial import rehearsal

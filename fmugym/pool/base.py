@@ -237,8 +237,8 @@ class Pool(ABC):
         return ResetMethod.RESET
 
     @property
-    def is_attended(self) -> bool:
-        """Whether something goes with ``reset``, so that no other call should start episodes."""
+    def retries_resets(self) -> bool:
+        """Whether ``reset`` may be tried again, so that no other call should start episodes."""
         return False
 
     @property

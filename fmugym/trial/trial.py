@@ -17,7 +17,7 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
-from fmugym.pool.patience import speaks_of_licence
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.supervisor import WorkerError
 from fmugym.pool.rungs import find_rungs, offers_of
 from fmugym.pool.seats import taking
