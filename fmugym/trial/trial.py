@@ -17,9 +17,9 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
+from fmugym.pool.component_resets import find_component_resets, offers_of
 from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.supervisor import WorkerError
-from fmugym.pool.rungs import find_rungs, offers_of
 from fmugym.pool.seats import taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.trial.known import content_key, recall, remember, verdict_key, with_harm
@@ -225,4 +225,6 @@ def _components(verdict: Verdict, rehearsal: Rehearsal) -> tuple[ResetMethod, ..
     if not tried or rehearsal.is_frugal or not parts:
         return ()
     offers = [offers_of(part, reloads=subject.can_copy_libraries) for part in parts]
-    return find_rungs(offers, base, lambda found: rehearsal.grade(base, found) is Grade.BITWISE)
+    return find_component_resets(
+        offers, base, lambda found: rehearsal.grade(base, found) is Grade.BITWISE
+    )
