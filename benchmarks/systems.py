@@ -21,8 +21,8 @@ from tables import Table, rate, times
 from fmugym import FMU, bundled_fmu
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.local import local_pool
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
 __all__ = ["tables"]
 

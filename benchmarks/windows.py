@@ -17,7 +17,7 @@ from tables import Table, duration
 
 import fmugym
 from fmugym.vector.making import make_with_pool
-from fmugym.wine.loader import can_run_windows, obstacle_to_wine
+from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
 __all__ = ["tables"]
 

@@ -2,7 +2,7 @@
 
     python examples/ilqr_pendulum.py
 
-Each iteration linearizes the trajectory by one call of `fmugym.linearize_along`. It then solves a
+Each iteration linearizes the trajectory by one call of `linearize_along`. It then solves a
 linear-quadratic problem backwards in time, and tries the new torques forwards with several lengths
 of step, all in one rollout (Y. Tassa, T. Erez, E. Todorov, "Synthesis and stabilization of complex
 behaviors through online trajectory optimization", IROS 2012). The result is a plan and a feedback
@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from mpc_pendulum import PERIOD, PLANT, TORQUE, Array, SwingUp
 
 import fmugym
+from fmugym.linearization import linearize_along
 
 HORIZON = 80  # steps of 50 ms
 EFFORT = 1.0  # the weight of the torque squared
@@ -87,10 +88,10 @@ def optimize(iterations: int = 80, seed: int = 0) -> Plan:
     envs.reset(seed=0)
     here = envs.save_state(0)
     torques = np.random.default_rng(seed).normal(0, 0.1, (HORIZON, 1))
-    x = fmugym.linearize_along(envs, here, torques).x
+    x = linearize_along(envs, here, torques).x
     plan = Plan(x, torques, np.zeros((HORIZON, 1, 2)), [float(cost(x, torques))])
     for _ in range(iterations):
-        along = fmugym.linearize_along(envs, here, plan.torques)
+        along = linearize_along(envs, here, plan.torques)
         changes, gains = backward(along, plan.torques)
         states, tried = forward(envs, here, plan, changes, gains)
         costs = cost(states, tried)

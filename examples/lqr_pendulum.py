@@ -2,7 +2,7 @@
 
     python examples/lqr_pendulum.py
 
-`fmugym.linearize` asks the FMU for the linear model of the upright position. The regulator that is
+`linearize` asks the FMU for the linear model of the upright position. The regulator that is
 optimal for this model (LQR) is four lines of `fmugym.baselines`. It drives the nonlinear FMU from
 six angles. Small ones follow the prediction of the linear model. Beyond 23.6 degrees, the largest
 torque of 2 N m is weaker than the weight, and the pendulum falls.
@@ -20,6 +20,7 @@ from mpc_pendulum import PERIOD, PLANT, TORQUE, Array, SwingUp
 
 import fmugym
 from fmugym.baselines import LQR
+from fmugym.linearization import linearize, linearize_along
 
 ANGLES = (5.0, 10.0, 15.0, 20.0, 22.0, 24.0)  # where it begins, in degrees from upright
 WEIGHTS = (4.0, 0.1)  # of angle and velocity; the reward of SwingUp has them, too
@@ -29,7 +30,7 @@ EFFORT = 0.1  # the weight of the torque
 def regulator(envs: fmugym.FMUVectorEnv) -> LQR:
     """The regulator for the upright position, bound to environments."""
     fmu = fmugym.bundled_fmu("Pendulum")
-    model = fmugym.linearize(fmu, at=PLANT | {"q_0": np.pi, "q_dot_0": 0.0})
+    model = linearize(fmu, at=PLANT | {"q_0": np.pi, "q_dot_0": 0.0})
     return LQR(model, WEIGHTS, [EFFORT]).bind(envs)
 
 
@@ -62,7 +63,7 @@ def predicted(gain: Array, angles: Array, steps: int) -> Array:
     """The angles of the linear model with the regulator, in degrees."""
     envs = fmugym.FMUVectorEnv(SwingUp, 1)
     start(envs, np.zeros(1))
-    model = fmugym.linearize_along(envs, envs.save_state(), np.zeros((1, 1)))  # of one step
+    model = linearize_along(envs, envs.save_state(), np.zeros((1, 1)))  # of one step
     envs.close()
     closed = model.A[0] - model.B[0] @ gain
     x, rows = np.stack([angles, np.zeros_like(angles)]), []

@@ -29,6 +29,7 @@ from scipy.linalg import expm, solve_discrete_are
 
 import fmugym
 from fmugym.lab import CellType, Lab, ManualClock
+from fmugym.linearization import LinearModel, linearize
 
 ENV = "fmugym/CloudPendulum-v0"
 PERIOD = 0.02  # s, from one sample to the next
@@ -51,7 +52,7 @@ RANDOMIZED = {
 Array = NDArray[np.float64]
 
 
-def delayed_lqr(model: fmugym.LinearModel) -> Array:
+def delayed_lqr(model: LinearModel) -> Array:
     """Return the gains for the angle, the velocity and the pending torque.
 
     A torque takes effect one period after the sample from which it was computed. The pending torque
@@ -74,7 +75,7 @@ class Policy:
         model: The pendulum linearized upright; its states are the angle and the velocity.
     """
 
-    def __init__(self, model: fmugym.LinearModel) -> None:
+    def __init__(self, model: LinearModel) -> None:
         self.gravity = model.A[1, 0]  # 1/s^2, g / l
         self.inertia = 1 / model.B[1, 0]  # kg m^2
         self.gains = delayed_lqr(model)
@@ -102,7 +103,7 @@ class Policy:
         return ENERGY_GAIN * missing * np.copysign(1.0, motion)
 
 
-def play(env: Any, model: fmugym.LinearModel, seed: int) -> Array:
+def play(env: Any, model: LinearModel, seed: int) -> Array:
     """Play an episode; return q, velocity and torque, (3, steps), or (3, steps, envs)."""
     policy, rows = Policy(model), []
     observation, _ = env.reset(seed=seed)
@@ -118,7 +119,7 @@ def play(env: Any, model: fmugym.LinearModel, seed: int) -> Array:
 
 
 def play_on_lab(
-    model: fmugym.LinearModel,
+    model: LinearModel,
     seed: int,
     fast: bool = False,
     plant: Mapping[str, float] | None = None,
@@ -173,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=Path("pendulum_sim_to_lab.png"))
     options = parser.parse_args(arguments)
 
-    model = fmugym.linearize(fmugym.bundled_fmu("Pendulum"))  # which starts upright
+    model = linearize(fmugym.bundled_fmu("Pendulum"))  # which starts upright
     simulated = play(gymnasium.make(ENV), model, seed=0)
     many = gymnasium.make_vec(ENV, options.envs, model_parameters=RANDOMIZED)
     randomized = play(many, model, seed=0)

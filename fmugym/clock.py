@@ -1,8 +1,8 @@
-"""The former place of the clocks, which are in ``fmugym.pool.backend.clock`` now."""
+"""The former place of the clocks, which are in ``fmugym.pool.backend.clocks`` now."""
 
 import warnings
 
-from fmugym.pool.backend.clock import Clock, ManualClock, RealClock
+from fmugym.pool.backend.clocks import Clock, ManualClock, RealClock
 
 __all__ = ["Clock", "ManualClock", "RealClock"]
 

@@ -194,7 +194,7 @@ class Foreign(KnownArguments):
     archive_limits: ArchiveLimits | None = key(
         table_of(ArchiveLimits, what="archive limit", make=ArchiveLimits),
         "The [largest FMU](reliability.md#archive-limits) that is opened, as a dict or a "
-        "`fmugym.ArchiveLimits`.",
+        "`fmugym.archive.ArchiveLimits`.",
         None,
         "`ArchiveLimits()`",
     )

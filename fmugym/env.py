@@ -24,7 +24,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.patience import failed_reset
+from fmugym.pool.licences import failed_reset
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
@@ -87,8 +87,9 @@ class FMUEnv(Constructed):
         render_mode: One of the class's ``metadata["render_modes"]``, or None. For another mode of
             Gymnasium there is a warning, and no pictures.
         backend: What stands in for the FMU, which then only describes the variables: an object
-            with ``reset``, ``step`` and ``stop`` (``fmugym.Backend``), or ``fmugym.Paced`` around
-            it. Or the name of a way to step the FMU, see ``fmugym.pool.wishes.Wishes``.
+            with ``reset``, ``step`` and ``stop`` (``fmugym.pool.Backend``), or
+            ``fmugym.pool.Paced`` around it. Or the name of a way to step the FMU, see
+            ``fmugym.pool.wishes.Wishes``.
         isolation: Where the FMU runs; by default where the config says.
         hooks: The way of calling hooks. ``"auto"`` compiles them at the first reset if that is
             possible, so that the native pool runs them in its step; one may stay in Python.

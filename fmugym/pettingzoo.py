@@ -18,7 +18,7 @@ from fmugym.declared import TaskEnv
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import lacking
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 
 try:
     from pettingzoo import ParallelEnv

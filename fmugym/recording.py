@@ -2,12 +2,12 @@
 
 ::
 
-    recorder = fmugym.Recorder(env)
+    recorder = Recorder(env)
     recorder.reset(seed=1)
     ...                                    # steps as ever
     recorder.recording.save("episode.npz")
 
-    report = fmugym.replay(fmugym.Recording.load("episode.npz"), env)
+    report = replay(Recording.load("episode.npz"), env)
     print(report)                          # equal, or the first difference
 """
 

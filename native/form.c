@@ -279,7 +279,7 @@ static void read_part(Reader *reader, Component *part) {
     part->fmi = read_fmi(reader);
     require(reader, part->fmi != &composite, "a component is no system");
     part->has_mode = read_flag(reader);
-    part->rung = (Rung)read_integer_in(reader, RUNG_RESTORE, RUNG_LIBRARY);
+    part->reset_method = (ResetMethod)read_integer_in(reader, METHOD_RESTORE, METHOD_LIBRARY);
     part->steps = read_integer_in(reader, 1, INT64_MAX);
     const Names n = read_names(reader);
     part->model = n.model;
@@ -313,8 +313,8 @@ static void count_slots(System *s) {
         s->inputs += part->inputs.count;
         s->outputs += part->outputs.count;
         s->scratch = scratch > s->scratch ? scratch : s->scratch;
-        s->restores |= part->rung == RUNG_RESTORE;
-        s->renews |= part->rung >= RUNG_INSTANCE;
+        s->restores |= part->reset_method == METHOD_RESTORE;
+        s->renews |= part->reset_method >= METHOD_INSTANCE;
     }
 }
 

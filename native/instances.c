@@ -53,14 +53,14 @@ static bool ask_for_errors(Pool *pool, Instance *me) {
     const Settings *s = &pool->settings;
 
     if (s->logging || s->number_of_categories == 0 || s->fmi->choose_messages == NULL ||
-        atomic_get(&pool->deaf)) {
+        atomic_get(&pool->no_categories)) {
         return true;
     }
     if (choose_messages(pool, me, s->number_of_categories) <= STATUS_WARNING) {
         me->hearing = HEARING_ERRORS;
         return true;
     }
-    atomic_set(&pool->deaf, 1);
+    atomic_set(&pool->no_categories, 1);
     instance_discard(pool, me);
     return build(pool, me, false);
 }
@@ -103,7 +103,7 @@ void instance_hush(Pool *pool, Instance *me) {
     if (me->hearing == HEARING_ERRORS && me->phase == PHASE_STEPPING &&
         atomic_get(&pool->log.idle) > LOG_IDLE_LIMIT) {
         me->hearing = HEARING_LITTLE;
-        atomic_set(&pool->deaf, 1);
+        atomic_set(&pool->no_categories, 1);
         choose_messages(pool, me, 0);
     }
 }

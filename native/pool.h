@@ -188,8 +188,8 @@ typedef struct Pool {
     Atomic abandoned; /* whether any snapshot has been abandoned */
     Cost costs[OPERATIONS];
     Atomic states_too_large;
-    Atomic deaf;     /* whether the FMU has refused the categories of its own */
-    Atomic heard;    /* how often an instance was asked to log everything */
+    Atomic no_categories; /* whether the FMU is asked no more to log why calls fail */
+    Atomic heard;         /* how often an instance was asked to log everything */
 } Pool;
 
 /* float64 values, variables first; strides in bytes. */

@@ -19,11 +19,11 @@ typedef struct {
 /* How a part begins an episode, from the fastest way to the surest. fmugym/pool/form.py has the
  * same numbers. */
 typedef enum {
-    RUNG_RESTORE, /* returns to its state after the initialization, if the start values are the same */
-    RUNG_RESET,
-    RUNG_INSTANCE, /* is made anew */
-    RUNG_LIBRARY   /* and its private library is loaded anew */
-} Rung;
+    METHOD_RESTORE,  /* returns to its state after the initialization, if start values are the same */
+    METHOD_RESET,
+    METHOD_INSTANCE, /* is made anew */
+    METHOD_LIBRARY   /* and its private library is loaded anew */
+} ResetMethod;
 
 /* An FMU of the system. */
 typedef struct Component {
@@ -35,7 +35,7 @@ typedef struct Component {
     const char **categories;
     size_t number_of_categories;
     bool has_mode; /* whether its FMI version has an Initialization Mode */
-    Rung rung;
+    ResetMethod reset_method;
     int64_t steps; /* in one of the system */
     Solving solving;
     Access inputs, outputs; /* what a step sets and gets, in the order of the slots */
@@ -113,7 +113,7 @@ typedef struct System {
     const uint32_t *first_ends; /* of each variable; one more */
     size_t number_of_variables;
     bool jacobi;
-    bool restores; /* whether a part begins by RUNG_RESTORE */
+    bool restores; /* whether a part begins by METHOD_RESTORE */
     bool renews;   /* whether a part is made anew */
     bool private_libraries; /* whether each instance has its own libraries */
     size_t largest_state; /* of a part that is kept, in bytes */

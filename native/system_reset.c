@@ -9,9 +9,9 @@
 
 #include "system.h"
 
-static Rung rung_of(const Composite *me, size_t index) {
-    const Rung rung = me->system->parts[index].rung;
-    return rung == RUNG_RESTORE && me->kept.useless[index] ? RUNG_RESET : rung;
+static ResetMethod reset_method_of(const Composite *me, size_t index) {
+    const ResetMethod method = me->system->parts[index].reset_method;
+    return method == METHOD_RESTORE && me->kept.useless[index] ? METHOD_RESET : method;
 }
 
 /* Resets */
@@ -46,7 +46,7 @@ static Status renew_part(Composite *me, size_t index) {
     }
     dismiss(me, index);
     const bool reloads =
-        me->system->private_libraries && me->system->parts[index].rung == RUNG_LIBRARY;
+        me->system->private_libraries && me->system->parts[index].reset_method == METHOD_LIBRARY;
     if (me->parts.dead[index] || (reloads && !part_reload(me, index)) ||
         !part_instantiate(me, index)) {
         return part_judge(me, index, STATUS_FATAL);
@@ -60,10 +60,10 @@ static Status begin_anew(Composite *me, size_t index) {
     if (me->parts.dead[index]) {
         return STATUS_ERROR;
     }
-    switch (rung_of(me, index)) {
-    case RUNG_RESTORE:
+    switch (reset_method_of(me, index)) {
+    case METHOD_RESTORE:
         return STATUS_OK;
-    case RUNG_RESET:
+    case METHOD_RESET:
         return reset_part(me, index);
     default:
         return renew_part(me, index);
@@ -93,7 +93,7 @@ Status start_reset_restoring(Composite *me) {
 
     me->kept.known = false;
     for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
-        if (rung_of(me, i) == RUNG_RESTORE) {
+        if (reset_method_of(me, i) == METHOD_RESTORE) {
             status = me->parts.dead[i] ? STATUS_ERROR : reset_part(me, i);
             me->kept.useless[i] = status > STATUS_WARNING;
         }
@@ -176,7 +176,7 @@ static Status get_states(Composite *me) {
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < me->system->count && status <= STATUS_WARNING; i++) {
-        if (rung_of(me, i) == RUNG_RESTORE) {
+        if (reset_method_of(me, i) == METHOD_RESTORE) {
             status = get_state(me, i);
             me->kept.useless[i] = status > STATUS_WARNING;
         }
@@ -219,7 +219,7 @@ Status start_restore(Composite *me) {
     Status status = STATUS_OK;
 
     for (size_t i = 0; i < s->count && status <= STATUS_WARNING; i++) {
-        if (rung_of(me, i) == RUNG_RESTORE) {
+        if (reset_method_of(me, i) == METHOD_RESTORE) {
             status = me->parts.dead[i]
                          ? STATUS_ERROR
                          : part_judge(me, i, s->parts[i].fmi->set_state(&me->libraries[i],
@@ -251,7 +251,7 @@ void start_blame(Composite *me) {
     bool found = false;
 
     for (size_t i = 0; i < me->system->count; i++) {
-        const bool differs = rung_of(me, i) == RUNG_RESTORE && has_other_outputs(me, i);
+        const bool differs = reset_method_of(me, i) == METHOD_RESTORE && has_other_outputs(me, i);
         me->kept.useless[i] |= differs;
         found |= differs;
     }

@@ -4,7 +4,7 @@ import logging
 from dataclasses import replace
 
 from fmugym import FMU
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.backend.by_fmpy import FMPyInstance
 from fmugym.pool.backend.rig import FaultError

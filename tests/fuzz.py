@@ -24,9 +24,10 @@ from fmu_tools import library_name, probe_xml, read_fmu
 from fuzz_driver import Case, main, require
 from lxml import etree
 
-from fmugym import FMU, EnvConfig, FMUGymError
+from fmugym import FMU, FMUGymError
 from fmugym.archive import fmu as fmu_module
 from fmugym.archive.bundled import BUNDLED, bundled_fmu
+from fmugym.config import EnvConfig
 from fmugym.task.interface import resolve
 from fmugym.task.spaces import action_space, observation_space
 from fmugym.tools.overview import as_text, overview

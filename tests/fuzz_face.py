@@ -24,8 +24,10 @@ from odd_values import circular, hostile
 
 import fmugym
 from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform, testing
+from fmugym.archive import ArchiveLimits
 from fmugym.checks import integer_of
 from fmugym.config import EnvConfig
+from fmugym.pool import Paced
 
 
 class Sampled:
@@ -521,9 +523,9 @@ def of_functions(rng):
         "limits": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), limits=value).close(),
         "preload": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), preload=value).close(),
         "timeout": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), probe_timeout=value).close(),
-        "ArchiveLimits": lambda: fmugym.ArchiveLimits(max_ratio=value),
+        "ArchiveLimits": lambda: ArchiveLimits(max_ratio=value),
         "EnvConfig": lambda: EnvConfig.from_dict(value),
-        "Paced": lambda: fmugym.Paced(other, hold_after=value),
+        "Paced": lambda: Paced(other, hold_after=value),
         "check_fmu_env": lambda: testing.check_fmu_env(value),
         "check_hooks": lambda: callable(value) or testing.check_hooks(value),
         "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),

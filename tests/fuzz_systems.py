@@ -31,7 +31,7 @@ CALLS = 25
 NO_STATES = 1
 """The version of FMI that cannot save states."""
 
-RUNGS = (ResetMethod.RESTORE, ResetMethod.RESET, ResetMethod.INSTANCE)
+METHODS = (ResetMethod.RESTORE, ResetMethod.RESET, ResetMethod.INSTANCE)
 
 
 def component(rng, path, faults):
@@ -79,17 +79,17 @@ def spec_of(rng, fmu, versions):
     inputs = [v for v in fmu.description.variables.values() if v.causality == "input"]
     outputs = [v for n, v in fmu.description.variables.items() if n[2:4] in {"y1", "y2", "t"}]
     outputs += [v for n, v in fmu.description.variables.items() if n.startswith("master.")]
-    able, rungs = fmu.description.capabilities, ()
+    able, methods = fmu.description.capabilities, ()
     if rng.random() < 0.6:
-        rungs = tuple(rng.choice(RUNGS[v == NO_STATES :]) for v in versions)
+        methods = tuple(rng.choice(METHODS[v == NO_STATES :]) for v in versions)
     return PoolSpec(
         tuple(inputs),
         tuple(outputs),
         0.1,
         substeps=rng.choice((1, 1, 2)),
         fault_retries=rng.choice((0, 2)) if able.can_get_and_set_fmu_state else 0,
-        reset_method=rng.choice(RUNGS) if not rungs else ResetMethod.INSTANCE,
-        component_resets=rungs,
+        reset_method=rng.choice(METHODS) if not methods else ResetMethod.INSTANCE,
+        component_resets=methods,
     )
 
 

@@ -10,8 +10,8 @@ from scipy.linalg import expm
 
 from fmugym import bundled_fmu
 from fmugym.systems import FMUSystem
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import MASTERS, Component, Evaluation, Group, Link, SystemPlan
 
 by_each_master = pytest.mark.parametrize("master", MASTERS)
 

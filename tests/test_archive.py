@@ -11,8 +11,8 @@ from functools import partial
 import pytest
 from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_fmu, write_fmu
 
-from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
-from fmugym.archive import safe_zip, temporary
+from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
+from fmugym.archive import ArchiveLimits, safe_zip, temporary
 
 
 @pytest.fixture

@@ -8,6 +8,7 @@ from values_tools import LARGER, STEP, Env
 
 import fmugym
 from fmugym import ConfigError, FMUVectorEnv
+from fmugym.linearization import derivatives, linearize, linearize_along
 
 KINDS = pytest.mark.parametrize("kind", ["Directional", "Adjoint"])
 SIZES = {name: LARGER[name] for name in "nmr"}
@@ -24,7 +25,7 @@ def made(folder, kind="Directional", **options):
 @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 def test_the_matrices_come_out(tmp_path, kind, interface):
     fmu = fmugym.FMU(made(tmp_path, kind, interfaces=(interface,)), sizes=SIZES)
-    model = fmugym.linearize(fmu, at=GIVEN | {"u": [1.0, -2.0]})
+    model = linearize(fmu, at=GIVEN | {"u": [1.0, -2.0]})
     assert model.A.tolist() == LARGER["A"]
     assert model.B.tolist() == LARGER["B"]
     assert model.states == ("x[1]", "x[2]", "x[3]")
@@ -39,21 +40,21 @@ def test_the_matrices_come_out(tmp_path, kind, interface):
 @KINDS
 def test_some_elements(tmp_path, kind):
     fmu = fmugym.FMU(made(tmp_path, kind), sizes=SIZES)
-    model = fmugym.linearize(fmu, at=GIVEN, states=["x[3]", "x[1]"], inputs="u[2]")
+    model = linearize(fmu, at=GIVEN, states=["x[3]", "x[1]"], inputs="u[2]")
     places = np.ix_([2, 0], [2, 0])
     assert model.A.tolist() == MATRICES["A"][places].tolist()
     assert model.B.tolist() == MATRICES["B"][[2, 0]][:, [1]].tolist()
-    assert fmugym.linearize(fmu, at=GIVEN, states="x").A.tolist() == LARGER["A"]
+    assert linearize(fmu, at=GIVEN, states="x").A.tolist() == LARGER["A"]
 
 
 def test_wrong_names(tmp_path):
     path = made(tmp_path, fixed=True)
     with pytest.raises(ConfigError, match=r"'y\[1\]'.*state.*'x\[1\]', 'x\[2\]'"):
-        fmugym.linearize(path, states="y")
+        linearize(path, states="y")
     with pytest.raises(ConfigError, match=r"x\[3\].*\(2,\)"):
-        fmugym.linearize(path, states="x[3]")
+        linearize(path, states="x[3]")
     with pytest.raises(ConfigError, match=r"'A'.*\(2, 2\).*\(3,\)"):
-        fmugym.linearize(path, at={"A": [1, 2, 3]})
+        linearize(path, at={"A": [1, 2, 3]})
 
 
 def discrete():
@@ -77,7 +78,7 @@ def test_along_a_trajectory(tmp_path, method, options):
     envs.reset(seed=0)
     start = envs.save_state()[0]
     states = {"x": "x_0"} if method == "differences" else None
-    found = fmugym.linearize_along(envs, start, U, states=states, method=method)
+    found = linearize_along(envs, start, U, states=states, method=method)
     a, b = discrete()
     c, d = MATRICES["C"], MATRICES["D"]
     accuracy = {"rel": 1e-4, "abs": 1e-4} if method == "differences" else {"abs": 1e-6}
@@ -100,7 +101,7 @@ def test_derivatives_of_a_rollout(tmp_path):
 
     envs = FMUVectorEnv(make, 2)
     envs.reset(seed=0)
-    found = fmugym.derivatives(envs, envs.save_state()[0], U)
+    found = derivatives(envs, envs.save_state()[0], U)
     a, b = discrete()
     rows = np.vstack([MATRICES["C"], [[0, 1, 0]]])
     direct = np.vstack([MATRICES["D"], [[0, 0]]])

@@ -14,10 +14,11 @@ from gymnasium.wrappers import RecordVideo
 from vector_tools import run_side_by_side
 
 import fmugym
-from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, Paced, SimulationError, Status
-from fmugym.pool import BackendPool, PoolSpec
-from fmugym.pool.backend import pool as backend_module
-from fmugym.pool.backend.clock import ManualClock
+from fmugym import FMU, ConfigError, FMI2CSEnv, FMUVectorEnv, SimulationError
+from fmugym.fmi import Status
+from fmugym.pool import BackendPool, Paced, PoolSpec
+from fmugym.pool.backend import backend_pool as backend_module
+from fmugym.pool.backend.clocks import ManualClock
 from fmugym.pool.bundle import Bundle
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
@@ -663,7 +664,7 @@ class TestPacing:
         assert rig.calls == ["reset", "stop"]
         env.close()
 
-    def test_a_negative_patience(self):
+    def test_a_negative_time_until_a_hold(self):
         with pytest.raises(ConfigError, match="hold_after must be positive"):
             Paced(Held(), hold_after=0.0)
 

@@ -9,6 +9,7 @@ import pytest
 
 import fmugym
 from fmugym.baselines import LQR, PID, Constant, Hysteresis, Random, Schedule, controller_of
+from fmugym.linearization import linearize
 from fmugym.vector import FMUVectorEnv
 
 KELVIN = 273.15
@@ -142,7 +143,7 @@ def test_a_thermostat_of_a_switch():
 class TestLQR:
     @pytest.fixture
     def model(self):
-        return fmugym.linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
+        return linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
 
     def test_balances_a_pendulum(self, pendulum, model):
         controller = LQR(model, [1.0, 0.1], [100.0]).bind(pendulum)

@@ -8,6 +8,7 @@ import pytest
 import fmugym
 from fmugym.baselines import PID, Constant, Controller, Hysteresis, tune
 from fmugym.envs import HouseEnv
+from fmugym.linearization import linearize
 from fmugym.vector import FMUVectorEnv
 
 WEIGHTS = (1.0, 0.1, 200.0)  # of angle, rate and torque
@@ -56,7 +57,7 @@ def riccati_gain():
     from scipy.linalg import solve_discrete_are
     from scipy.signal import cont2discrete
 
-    model = fmugym.linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
+    model = linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
     a, b, *_ = cont2discrete((model.A, model.B, np.eye(2), np.zeros((2, 1))), 0.02)
     q, r = np.diag(WEIGHTS[:2]), np.array([[WEIGHTS[2]]])
     cost = solve_discrete_are(a, b, q, r)

@@ -12,7 +12,7 @@ from fmugym.archive import temporary
 from fmugym.caching import cache_folder, lasting_folder
 from fmugym.envs import CartPoleEnv
 from fmugym.trial.known import recall, remember
-from fmugym.wine.program import wine_folder
+from fmugym.wine.windows_worker import wine_folder
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="Windows has no such owners and modes")
 

@@ -22,7 +22,7 @@ CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 HANGING = """
 import sys
 from fmugym.tools import ending
-ending._PATIENCE = 0.5
+ending._TIMEOUT = 0.5
 from fmugym.__main__ import main
 sys.exit(main())
 """

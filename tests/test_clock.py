@@ -6,7 +6,7 @@ import time
 import pytest
 
 from fmugym import ConfigError
-from fmugym.pool.backend.clock import ManualClock, RealClock
+from fmugym.pool.backend.clocks import ManualClock, RealClock
 
 
 class TestRealClock:
@@ -61,9 +61,9 @@ class TestManualClock:
     def test_advance_wakes_a_sleeper(self):
         clock = ManualClock()
         busy = threading.Event()
-        crew = clock.thread(busy.wait, (10,))  # at work, so that time waits for it
+        worker = clock.thread(busy.wait, (10,))  # at work, so that time waits for it
         sleeper = threading.Thread(target=clock.sleep, args=(1.0,))
-        crew.start()
+        worker.start()
         sleeper.start()
         clock.advance(0.5)
         sleeper.join(0.05)
@@ -72,7 +72,7 @@ class TestManualClock:
             clock.advance(0.5)
             sleeper.join(0.01)
         busy.set()
-        crew.join()
+        worker.join()
 
     def test_threads_take_turns_at_exact_times(self):
         clock, seen = ManualClock(), []

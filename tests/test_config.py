@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
-from fmugym import FMU, Choice, ConfigError, EnvConfig, Uniform
+from fmugym import FMU, Choice, ConfigError, Uniform
+from fmugym.config import EnvConfig
 from fmugym.task.interface import resolve
 from fmugym.task.starting import checked_value
 

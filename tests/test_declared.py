@@ -19,7 +19,7 @@ import fmugym
 from fmugym import ConfigError, Task, TaskEnv, Uniform
 from fmugym.declared.declarations import BUILT_IN
 from fmugym.declared.expressions import CONSTANTS
-from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.errors import TaskError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

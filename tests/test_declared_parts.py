@@ -10,7 +10,7 @@ from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
 from fmugym.declared.expressions import Code, Expression, Names, function_of
-from fmugym.declared.functions import FUNCTIONS
+from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.quantities import duration
 
 

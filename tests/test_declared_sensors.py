@@ -7,7 +7,7 @@ import pytest
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym.declared import functions
+from fmugym.declared import mathematics
 from fmugym.errors import TaskError
 
 DT = 0.05
@@ -41,9 +41,9 @@ def episode(env, seed=None, steps=20):
 
 def test_the_bits_of_noise_are_those_of_splitmix64():
     """The reference is Vigna's program of 2015 with the seed 1234567."""
-    seeds = np.int64(1234567) + np.arange(1, 4) * functions._STEP
+    seeds = np.int64(1234567) + np.arange(1, 4) * mathematics._STEP
     expected = [6457827717110365317, 3203168211198807973, 9817491932198370423]
-    assert functions._mixed(seeds).view(np.uint64).tolist() == expected
+    assert mathematics._mixed(seeds).view(np.uint64).tolist() == expected
 
 
 def test_noise_is_normal_and_differs_in_steps_and_episodes(load):

@@ -6,6 +6,7 @@ import pytest
 from test_snapshots import vector_of
 
 import fmugym
+from fmugym.linearization import derivatives
 
 M, L, B, G, DT = 0.06, 0.1, 1e-3, 9.81, 0.02
 HORIZON = 12
@@ -77,7 +78,7 @@ def fixture_snapshot():
 def test_are_those_of_the_equations(snapshot, num_envs):
     torques = np.random.default_rng(0).uniform(-0.015, 0.015, HORIZON)
     envs = vector_of(Precise, num_envs)
-    found = fmugym.derivatives(envs, snapshot, torques[:, None])
+    found = derivatives(envs, snapshot, torques[:, None])
     states, by_actions, of_rewards = by_hand(torques.astype(np.float32).astype(float))
     assert found.observations == pytest.approx(states, abs=1e-9)
     assert found.by_actions.shape == (HORIZON, 2, HORIZON, 1)
@@ -90,7 +91,7 @@ def test_are_those_of_the_equations(snapshot, num_envs):
 def test_of_actions_at_their_bounds(snapshot):
     envs = vector_of(Precise, 8)
     torques = np.full(HORIZON, 0.02)
-    found = fmugym.derivatives(envs, snapshot, torques[:, None], step=1e-4)
+    found = derivatives(envs, snapshot, torques[:, None], step=1e-4)
     _, by_actions, _ = by_hand(torques)
     assert found.by_actions[..., 0] == pytest.approx(by_actions, rel=1e-2, abs=1e-3)
     envs.close()
@@ -98,7 +99,7 @@ def test_of_actions_at_their_bounds(snapshot):
 
 def test_later_actions_have_no_influence(snapshot):
     envs = vector_of(Precise, 8)
-    found = fmugym.derivatives(envs, snapshot, np.zeros((HORIZON, 1)))
+    found = derivatives(envs, snapshot, np.zeros((HORIZON, 1)))
     later = np.triu(np.ones((HORIZON, HORIZON), bool), 1)
     assert not found.by_actions[:, :, :, 0].transpose(0, 2, 1)[later].any()
     assert not found.of_rewards[later].any()

@@ -92,7 +92,7 @@ class TestKalmanFilter:
         estimator.mean, estimator.covariance = np.zeros(2), np.diag([1e-3, 1e-3]) ** 2
         lqr.start(estimator.envs, np.zeros(5))
         snapshot = estimator.envs.save_state(0)
-        step = ukf.fmugym.linearize_along(estimator.envs, snapshot, np.zeros((1, 1)))
+        step = ukf.fmugym.linearization.linearize_along(estimator.envs, snapshot, np.zeros((1, 1)))
         expected = estimator.covariance
         for _ in range(5):
             gain = expected[:, 0] / (expected[0, 0] + ukf.NOISE**2)

@@ -9,7 +9,7 @@ from fmu_tools import MAJOR_VERSIONS, edited_fmu, library_name, probe_library
 from pool_tools import open_pool, start, step
 
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
 with_state = pytest.mark.parametrize("version", [2, 3])

@@ -17,8 +17,8 @@ import fmugym
 from fmugym import ConfigError, FMULoadError, FMUVectorEnv, bundled_fmu
 from fmugym.archive.bundled import BUNDLED
 from fmugym.pool import PoolSpec
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import Component, Group, SystemPlan
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import Component, Group, SystemPlan
 from fmugym.trial.opening import make_pool
 
 PENDULUM = bundled_fmu("Pendulum")

@@ -13,10 +13,10 @@ from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped, probe_config
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
 
-import fmugym
 from fmugym import FMU, ConfigError, SimulationError
-from fmugym.fmi.status import Status
-from fmugym.pool.memory import grown_bytes
+from fmugym.config import EnvConfig
+from fmugym.fmi import Status
+from fmugym.pool.process_memory import grown_bytes
 from fmugym.vector import FMUVectorEnv
 
 MB = 2**20
@@ -327,7 +327,7 @@ def test_bundled_fmus_are_not_watched():
     env = gym.make("fmugym/Pendulum-v0")
     assert env.unwrapped.health["memory_growth"] == 0
     assert (
-        fmugym.EnvConfig.from_dict(
+        EnvConfig.from_dict(
             {"model_input_names": "u", "model_output_names": "y", "foreign": {"leak_limit": None}}
         ).foreign.leak_limit
         is None

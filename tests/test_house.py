@@ -1,10 +1,12 @@
 """The rooms of the package: imports run one way, and no two modules import each other."""
 
 import ast
+import re
+from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import gymnasium
-import pytest
 
 import fmugym
 from fmugym import FMUEnv, FMUVectorEnv, TaskEnv
@@ -12,30 +14,30 @@ from fmugym.task.hooks import Hooks
 
 PACKAGE = Path(fmugym.__file__).parent
 
-STOREYS = [
-    {"signals", "_native"},
-    {"errors", "caching", "lazy"},
-    {"checks", "retired", "extras", "figures", "scaling", "wine"},
-    {"keys"},
-    {"archive", "distributions", "rendering"},
-    {"systems"},
-    {"fmi"},
-    {"pool"},
-    {"trial"},
-    {"config"},
-    {"task"},
-    {"env"},
-    {"vector", "lab", "identification"},
-    {"linearization"},
-    {"baselines"},
-    {"search"},
-    {"registration", "recording", "testing", "sb3", "torchrl", "declared", "series"},
-    {"export", "logs", "minari", "episodes", "repair"},
-    {"training"},
-    {"envs", "pettingzoo", "rllib", "tools"},
-    {"__init__", "__main__", "clock"},
-]
-"""From the ground floor up: a room imports rooms of lower storeys and itself only."""
+ROOT = PACKAGE.parent
+RULE = "-" * 20
+"""In the picture: optional rooms are above it, the core is below."""
+
+
+def picture():
+    """The house as CONTRIBUTING draws it: the storeys from the ground floor up, and the core."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    (block,) = (b for b in re.findall(r"```text\n(.*?)```", text, re.DOTALL) if RULE in b)
+    lines = [re.split(r"\s{2,}", line)[0] for line in block.splitlines()]
+    below = lines[[line.startswith(RULE) for line in lines].index(True) + 1 :]
+    drawn = [storeys_on(line) for line in reversed(lines) if not line.startswith(RULE)]
+    return [rooms for line in drawn for rooms in line], {
+        room for line in below for rooms in storeys_on(line) for room in rooms
+    }
+
+
+def storeys_on(line):
+    return [set(storey.split(", ")) for storey in line.split(" <- ")]
+
+
+STOREYS, CORE = picture()
+DOORS = {"fmugym.systems.system": "fmugym.systems.ssp.archives"}
+"""Where the core opens an optional room: ``FMUSystem.read``, of archives that need it."""
 
 
 def module_of(path):
@@ -46,36 +48,72 @@ def module_of(path):
 MODULES = {module_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
 
 
+@cache
+def tree_of(module):
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
 def imports_of(module):
     """The modules of the package that a module imports anywhere, functions and types included."""
-    path = MODULES[module]
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{module} has a relative import"
-            names = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in MODULES else node.module for name in names}
-    found = {name for name in found if name.split(".")[0] == "fmugym"}
+    found = {name for node in ast.walk(tree_of(module)) for name in imported_by(node)}
     return {name for name in found if not module.startswith(f"{name}.")}
 
 
+def imported_by(node):
+    """The modules of the package that a statement imports."""
+    if isinstance(node, ast.Import):
+        found = {alias.name for alias in node.names}
+    elif isinstance(node, ast.ImportFrom):
+        assert node.level == 0, "a relative import"
+        names = {f"{node.module}.{alias.name}" for alias in node.names}
+        found = {name if name in MODULES else node.module for name in names}
+    else:
+        found = set()
+    return {name for name in found if name.split(".")[0] == "fmugym"}
+
+
 def room_of(module):
-    parts = module.split(".")
-    return parts[1] if len(parts) > 1 else "__init__"
+    parts = module.split(".")[1:] or ["__init__"]
+    return "systems/ssp" if parts[:2] == ["systems", "ssp"] else parts[0]
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_a_room_imports_lower_storeys_only(module):
+def test_the_picture_has_each_room_once():
+    drawn = [room for rooms in STOREYS for room in rooms]
+    assert sorted(drawn) == sorted({*map(room_of, MODULES), "_native"})
+
+
+def test_a_room_imports_lower_storeys_only():
     storey = {room: level for level, rooms in enumerate(STOREYS) for room in rooms}
-    own = room_of(module)
-    above = [
-        name
+    upwards = {
+        module: name
+        for module in MODULES
         for name in imports_of(module)
-        if room_of(name) != own and storey[room_of(name)] >= storey[own]
-    ]
-    assert above == []
+        if room_of(name) != room_of(module) and storey[room_of(name)] >= storey[room_of(module)]
+    }
+    assert upwards == DOORS
+
+
+def test_the_core_opens_optional_rooms_in_functions_only():
+    found = []
+    for module in (module for module in MODULES if room_of(module) in CORE):
+        tree = tree_of(module)
+        named = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        at_import = {name for node in tree.body for name in imported_by(node)}
+        optional = [n for n in named & MODULES.keys() | at_import if room_of(n) not in CORE]
+        found += [f"{module}: {name}" for name in optional]
+    assert found == []
+
+
+SHARED = {
+    *("actions", "base", "env", "inputs", "inside", "opening"),
+    *("results", "rollouts", "saving", "tuning"),
+}
+"""Names of files that still occur in two or three rooms."""
+
+
+def test_the_name_of_a_file_tells_it_from_all_others():
+    often = Counter(path.stem for path in MODULES.values())
+    assert {name for name, count in often.items() if count > 1} == {"__init__", *SHARED}
 
 
 def test_no_module_imports_itself_by_a_detour():
@@ -85,15 +123,17 @@ def test_no_module_imports_itself_by_a_detour():
     assert graph == {}
 
 
-ROOT = PACKAGE.parent
 FOLDERS = ("fmugym", "examples", "benchmarks", "tests")
 ENVIRONMENTS = {cls for env in (TaskEnv, FMUEnv, FMUVectorEnv) for cls in env.__mro__}
 
 
 def names_given_in(cls):
     """The names of the methods of a class, and of the attributes that it declares and assigns."""
-    tree = ast.parse(MODULES[cls.__module__].read_text(encoding="utf-8"))
-    (body,) = (n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__)
+    (body,) = (
+        n
+        for n in tree_of(cls.__module__).body
+        if isinstance(n, ast.ClassDef) and n.name == cls.__name__
+    )
     for node in ast.walk(body):
         if isinstance(node, ast.FunctionDef):
             yield node.name

@@ -1,5 +1,6 @@
 """What ``import fmugym`` imports, and the names that come later."""
 
+import pkgutil
 import subprocess
 import sys
 
@@ -9,6 +10,11 @@ import fmugym
 from fmugym import vector
 
 HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.env", "fmugym.envs")
+
+OPTIONAL = (
+    *("lab", "identification", "series", "search", "systems.ssp", "sb3", "torchrl", "rllib"),
+    *("pettingzoo", "export", "logs", "minari", "episodes", "repair", "training", "tools"),
+)
 
 
 def run(program):
@@ -30,6 +36,26 @@ def test_a_class_brings_neither_vector_environments_nor_pictures():
     assert not {"pygame", "fmugym.vector.env", "fmugym.lab"} & imported
 
 
+def test_environments_work_without_optional_rooms():
+    program = f"""
+import sys
+for room in {OPTIONAL}:
+    sys.modules["fmugym." + room] = None  # as if it had not been installed
+import gymnasium, fmugym
+fmu = {{"bundled": "Pendulum"}}
+task = {{"fmu": fmu, "time_step": "20ms", "agent": {{"actions": ["tau"], "observations": ["q"]}}}}
+task["variables"] = {{"tau": {{"min": -1, "max": 1}}}}
+task["reward"] = "-q * q"
+make, make_vec = gymnasium.make, gymnasium.make_vec
+for env in (make("fmugym/CartPole-v0"), fmugym.load(task), make_vec("fmugym/Pendulum-v0", 2)):
+    env.reset(seed=1)
+    env.step(env.action_space.sample())
+    env.close()
+print(*(name for name in sys.modules if name.startswith("fmugym.envs")))
+"""
+    assert "fmugym.envs" in run(program)
+
+
 def test_the_environments_are_registered():
     program = """
 import gymnasium, fmugym
@@ -45,6 +71,29 @@ def test_every_public_name_is_there():
         assert name in dir(fmugym)
     program = "from fmugym import *; print(CartPole := envs.CartPoleEnv, FMUVectorEnv, register)"
     assert "fmugym.vector.env.FMUVectorEnv" in " ".join(run(program))
+
+
+MOVED = {
+    "archive": ["ArchiveLimits"],
+    "config": ["EnvConfig"],
+    "fmi": ["Status"],
+    "linearization": ["LinearModel", "derivatives", "linearize", "linearize_along"],
+    "pool": ["Backend", "Paced"],
+    "recording": ["Recorder", "Recording", "replay"],
+    "training.agents": ["load_agent"],
+}
+
+
+@pytest.mark.parametrize(("room", "name"), [(r, name) for r in MOVED for name in MOVED[r]])
+def test_a_name_that_has_moved_warns_and_is_what_it_was(room, name):
+    place = f"fmugym.{room}"
+    for old in (f"value = fmugym.{name}", f"from fmugym import {name} as value"):
+        with pytest.warns(DeprecationWarning, match=f"{name} has moved.* from {place}") as told:
+            exec(compile(old, __file__, "exec"), {"fmugym": fmugym}, found := {})
+        assert {one.filename for one in told} == {__file__}
+        assert found["value"] is pkgutil.resolve_name(f"{place}.{name}")
+    assert name not in fmugym.__all__
+    assert name not in dir(fmugym)
 
 
 @pytest.mark.parametrize("name", ["lab", "testing", "identification", "rendering", "vector"])

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import fmugym
+from fmugym.config import EnvConfig
 from fmugym.errors import TaskError
 from fmugym.tools.cli import main
 
@@ -135,7 +136,7 @@ def test_one_error_tells_all_mistakes_of_expressions(tmp_path):
 def test_one_error_tells_all_mistakes_of_a_config():
     given = {"model_input_names": "u", "time_step": -1, "on_fault": "rais", "substep": 2}
     with pytest.raises(fmugym.ConfigError) as caught:
-        fmugym.EnvConfig.from_dict(given)
+        EnvConfig.from_dict(given)
     for fact in ("time_step", "-1", "'raise'", "'substeps'"):
         assert fact in str(caught.value)
 

@@ -13,14 +13,15 @@ import pytest
 from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
+from fmugym.config import EnvConfig
 from fmugym.errors import LicenceError
-from fmugym.pool.patience import speaks_of_licence
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.tools.cli import main
 from fmugym.trial import rehearsal
-from fmugym.trial.episodes import Starts
 from fmugym.trial.known import known_verdict
 from fmugym.trial.subject import Subject
+from fmugym.trial.trial_episodes import Starts
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")
 
@@ -246,7 +247,7 @@ class TestWaiting:
 )
 def test_odd_values_are_refused(key, value):
     with pytest.raises(fmugym.ConfigError, match=key):
-        fmugym.EnvConfig.from_dict(
+        EnvConfig.from_dict(
             {"model_input_names": "u", "model_output_names": "y", "foreign": {key: value}}
         )
 

@@ -13,6 +13,7 @@ from scipy.linalg import expm
 
 import fmugym
 from fmugym.archive.bundled import BUNDLED
+from fmugym.linearization import linearize
 
 M, L, B, G, V_C = 0.06, 0.1, 4e-4, 9.81, 0.05  # of the bundled pendulum
 with_derivatives = pytest.mark.parametrize(
@@ -30,19 +31,19 @@ POINTS = {
 }  # fmt: skip
 
 
-def linearize(model, version, **arguments):
-    return fmugym.linearize(fmugym.bundled_fmu(model, version), **arguments)
+def linearize_bundled(model, version, **arguments):
+    return linearize(fmugym.bundled_fmu(model, version), **arguments)
 
 
 def test_an_fmu_with_arguments_of_its_own():
     path = fmugym.bundled_fmu("Pendulum")
     with closing(fmugym.FMU(path)) as fmu:
         folder = fmu.extract()
-        assert fmugym.linearize(fmu).A.tolist() == fmugym.linearize(path).A.tolist()
+        assert linearize(fmu).A.tolist() == linearize(path).A.tolist()
         assert folder.exists()  # it is still the caller's
     preloading = fmugym.FMU(path, preload=["/nowhere/libgave.so"])
     with pytest.raises(fmugym.FMULoadError, match="libgave"):
-        fmugym.linearize(preloading)
+        linearize(preloading)
 
 
 @each_version
@@ -50,7 +51,7 @@ def test_an_fmu_with_arguments_of_its_own():
 @pytest.mark.parametrize(("velocity", "coulomb"), [(0.0, 0.0), (0.03, 2e-3), (-4.0, 3e-3)])
 def test_the_pendulum_against_the_closed_form(version, angle, velocity, coulomb):
     at = {"theta_0": angle, "theta_dot_0": velocity, "c": coulomb, "tau": 0.01}
-    model = linearize("Pendulum", version, at=at)
+    model = linearize_bundled("Pendulum", version, at=at)
     damping = B + coulomb / V_C / np.cosh(velocity / V_C) ** 2
     moment = 0.01 - B * velocity - coulomb * np.tanh(velocity / V_C)
     inertia = M * L**2
@@ -65,7 +66,7 @@ def test_the_pendulum_against_the_closed_form(version, angle, velocity, coulomb)
 def test_against_central_differences_of_the_fmu(model, version):
     """At a point that is no equilibrium, by other start values and inputs."""
     point = POINTS[model]
-    linear = linearize(model, version, at=point)
+    linear = linearize_bundled(model, version, at=point)
     eps = 1e-6
     values = np.array(list(point.values()))
     ways = np.array([values + s * eps * row for row in np.eye(len(values)) for s in (1, -1)])
@@ -105,7 +106,7 @@ def test_each_instance_is_differentiated_at_its_own_point(version):
 
 @each_version
 def test_a_step_from_near_upright_is_that_of_the_linear_model(version):
-    linear = linearize("Pendulum", version)
+    linear = linearize_bundled("Pendulum", version)
     system = np.zeros((3, 3))
     system[:2] = np.hstack([linear.A, linear.B])
     fmu = fmugym.FMU(fmugym.bundled_fmu("Pendulum", version))
@@ -120,26 +121,28 @@ def test_a_step_from_near_upright_is_that_of_the_linear_model(version):
 @each_version
 def test_the_states_may_be_chosen_and_ordered(version):
     point = POINTS["DoublePendulum"]
-    all_ = linearize("DoublePendulum", version, at=point)
+    all_ = linearize_bundled("DoublePendulum", version, at=point)
     assert all_.states == ("q1", "q2", "q1_dot", "q2_dot")
     assert all_.derivatives == ("q1_dot", "q2_dot", "q1_ddot", "q2_ddot")
-    elbow = linearize("DoublePendulum", version, states=["q2_dot", "q2"], inputs="tau2", at=point)
+    elbow = linearize_bundled(
+        "DoublePendulum", version, states=["q2_dot", "q2"], inputs="tau2", at=point
+    )
     assert elbow.derivatives == ("q2_ddot", "q2_dot")
     assert elbow.A.tolist() == all_.A[np.ix_([3, 1], [3, 1])].tolist()
     assert elbow.B.tolist() == all_.B[np.ix_([3, 1], [1])].tolist()
-    assert linearize("DoublePendulum", version, inputs=[]).B.shape == (4, 0)
+    assert linearize_bundled("DoublePendulum", version, inputs=[]).B.shape == (4, 0)
 
 
 @each_version
 def test_units(version):
     units = {"theta": "rad", "theta_dot": "rad/s", "theta_ddot": "rad/s2", "tau": "N.m"}
-    assert linearize("Pendulum", version).units == units
+    assert linearize_bundled("Pendulum", version).units == units
 
 
 @each_version
 def test_an_item_of_an_enumeration_may_be_named(version):
     """A rod that turns about its end has 3/2 of the point mass's g / l."""
-    rod = linearize("Pendulum", version, at={"body": "uniform_rod"})
+    rod = linearize_bundled("Pendulum", version, at={"body": "uniform_rod"})
     assert rod.A[1, 0] == pytest.approx(1.5 * G / L, rel=1e-12)
 
 
@@ -160,39 +163,39 @@ def test_an_item_of_an_enumeration_may_be_named(version):
 )  # fmt: skip
 def test_a_mistake_is_named(arguments, message):
     with pytest.raises(fmugym.ConfigError) as error:
-        linearize("Pendulum", "2.0", **arguments)
+        linearize_bundled("Pendulum", "2.0", **arguments)
     assert message in str(error.value)
 
 
 def test_fmi_1_has_no_derivatives():
     with pytest.raises(fmugym.ConfigError, match=r"Pendulum \(FMI 1\.0\) cannot be linearized: it"):
-        linearize("Pendulum", "1.0")
+        linearize_bundled("Pendulum", "1.0")
 
 
 def test_an_fmu_of_another_exporter_without_derivatives(tmp_path):
     path = FmuBuilder.build_FMU(foreign_tank.__file__, dest=tmp_path)
     with pytest.raises(fmugym.ConfigError, match="it provides neither directional derivatives"):
-        fmugym.linearize(path)
+        linearize(path)
 
 
 def test_an_fmu_that_declares_no_states(tmp_path):
     claim = {'modelIdentifier="Probe"': 'modelIdentifier="Probe" providesDirectionalDerivative="1"'}
     with pytest.raises(fmugym.ConfigError, match=r"Probe.*no derivatives of"):
-        fmugym.linearize(probe_fmu(tmp_path, edits=claim))
+        linearize(probe_fmu(tmp_path, edits=claim))
 
 
 def test_a_derivative_of_no_named_state_is_left_out(tmp_path):
     path = edited_fmu("Pendulum", tmp_path, {' nominal="1" derivative="3"': ' nominal="1"'})
-    assert fmugym.linearize(path).states == ("theta_dot",)
+    assert linearize(path).states == ("theta_dot",)
 
 
 def test_an_fmu_that_fails(tmp_path, temp_root):
     """The probe claims to provide derivatives; its String is set before it fails."""
     path = probe_fmu(tmp_path, edits=CLAIMING_DERIVATIVES)
     with pytest.raises(fmugym.SimulationError, match="the derivative by 'sum' returned Error"):
-        fmugym.linearize(path, at={"label": "derived", "gain": 2.0})
+        linearize(path, at={"label": "derived", "gain": 2.0})
     with pytest.raises(fmugym.SimulationError, match="initialization returned Error"):
-        fmugym.linearize(path, at={"init_status": 3})
+        linearize(path, at={"init_status": 3})
     assert list(temp_root.iterdir()) == []
 
 
@@ -203,7 +206,7 @@ def test_adjoint_derivatives_where_there_are_no_others(tmp_path, interface):
         tmp_path / "model.fmu", "van_der_pol", 3, (interface,), flags
     )
     assert not fmugym.FMU(path).description.capabilities.provides_directional_derivatives
-    model = fmugym.linearize(path, at={"x1": 1.5, "x2": -0.5, "mu": 3.0})
+    model = linearize(path, at={"x1": 1.5, "x2": -0.5, "mu": 3.0})
     assert model.A.tolist() == [[0.0, 1.0], [2 * 3.0 * 1.5 * 0.5 - 1.0, 3.0 * (1.0 - 1.5**2)]]
     assert model.f.tolist() == [-0.5, 3.0 * (1.0 - 1.5**2) * -0.5 - 1.5]
-    assert fmugym.linearize(path, states="x2").A.shape == (1, 1)
+    assert linearize(path, states="x2").A.shape == (1, 1)

@@ -8,8 +8,9 @@ import pytest
 from gymnasium import spaces
 
 import fmugym
-from fmugym import ConfigError, Recorder, bundled_fmu
+from fmugym import ConfigError, bundled_fmu
 from fmugym.logs import PlantLog, play_log
+from fmugym.recording import Recorder
 from fmugym.series import RecordSeries
 
 IDS = ["fmugym/CartPole-v0", "fmugym/Pendulum-v0", "fmugym/House-v0"]

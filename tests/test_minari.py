@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym import ConfigError, Recorder, Recording
+from fmugym import ConfigError
+from fmugym.recording import Recorder, Recording, replay
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
 
@@ -57,7 +58,7 @@ def test_recordings_come_back_to_the_last_bit(env_id, data_format):
     for one, expected in zip(read_dataset("test/all-v0"), recordings, strict=True):
         for name, value in vars(expected).items():
             np.testing.assert_array_equal(getattr(one, name), value, err_msg=name)
-        assert fmugym.replay(one, env).is_equal
+        assert replay(one, env).is_equal
     env.close()
 
 

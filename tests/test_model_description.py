@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, read_fmu, write_fmu
 
-from fmugym import FMU, ArchiveLimits, ConfigError, FMULoadError, bundled_fmu
+from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
+from fmugym.archive import ArchiveLimits
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 
 

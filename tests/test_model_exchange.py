@@ -15,7 +15,8 @@ from scipy.integrate import solve_ivp
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
+from fmugym.linearization import linearize
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import SOLVERS
 from fmugym.tools.proposal import Proposal
@@ -340,7 +341,7 @@ def test_linear_models(fmu_path, version):
     """The FMU's derivatives can be read in continuous time, too."""
     plural = "s" if version == 3 else ""
     flags = f'providesDirectionalDerivative{plural}="true"'
-    model = fmugym.linearize(fmu_path("dahlquist", version, flags=flags), inputs=[], at={"k": 3})
+    model = linearize(fmu_path("dahlquist", version, flags=flags), inputs=[], at={"k": 3})
     assert model.A.tolist() == [[-3.0]]
 
 

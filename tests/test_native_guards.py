@@ -15,7 +15,7 @@ from test_native_pool import LOG, make, on_linux
 import fmugym
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts

@@ -18,7 +18,7 @@ import pytest
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
 from fmugym.trial import opening

@@ -12,10 +12,10 @@ import fmugym
 from fmugym.pool.native import NativePool
 from fmugym.pool.spec import PoolSpec
 from fmugym.tools.cli import main
-from fmugym.trial.episodes import Starts
 from fmugym.trial.known import known_verdict
 from fmugym.trial.neighbours import disturb_in_threads
 from fmugym.trial.subject import Subject
+from fmugym.trial.trial_episodes import Starts
 from fmugym.trial.verdict import Neighbours
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="its library is made for Linux")

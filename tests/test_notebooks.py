@@ -8,7 +8,7 @@ from fmu_tools import HERE
 
 import fmugym
 from fmugym.envs import CartPoleEnv
-from fmugym.episodes.progress import no_progress, progress
+from fmugym.episodes.progress_bars import no_progress, progress
 
 
 def test_objects_are_shown_in_one_informative_line():

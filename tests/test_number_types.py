@@ -8,8 +8,8 @@ import pytest
 from gymnasium import spaces
 
 import fmugym
-from fmugym import Choice, ConfigError, EnvConfig, LogUniform, Normal, Uniform
-from fmugym.config import FOREIGN
+from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform
+from fmugym.config import FOREIGN, EnvConfig
 
 TYPES = [
     int,

@@ -7,6 +7,7 @@ from example_tools import EXAMPLES, run_example
 from PIL import Image
 
 import fmugym
+from fmugym.linearization import linearize
 
 CELLS = {
     "heavy": {"plant": {"m": 0.085}},
@@ -31,7 +32,7 @@ def fixture_example():
 
 @pytest.fixture(scope="module", name="model")
 def fixture_model():
-    return fmugym.linearize(fmugym.bundled_fmu("Pendulum"))
+    return linearize(fmugym.bundled_fmu("Pendulum"))
 
 
 def test_upright_on_the_hardware_in_at_least_nine_of_ten(example, model):

@@ -14,10 +14,10 @@ from wine_tools import for_windows
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
 from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
 from fmugym.archive.texts import number_of, with_texts
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import Component, Group, SystemPlan
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import Component, Group, SystemPlan
 from fmugym.trial import opening
 
 all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)

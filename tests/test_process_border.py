@@ -51,8 +51,8 @@ class Impostor:
         with contextlib.suppress(OSError):
             self._end.shutdown(socket.SHUT_RDWR)
 
-    def exit_status(self, patience):
-        self._thread.join(patience)
+    def exit_status(self, timeout):
+        self._thread.join(timeout)
         return None if self._thread.is_alive() else 0
 
     def forget(self):

@@ -32,7 +32,7 @@ from process_tools import (
 
 import fmugym
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
 from fmugym.pool.process.launcher import _guard

@@ -10,8 +10,9 @@ import pytest
 from test_snapshots import Track
 
 import fmugym
-from fmugym import ConfigError, Recorder, Recording, SimulationError
+from fmugym import ConfigError, SimulationError
 from fmugym.envs import CartPoleEnv
+from fmugym.recording import Recorder, Recording, replay
 
 
 class Named(Track):
@@ -51,7 +52,7 @@ def test_a_file_is_replayed_to_the_last_bit(make, version, tmp_path):
     assert loaded.seed == 5
     assert loaded.drawn == recording.drawn
     with make(fmi_version=version, isolation="process") as env:
-        report = fmugym.replay(loaded, env)
+        report = replay(loaded, env)
     assert report.is_equal
     assert str(report) == "8 steps were replayed: all is equal to the last bit"
     assert (tmp_path / "episode.npz").stat().st_size < 20_000
@@ -64,7 +65,7 @@ def test_a_later_episode_and_its_options():
     assert recorder.recording.seed is None
     assert recorder.recording.drawn["m"] == 0.055
     with Track() as env:
-        assert fmugym.replay(recorder.recording, env).is_equal
+        assert replay(recorder.recording, env).is_equal
 
 
 def test_a_recorded_episode_is_that_without_a_recorder():
@@ -80,8 +81,8 @@ def test_wrappers_are_part_of_it():
     env = gymnasium.make("fmugym/CartPole-v0", max_episode_steps=4)
     recording = record(env, seed=0).recording
     assert recording.truncated.tolist() == [False, False, False, True]
-    assert fmugym.replay(recording, env).is_equal
-    report = fmugym.replay(recording, env.unwrapped)
+    assert replay(recording, env).is_equal
+    report = replay(recording, env.unwrapped)
     assert report.difference == "step 4: the flag truncated is np.False_, recorded was np.True_"
     env.close()
 
@@ -105,7 +106,7 @@ def test_the_first_difference_is_named(changes, difference):
                 value = getattr(recording, name).copy()
                 value[change] = ~value[change] if value.dtype == bool else value[change] + 1e-6
             recording = replace(recording, **{name: value})
-        report = fmugym.replay(recording, env)
+        report = replay(recording, env)
     assert difference in report.difference
     assert not report.is_equal
 
@@ -114,7 +115,7 @@ def test_other_surroundings_are_told():
     with Track() as env:
         recording = record(env, seed=0).recording
         others = {**recording.surroundings, "numpy": "1.0"}
-        report = fmugym.replay(replace(recording, surroundings=others), env)
+        report = replay(replace(recording, surroundings=others), env)
     assert report.surroundings == {"numpy": ("1.0", np.__version__)}
     assert f"numpy was '1.0', is '{np.__version__}'" in str(report)
 
@@ -132,7 +133,7 @@ class TestRefusals:
         with Track() as env, Track(time_step=0.01) as other:
             recording = record(env, seed=0).recording
             with pytest.raises(ConfigError, match="time_step"):
-                fmugym.replay(recording, other)
+                replay(recording, other)
 
     def test_of_other_environments(self):
         with pytest.raises(ConfigError, match="FMUEnv"):
@@ -221,4 +222,4 @@ class TestRefusals:
         with make() as env:
             recording = replace(record(env, seed=0).recording, actions=np.zeros(shape))
             with pytest.raises(ConfigError, match=r"action|flat element"):
-                fmugym.replay(recording, env)
+                replay(recording, env)

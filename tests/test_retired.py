@@ -6,7 +6,8 @@ from contextlib import contextmanager
 import pytest
 
 import fmugym
-from fmugym.config import FOREIGN
+from fmugym.archive import ArchiveLimits
+from fmugym.config import FOREIGN, EnvConfig
 from fmugym.declared.systems import system_of
 from fmugym.declared.task import Task
 from fmugym.retired import RETIRED
@@ -28,7 +29,7 @@ def told(key):
 def test_in_a_config(key):
     names = {"model_input_names": "u", "model_output_names": "y"}
     with told(key):
-        assert fmugym.EnvConfig.from_dict(names | {key: 1}) == fmugym.EnvConfig.from_dict(names)
+        assert EnvConfig.from_dict(names | {key: 1}) == EnvConfig.from_dict(names)
 
 
 @every_retired_key
@@ -80,7 +81,7 @@ MOVED = {
     "max_instances": 2,
     "licence_wait": 1.5,
     "preload": ("libm.so.6",),
-    "archive_limits": fmugym.ArchiveLimits(max_ratio=3),
+    "archive_limits": ArchiveLimits(max_ratio=3),
 }
 
 
@@ -89,8 +90,8 @@ def test_keys_for_experts_may_stand_where_they_stood_in_a_config():
     names = {"model_input_names": "u", "model_output_names": "y"}
     for key, value in MOVED.items():
         with pytest.warns(FutureWarning, match=rf"'{key}' now stands in the table 'foreign'"):
-            old = fmugym.EnvConfig.from_dict(names | {key: value})
-        assert old == fmugym.EnvConfig.from_dict(names | {"foreign": {key: value}})
+            old = EnvConfig.from_dict(names | {key: value})
+        assert old == EnvConfig.from_dict(names | {"foreign": {key: value}})
         assert getattr(old.foreign, key) == value
 
 

@@ -13,7 +13,7 @@ import pytest
 import fmugym
 from fmugym import ConfigError
 from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, write_report
-from fmugym.series.pictures import as_svg
+from fmugym.series.plots import as_svg
 from fmugym.vector import FMUVectorEnv
 
 TASK = {

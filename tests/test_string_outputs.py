@@ -218,7 +218,7 @@ class Rig:
 
     def step(self, inputs):
         self.steps += 1
-        return self.outputs(), fmugym.Status.OK
+        return self.outputs(), fmugym.fmi.Status.OK
 
     def outputs(self):
         return {"length": 1.0, "String_told": f"{self.word} {self.steps}"}

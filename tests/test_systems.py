@@ -27,12 +27,12 @@ from system_tools import (
 
 import fmugym
 from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import (
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import (
     MASTERS,
     Component,
     Connector,

@@ -25,7 +25,7 @@ from fmugym import (
     FMUVectorEnv,
     Uniform,
 )
-from fmugym.fmi.status import Status
+from fmugym.fmi import Status
 from fmugym.tools import cli
 
 PLANT = {

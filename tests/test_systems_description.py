@@ -11,7 +11,7 @@ from fmugym.archive.structure import Feedthrough
 from fmugym.archive.units import conversion_of_link
 from fmugym.errors import ArgumentError, ConfigError, FMULoadError
 from fmugym.systems.order import order_of, strong_components
-from fmugym.systems.plan import Link, Loop
+from fmugym.systems.system_plan import Link, Loop
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum")
 CART = {version: bundled_fmu("CartPole", version) for version in ("1.0", "2.0", "3.0")}

@@ -14,6 +14,7 @@ from vector_tools import require_same_alone
 import fmugym
 from fmugym import Component, ConfigError, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
+from fmugym.linearization import linearize
 from fmugym.systems.placing import layout_of
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
@@ -204,7 +205,7 @@ class TestEnvironments:
         assert fit.values["east.A_f"] == pytest.approx(140.0, rel=1e-3)
 
     def test_a_linear_model_has_the_names_of_the_system(self):
-        model = fmugym.linearize(two_houses())
+        model = linearize(two_houses())
         assert {"east.T_m", "west.T_m"} <= set(model.states)
         assert {"outside", "east.u", "west.u"} <= set(model.inputs)
         assert "east.T_out" not in model.inputs

@@ -30,11 +30,11 @@ from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.native import NativePool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import Component as Planned
-from fmugym.systems.plan import Connector, End, Link, Loop
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import Component as Planned
+from fmugym.systems.system_plan import Connector, End, Link, Loop
 from fmugym.tools import cli
-from fmugym.wine.loader import can_run_windows
+from fmugym.wine.installation import can_run_windows
 
 MASSES = ["first.y1", "second.y2"]
 

@@ -7,7 +7,8 @@ import pytest
 from pool_tools import open_pool, start
 from system_tools import linear_fmu
 
-from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu, linearize
+from fmugym import Component, ConfigError, Connection, FMUSystem, bundled_fmu
+from fmugym.linearization import linearize
 
 MASS, LENGTH, GRAVITY, FRICTION = 0.5, 0.4, 9.81, 0.03
 ANGLES = (0.3, -0.8)

@@ -12,8 +12,8 @@ from system_tools import (
     system,
 )
 
-from fmugym.fmi.status import Status
-from fmugym.systems.plan import Evaluation, Group, Link, Loop, SystemPlan
+from fmugym.fmi import Status
+from fmugym.systems.system_plan import Evaluation, Group, Link, Loop, SystemPlan
 
 NAMES = ("a", "b", "c")
 COUNT = 150

@@ -17,9 +17,9 @@ from pool_tools import open_pool, start, step
 
 from fmugym import FMUSystem
 from fmugym.pool import PoolSpec
-from fmugym.pool.rungs import find_rungs
+from fmugym.pool.component_resets import find_component_resets
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.fmu import SystemFMU
+from fmugym.systems.system_fmu import SystemFMU
 from fmugym.tools import cli
 from fmugym.trial.trial import examine
 
@@ -189,7 +189,7 @@ class TestChoice:
                 for method, own in zip(methods, truth, strict=True)
             )
 
-        return find_rungs(offers, base, is_right), asked
+        return find_component_resets(offers, base, is_right), asked
 
     @pytest.mark.parametrize("truth", MIXES)
     def test_each_gets_its_own(self, truth):
@@ -204,7 +204,7 @@ class TestChoice:
         assert len(asked) == 1
 
     def test_what_is_wrong_together_is_not_used(self):
-        assert find_rungs(self.OFFERS, RESET, lambda m: list(m).count(RESTORE) < 2) == ()
+        assert find_component_resets(self.OFFERS, RESET, lambda m: list(m).count(RESTORE) < 2) == ()
 
     def test_nothing_is_tried_without_a_choice(self):
         found, asked = self.find(((INSTANCE,),) * 2, INSTANCE, (INSTANCE,) * 2)

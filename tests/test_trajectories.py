@@ -11,8 +11,9 @@ from test_snapshots import POOLS, vector_of
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
-from fmugym import ConfigError, SimulationError, linearize_along
+from fmugym import ConfigError, SimulationError
 from fmugym.envs import CartPoleEnv
+from fmugym.linearization import derivatives, linearize, linearize_along
 from fmugym.linearization.trajectories import discrete
 from fmugym.pool.native import NativePool
 
@@ -93,7 +94,7 @@ class TestDifferences:
             env.reset(seed=0)
             snapshot = env.save_state()
         envs = vector_of(Precise, 32)
-        by_actions = fmugym.derivatives(envs, snapshot, TORQUES).by_actions
+        by_actions = derivatives(envs, snapshot, TORQUES).by_actions
         found = linearize_along(envs, snapshot, TORQUES, states=STARTS)
         envs.close()
         effect = found.B[2]
@@ -219,7 +220,7 @@ class TestDirectional:
                 super().__init__(model_parameters={"q_0": np.pi})
 
         found = along(Upright, np.zeros((2, 1)))
-        model = fmugym.linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
+        model = linearize(fmugym.bundled_fmu("Pendulum"), at={"q_0": np.pi})
         joined = np.zeros((3, 3))
         joined[:2] = np.hstack([model.A, model.B])
         expected = expm(joined * DT)[:2]
@@ -451,7 +452,7 @@ class TestRefusals:
         envs = vector_of(Precise, 2)
         envs.reset(seed=0)
         snapshot, zeros = envs.save_state(), np.zeros((3, 1))
-        for function in (linearize_along, fmugym.derivatives):
+        for function in (linearize_along, derivatives):
             with pytest.raises(ConfigError, match="FMUVectorEnv"):
                 function(Precise, snapshot[0], zeros)
             with pytest.raises(ConfigError, match="2 environments"):
@@ -459,9 +460,9 @@ class TestRefusals:
             with pytest.raises(ConfigError, match="save_state"):
                 function(envs, None, zeros)
         with pytest.raises(ConfigError, match="step"):
-            fmugym.derivatives(envs, snapshot[0], zeros, step=-1.0)
+            derivatives(envs, snapshot[0], zeros, step=-1.0)
         envs.close()
-        for function in (linearize_along, fmugym.derivatives):
+        for function in (linearize_along, derivatives):
             with pytest.raises(SimulationError, match="closed"):
                 function(envs, snapshot[0], zeros)
 

@@ -14,12 +14,10 @@ from fmu_tools import PlainEnv, probe_config, probe_fmu
 import fmugym
 from fmugym import (
     FMU,
-    ArchiveLimits,
     Choice,
     Component,
     ConfigError,
     Connection,
-    EnvConfig,
     FMI1CSEnv,
     FMI2CSEnv,
     FMI3CSEnv,
@@ -29,7 +27,9 @@ from fmugym import (
     Uniform,
     bundled_fmu,
 )
+from fmugym.archive import ArchiveLimits
 from fmugym.baselines import PID
+from fmugym.config import EnvConfig
 from fmugym.errors import ArgumentError
 from fmugym.task.readings import READINGS
 

@@ -9,8 +9,9 @@ import pytest
 from test_threads import MANY, call_at_once, interrupt, run_together
 from vector_tools import results_of_both
 
-from fmugym import SimulationError, linearize_along
+from fmugym import SimulationError
 from fmugym.envs import CartPoleEnv
+from fmugym.linearization import linearize_along
 from fmugym.vector import FMUVectorEnv
 
 ACTIONS = np.zeros(3, np.int64)

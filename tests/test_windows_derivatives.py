@@ -12,7 +12,8 @@ from test_trajectories import STARTS, TORQUES, along
 from wine_tools import building_for_windows, exchange_fmu, for_windows
 
 import fmugym
-from fmugym import SimulationError, bundled_fmu, linearize
+from fmugym import SimulationError, bundled_fmu
+from fmugym.linearization import linearize
 
 PARTS = ("A", "B", "f", "x0", "u0")
 

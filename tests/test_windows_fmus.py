@@ -28,8 +28,8 @@ from fmugym.pool.spec import PoolSpec
 from fmugym.tools import cli
 from fmugym.trial import opening
 from fmugym.vector import episodes
-from fmugym.wine import program
-from fmugym.wine.loader import can_run_windows
+from fmugym.wine import windows_worker
+from fmugym.wine.installation import can_run_windows
 
 LOG = logging.getLogger("fmugym.test")
 
@@ -48,7 +48,7 @@ def fixture_bare(monkeypatch, tmp_path):
     """A machine without Wine and ziglang."""
     monkeypatch.setenv("FMUGYM_WINE", "/nowhere/wine64")
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(program, "_compiler_version", lambda: "")
+    monkeypatch.setattr(windows_worker, "_compiler_version", lambda: "")
 
 
 def open_pool(path, num_instances=1, inputs=("f",), outputs=("x", "theta"), **options):
@@ -118,16 +118,24 @@ class TestChoice:
 class TestProgram:
     def test_its_sources_fit_the_native_pool(self, tmp_path):
         """Without Wine, too: what they use of the native pool is there."""
-        for path in program.sources():
+        for path in windows_worker.sources():
             if path.parent.name == "worker" and path.suffix == ".c":
-                command = [sys.executable, "-m", "ziglang", "cc", "-c", *program._OPTIONS, path]
+                command = [
+                    sys.executable,
+                    "-m",
+                    "ziglang",
+                    "cc",
+                    "-c",
+                    *windows_worker._OPTIONS,
+                    path,
+                ]
                 done = subprocess.run(
                     [*command, "-o", "made.o"], cwd=tmp_path, capture_output=True, text=True
                 )
                 assert done.returncode == 0, done.stderr
 
     def test_its_sources_are_found(self):
-        names = {path.name for path in program.sources()}
+        names = {path.name for path in windows_worker.sources()}
         assert {"main.c", "requests.c", "fmi1.c", "fmi2.c", "fmi3.c", "pool.h"} <= names
 
     def test_a_checkout_and_an_installed_package_share_it(self, monkeypatch, tmp_path):
@@ -138,23 +146,23 @@ class TestProgram:
             files = folder / "pool.h", folder / "worker" / "main.c"
             for file in files:
                 file.write_text(f"/* {file.name} */")
-            monkeypatch.setattr(program, "sources", lambda files=files: files)
-            digests.add(program._digest.__wrapped__())
+            monkeypatch.setattr(windows_worker, "sources", lambda files=files: files)
+            digests.add(windows_worker._digest.__wrapped__())
         assert len(digests) == 1
 
     def test_without_a_compiler_one_that_was_built_before_is_used(self, bare, tmp_path):
-        assert program.known_program() is None
-        built = program.wine_folder() / f"worker-{program._digest()}-0.0.0.exe"
+        assert windows_worker.known_program() is None
+        built = windows_worker.wine_folder() / f"worker-{windows_worker._digest()}-0.0.0.exe"
         built.touch()
-        assert program.known_program() == built
+        assert windows_worker.known_program() == built
 
     def test_a_compiler_that_fails_is_quoted(self, monkeypatch, tmp_path):
         monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
         broken = tmp_path / "broken.c"
         broken.write_text("#error nonsense\n")
-        monkeypatch.setattr(program, "sources", lambda: (broken,))
+        monkeypatch.setattr(windows_worker, "sources", lambda: (broken,))
         with pytest.raises(FMULoadError, match="nonsense"):
-            program.worker_program()
+            windows_worker.worker_program()
         assert not list(tmp_path.glob("wine/*.exe"))
 
 

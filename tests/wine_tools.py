@@ -13,7 +13,7 @@ import fmu_tools
 import pytest
 
 from fmugym import FMU
-from fmugym.wine.loader import can_run_windows, obstacle_to_wine
+from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
 FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
 PREFIXES = {1: "Model_fmi", 2: "fmi2", 3: "fmi3"}

@@ -1,6 +1,7 @@
 """Pages of the reference that are made of docstrings: all public names, room by room."""
 
 import inspect
+from pkgutil import resolve_name
 from typing import Any, Final
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -15,21 +16,24 @@ PAGES: Final = {
         "FMI2CSEnv",
         "FMI3CSEnv",
         *("FMI1MEEnv", "FMI2MEEnv", "FMI3MEEnv"),
-        "EnvConfig",
+        "config.EnvConfig",
         "register",
     ),
     "Many environments": ("FMUVectorEnv",),
     "Task files": ("load", "Task", "TaskEnv"),
     "Distributions": ("Uniform", "Normal", "LogUniform", "Choice"),
-    "Thinking ahead": ("Snapshot", "derivatives", "linearize", "linearize_along", "LinearModel"),
-    "Agents": ("load_agent",),
-    "Recordings": ("Recorder", "Recording", "replay"),
-    "FMUs": ("FMU", "ArchiveLimits", "Status", "bundled_fmu"),
+    "Thinking ahead": ("Snapshot",),
+    "Agents": ("training.agents.load_agent",),
+    "FMUs": ("FMU", "archive.ArchiveLimits", "fmi.Status", "bundled_fmu"),
     "Systems": ("FMUSystem", "Component", "Connection"),
-    "Rigs": ("Backend", "Paced"),
+    "Rigs": ("pool.Backend", "pool.Paced"),
     "Errors": (),  # and all other exceptions
 }
+"""Names in ``fmugym``, and others by their modules in it."""
+
 MODULES: Final = {
+    "Recordings": "fmugym.recording",
+    "Linear models": "fmugym.linearization",
     "Baselines": "fmugym.baselines",
     "Stable-Baselines3": "fmugym.sb3",
     "TorchRL": "fmugym.torchrl",
@@ -72,7 +76,7 @@ def _names() -> dict[str, list[str]]:
 
 
 def _block(name: str) -> str:
-    value = getattr(fmugym, name)
+    value = resolve_name(f"fmugym.{name}")
     return f"::: {value.__module__}.{value.__qualname__}"
 
 

@@ -20,11 +20,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Protocol, runtime_checkable
 
-from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
+from fmugym.archive.dependencies import ask_in_a_child, describe_missing, missing_libraries
 from fmugym.archive.description import INTERFACES
 from fmugym.archive.executable import check_library
 from fmugym.archive.loadable import LoadableFMU
-from fmugym.archive.missing import describe_missing
 from fmugym.archive.reading import read_model_description, read_root
 from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
@@ -33,7 +32,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import KnownArguments, check_mapping, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.signals import ordinary
-from fmugym.wine.loader import can_run_windows, obstacle_to_wine
+from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
 __all__ = ["DEFAULT_PROBE_TIMEOUT", "FMU", "StandsForFMU", "file_digest"]
 

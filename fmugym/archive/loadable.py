@@ -16,12 +16,12 @@ from fmugym.archive import loader
 from fmugym.archive.bundled import is_bundled
 from fmugym.archive.dependencies import (
     ask_in_a_child,
+    describe_missing,
     load_globally,
     missing_libraries,
     stray_libraries,
 )
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.missing import describe_missing
 from fmugym.errors import FMULoadError
 
 __all__ = ["ExtractedFMU", "LoadableFMU"]

@@ -175,7 +175,7 @@ class LQR(Controller):
     equation. Needs SciPy (the extra ``identification``).
 
     Args:
-        model: The linear model, from ``fmugym.linearize`` at an equilibrium.
+        model: The linear model, from ``fmugym.linearization.linearize`` at an equilibrium.
         q: The weights of the states: one each, or the matrix Q of shape (n, n).
         r: The weights of the inputs: one each, or the matrix R of shape (m, m).
         of: The names of the states in the observation; by default those of the model.

@@ -1,7 +1,7 @@
 """Expressions: arithmetic over the names of a task, as text.
 
 The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons, ``and``, ``or``,
-``not``, ``a if condition else b``, and calls of the functions of ``fmugym.declared.functions``.
+``not``, ``a if condition else b``, and calls of the functions of ``fmugym.declared.mathematics``.
 ``previous(x)`` is the value of ``x`` before the step. There are no attributes, subscripts, texts or
 assignments. Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
 
@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.declared.functions import FUNCTIONS, OPERATIONS
+from fmugym.declared.mathematics import FUNCTIONS, OPERATIONS
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["CONSTANTS", "Code", "Expression", "Names", "code_of_number", "function_of"]

@@ -8,8 +8,8 @@ from typing import Any
 
 from fmugym.checks import check_flag
 from fmugym.declared.entries import Entry
-from fmugym.declared.env import TaskEnv
 from fmugym.declared.task import Task
+from fmugym.declared.task_env import TaskEnv
 from fmugym.env import FMUEnv
 from fmugym.errors import ArgumentError, reason, shown, unknown_name
 from fmugym.signals import ordinary

@@ -1,15 +1,18 @@
-"""Durations such as ``"15min"``."""
+"""Numbers, distributions and durations of a task."""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from fmugym.checks import check_number
+from fmugym.checks import check_mapping, check_number, number_of
+from fmugym.declared.expressions import Expression
+from fmugym.distributions import as_distribution, is_distribution
 from fmugym.errors import ConfigError, shown
 
-__all__ = ["duration"]
+__all__ = ["duration", "finite", "number", "number_or_distribution"]
 
 _SECONDS: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 _NEGATIVE: Final = re.compile(r"\s*-\s*\d")
@@ -40,3 +43,40 @@ def duration(what: str, value: Any) -> float:
             f"(units: {', '.join(_SECONDS)}), got {shown(value)}"
         )
     return total
+
+
+def number(what: str, value: Any) -> float:
+    """A number of a task: a number, or a text with an expression of constants, such as ``pi / 2``.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    if isinstance(value, str):
+        return Expression.parse(value).constant()
+    return number_of(what, value, may_be_boolean=True)
+
+
+def finite(what: str, value: Any) -> float:
+    """A finite number of a task, as ``number``."""
+    return check_number(what, number(what, value), may_be_boolean=True)
+
+
+def number_or_distribution(what: str, value: Any, read: Callable[[str, Any], Any] = finite) -> Any:
+    """A number, or a distribution, whose numbers may be texts with expressions of constants.
+
+    Args:
+        what: Its name, for the error.
+        value: As the user gave it.
+        read: Reads what is no distribution.
+
+    Raises:
+        ConfigError: If it is neither.
+    """
+    if is_distribution(value):
+        return value
+    if not isinstance(value, Mapping):
+        return read(what, value)
+    items = check_mapping(what, value)
+    for name in items.keys() - {"distribution", "values", "probabilities"}:
+        items[name] = number(name, items[name])
+    return as_distribution(what, items)

@@ -12,7 +12,7 @@ from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry, gathered
-from fmugym.declared.values import number_or_distribution
+from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.ranges import within

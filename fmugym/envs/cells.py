@@ -16,7 +16,7 @@ from fmugym.checks import check_number, check_text, has_method
 from fmugym.errors import ConfigError, shown
 from fmugym.fmi.status import Status
 from fmugym.pool import Paced
-from fmugym.pool.backend.clock import RealClock
+from fmugym.pool.backend.clocks import RealClock
 from fmugym.signals import ordinary
 
 __all__ = ["Cell", "Lease", "paced_cells"]

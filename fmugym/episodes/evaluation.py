@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import plain
 from fmugym.extras import imported

@@ -14,7 +14,7 @@ from fmugym.baselines.base import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [

@@ -4,11 +4,11 @@
 and ``write_onnx`` write it. See ``docs/deploy.md``.
 """
 
-from fmugym.export.agent import Agent, agent_of
+from fmugym.export.c99 import write_c
+from fmugym.export.exportable import Agent, agent_of
 from fmugym.export.fmus import write_fmu
 from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
 from fmugym.export.onnx_model import write_onnx
-from fmugym.export.writing import write_c
 
 __all__ = [
     "Activation",

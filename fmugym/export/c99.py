@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import ConfigError
-from fmugym.export.agent import Agent
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, shown
+from fmugym.export.exportable import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines
 from fmugym.export.names import identifiers
 from fmugym.export.operations import HELPERS, TYPES, constant, expression
 from fmugym.vector.hooks.graph import Node
 
-__all__ = ["field_names", "header", "source"]
+__all__ = ["field_names", "header", "source", "write_c"]
 
 _LONGEST_INLINE: Final = 56
 
@@ -334,3 +337,29 @@ class _Source:
         for field, kept in zip(self._fields, self._logic.kept, strict=True):
             if kept.updates:
                 yield from self._stored(f"state->{field}", kept.updates, c_type(kept.dtype))
+
+
+def write_c(agent: Agent, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write an agent as C99: a header and a source file, which need nothing but the C library.
+
+    Args:
+        agent: The agent. Its name is that of the files.
+        folder: Where to write them; neither file may exist.
+
+    Returns:
+        The paths of the header and the source.
+
+    Raises:
+        ConfigError: If the task computes what cannot be written in C; the text names it.
+        FileExistsError: If a file exists.
+    """
+    place = check_path("folder", folder)
+    if not place.is_dir():
+        raise ConfigError(f"{shown(str(place))} is no folder")
+    texts = {f"{agent.name}.h": header(agent), f"{agent.name}.c": source(agent)}
+    for name in texts:
+        if (place / name).exists():
+            raise FileExistsError(f"{place / name} exists")
+    for name, text in texts.items():
+        (place / name).write_text(text, encoding="ascii", newline="\n")
+    return [place / name for name in texts]

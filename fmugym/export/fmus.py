@@ -14,11 +14,11 @@ from typing import Final
 
 from fmugym.checks import check_option, check_path
 from fmugym.errors import ConfigError, shown
-from fmugym.export.agent import Agent
 from fmugym.export.building import PLATFORMS, compiled, header_folder, own_platform
 from fmugym.export.c99 import field_names, header, source
-from fmugym.export.description import Port, kind_of, model_description, ports_of
+from fmugym.export.exportable import Agent
 from fmugym.export.layers import c_type
+from fmugym.export.model_description import Port, kind_of, model_description, ports_of
 from fmugym.export.operations import constant
 
 __all__ = ["FMI_VERSIONS", "write_fmu"]

@@ -21,8 +21,8 @@ from fmugym.archive.variable import Variable
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.export.decisions import Decision
-from fmugym.export.devices import without_imperfections
 from fmugym.export.external import found_in
+from fmugym.export.imperfections import without_imperfections
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph, Node

@@ -13,8 +13,8 @@ from gymnasium import spaces
 
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
-from fmugym.export.agent import Agent
 from fmugym.export.c99 import field_names
+from fmugym.export.exportable import Agent
 from fmugym.export.network import Activation, Network, Scaling
 from fmugym.export.onnx_nodes import Nodes, imported_onnx
 from fmugym.export.onnx_operations import computed, interpolated

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.systems.description import PartVariable
-from fmugym.systems.layout import Layout, Route
+from fmugym.systems.slots import Layout, Route
+from fmugym.systems.system_description import PartVariable
 
 __all__ = ["chained_jacobian"]
 

@@ -7,8 +7,8 @@ results as parameter values or, with their uncertainty, as distributions.
 The package needs SciPy, which the extra ``identification`` installs.
 """
 
+from fmugym.identification.comparison import Comparison, plot_comparison
 from fmugym.identification.output_error import FitResult, fit_parameters
-from fmugym.identification.results import Comparison, plot_comparison
 from fmugym.identification.swing import SwingFit, fit_swing
 from fmugym.identification.trajectory import Trajectory
 

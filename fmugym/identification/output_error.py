@@ -19,8 +19,8 @@ from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
+from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Experiment, Limits, Problem
-from fmugym.identification.results import Comparison
 from fmugym.identification.statistics import confidence_intervals, normal_distributions
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray

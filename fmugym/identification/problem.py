@@ -19,8 +19,8 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, check_text, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
-from fmugym.identification.results import Comparison
-from fmugym.identification.simulation import Simulator
+from fmugym.identification.comparison import Comparison
+from fmugym.identification.simulator import Simulator
 from fmugym.identification.statistics import information_inverse
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.lazy import scipy_module

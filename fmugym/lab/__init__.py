@@ -17,11 +17,11 @@ delay, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
 
 from fmugym.lab.client import Client
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
-from fmugym.lab.errors import LabError
 from fmugym.lab.lab import Lab, current_lab
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import HARDWARE, IDEAL, Options
 from fmugym.lab.users import User
-from fmugym.pool.backend.clock import Clock, ManualClock, RealClock
+from fmugym.pool.backend.clocks import Clock, ManualClock, RealClock
 
 __all__ = [
     "HARDWARE",

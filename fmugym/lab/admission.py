@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from fmugym.lab.bookings import Bookings
 from fmugym.lab.data import CellType
-from fmugym.lab.errors import LabError
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
-from fmugym.lab.requests import Request, check_range
+from fmugym.lab.request_checks import Request, check_range
 from fmugym.lab.sessions import Gym
 from fmugym.lab.users import User
 

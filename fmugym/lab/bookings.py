@@ -12,8 +12,8 @@ from typing import Final, TypeVar
 
 from fmugym.lab.cell import Cell
 from fmugym.lab.data import CellType
-from fmugym.lab.errors import LabError
-from fmugym.lab.requests import Request
+from fmugym.lab.lab_error import LabError
+from fmugym.lab.request_checks import Request
 from fmugym.lab.sessions import Gym, Session
 
 __all__ = ["Bookings", "new_token"]

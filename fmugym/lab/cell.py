@@ -16,15 +16,14 @@ from fmugym.archive.fmu import FMU
 from fmugym.checks import check_mapping
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.lab.acting import Acting
 from fmugym.lab.data import CellType
-from fmugym.lab.disturbance import Disturbance
+from fmugym.lab.disturbance import Acting, Disturbance
 from fmugym.lab.drive import HOLD_DAMPING, Drive
-from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
-from fmugym.lab.recording import Recording
 from fmugym.lab.sensors import Sensors
+from fmugym.lab.video_files import Recording
 from fmugym.pool import Pool, PoolSpec
 from fmugym.signals import ordinary
 from fmugym.task.starting import checked_value, start_variable

@@ -9,8 +9,8 @@ from fmugym.errors import ConfigError, shown
 from fmugym.lab.current import CURRENT
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
 from fmugym.lab.disturbance import Disturbance
-from fmugym.lab.errors import LabError
-from fmugym.lab.requests import Request
+from fmugym.lab.lab_error import LabError
+from fmugym.lab.request_checks import Request
 from fmugym.lab.service import Service
 from fmugym.signals import ordinary
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from fmugym.lab.data import ActuatorInfo
-from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
-from fmugym.lab.requests import entries_of, gains_of
+from fmugym.lab.request_checks import entries_of, gains_of
 from fmugym.lab.sessions import Session
 
 __all__ = ["Quantity", "actuators", "command", "read", "set_gains"]

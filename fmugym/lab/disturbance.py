@@ -15,10 +15,12 @@ from typing import Any, Final, Protocol
 
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.lab.drive import HOLD_DAMPING
 from fmugym.signals import ordinary
 
 __all__ = [
     "PRESETS",
+    "Acting",
     "Disturbance",
     "StateDependentPositionDisturbance",
     "StateDependentTorqueDisturbance",
@@ -276,3 +278,49 @@ def _check(disturbance: Any, joints: int) -> None:
             raise ConfigError(f"{name}: {attribute} has {len(entries)} entries for {joints} joints")
     if disturbance.torque is None and disturbance.position is not None:
         _vector(f"{name}: position", disturbance.position)
+
+
+_PULL_STIFFNESS: Final = 0.43  # N m/rad, as of the controller that holds the start position
+
+
+class Acting:
+    """Applies one disturbance.
+
+    Args:
+        disturbance: The disturbance.
+    """
+
+    def __init__(self, disturbance: Disturbance) -> None:
+        self._disturbance = disturbance
+        self._began: float | None = None
+
+    def apply(
+        self,
+        time: float,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        torque: Sequence[float],
+    ) -> list[float]:
+        """Add the disturbance to the torques, or replace them while it pulls to a position.
+
+        Args:
+            time: Time of the session, in s.
+            position: Angles of the joints, in rad.
+            velocity: Angular velocities of the joints, in rad/s.
+            torque: Torques on the joints, in N m.
+
+        Returns:
+            Torques on the joints, in N m.
+        """
+        disturbance = self._disturbance
+        if self._began is None and disturbance.is_due(time, position):
+            self._began = time
+        if self._began is None or time - self._began >= disturbance.duration:
+            return list(torque)
+        if disturbance.torque is not None:
+            return [own + other for own, other in zip(torque, disturbance.torque, strict=True)]
+        targets = disturbance.position or [0.0] * len(position)
+        return [
+            _PULL_STIFFNESS * (target - q) - HOLD_DAMPING * v
+            for target, q, v in zip(targets, position, velocity, strict=False)
+        ]

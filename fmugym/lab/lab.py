@@ -18,7 +18,7 @@ from fmugym.lab.data import CellType
 from fmugym.lab.presets import Options, make_options
 from fmugym.lab.service import Service
 from fmugym.lab.users import User
-from fmugym.pool.backend.clock import Clock, RealClock
+from fmugym.pool.backend.clocks import Clock, RealClock
 
 __all__ = ["Lab", "current_lab"]
 

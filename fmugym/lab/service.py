@@ -20,19 +20,19 @@ from fmugym.lab import controls
 from fmugym.lab.admission import check_lease, check_request
 from fmugym.lab.bookings import Bookings, new_token
 from fmugym.lab.cell import Cell
+from fmugym.lab.cell_pictures import CellPicture, LiveView
 from fmugym.lab.controls import Quantity
 from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
-from fmugym.lab.errors import LabError, as_lab_error
-from fmugym.lab.network import Network
-from fmugym.lab.pictures import CellPicture, LiveView
+from fmugym.lab.delays import Delays
+from fmugym.lab.lab_error import LabError, as_lab_error
 from fmugym.lab.presets import Options
-from fmugym.lab.recording import Recording
-from fmugym.lab.requests import Request, cell_types_of, text_of
+from fmugym.lab.request_checks import Request, cell_types_of, text_of
 from fmugym.lab.sessions import Gym, Session
 from fmugym.lab.timekeeper import Timekeeper
 from fmugym.lab.users import Account, Accounts
+from fmugym.lab.video_files import Recording
 from fmugym.lab.videos import VideoFolder
-from fmugym.pool.backend.clock import Clock
+from fmugym.pool.backend.clocks import Clock
 
 __all__ = ["Service"]
 
@@ -72,7 +72,7 @@ class Service:
     ) -> None:
         self.options, self.clock = options, clock
         self._time = Timekeeper(clock)
-        self._network = Network(options, self._time, rng)
+        self._delays = Delays(options, self._time, rng)
         self._bookings = Bookings(cells)
         self._accounts = Accounts(users, options, self._time.opened)
         self._videos = VideoFolder(video_folder)
@@ -105,13 +105,13 @@ class Service:
 
     def user_info(self, user_token: str) -> UserInfo:
         """See ``Client.get_user_info``."""
-        self._network.wait_for_getter()
+        self._delays.wait_for_getter()
         with self._lock:
             return self._account(user_token).info(self._now())
 
     def cell_infos(self, user_token: str) -> list[CellInfo]:
         """See ``Client.get_cells``."""
-        self._network.wait_for_getter()
+        self._delays.wait_for_getter()
         with self._lock:
             self._account(user_token)
             return [CellInfo(cell.cell_id, cell.cell_type) for cell in self._bookings.cells]
@@ -120,7 +120,7 @@ class Service:
 
     def start_gym(self, user_token: str, length: float, wanted: Sequence[CellType]) -> str:
         """See ``Client.start_gym``."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         kinds = cell_types_of(wanted)
         with self._lock:
             account = self._account(user_token)
@@ -133,7 +133,7 @@ class Service:
 
     def start_experiment(self, user_token: str, request: Request) -> str:
         """See ``Client.start_experiment``; returns the session token."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             account = self._account(user_token)
             self._admit(account, request, None)
@@ -142,7 +142,7 @@ class Service:
 
     def start_episode(self, gym_token: str, request: Request) -> str:
         """See ``Client.start_episode``; returns the episode token."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             gym = self._open_gym(gym_token)
             self._admit(gym.account, request, gym)
@@ -153,7 +153,7 @@ class Service:
 
     def stop_session(self, token: str, kind: Literal["experiment", "episode"]) -> str:
         """See ``Client.stop_experiment`` and ``Client.stop_episode``."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             session = self._bookings.find(text_of(kind, token), Session, kind)
             session.bring_to(self._now())
@@ -167,7 +167,7 @@ class Service:
 
     def stop_gym(self, gym_token: str) -> None:
         """See ``Client.stop_gym``."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             now = self._now()
             gym = self._bookings.find(text_of("gym", gym_token), Gym, "gym")
@@ -180,31 +180,31 @@ class Service:
 
     def read(self, token: str, quantity: Quantity) -> float | list[float]:
         """Return the newest reading of a cell: a float for one actuator, a list for two."""
-        self._network.wait_for_getter()
+        self._delays.wait_for_getter()
         with self._lock:
             return controls.read(self._session(token), quantity)
 
     def command(self, token: str, quantity: Quantity, value: Any) -> None:
         """Set a target of the drive, or its torque; None entries leave a joint unchanged."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             controls.command(self._session(token), self.options, quantity, value)
 
     def set_gains(self, token: str, kp: Any, kd: Any) -> None:
         """Set the drive's stiffness in N m/rad and damping in N m s/rad."""
-        self._network.wait_for_setter()
+        self._delays.wait_for_setter()
         with self._lock:
             controls.set_gains(self._session(token), kp, kd)
 
     def actuator_info(self, token: str) -> list[ActuatorInfo]:
         """See ``Client.get_actuator_info``."""
-        self._network.wait_for_getter()
+        self._delays.wait_for_getter()
         with self._lock:
             return controls.actuators(self._session(token), self.options)
 
     def logs(self, token: str) -> str:
         """See ``Client.get_logs``."""
-        self._network.wait_for_getter()
+        self._delays.wait_for_getter()
         with self._lock:
             return "\n".join(self._session(token).log)
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 from fmugym.lab.cell import Cell
-from fmugym.lab.errors import LabError
-from fmugym.lab.pictures import LiveView
-from fmugym.lab.recording import Recording
+from fmugym.lab.cell_pictures import LiveView
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.users import Account
+from fmugym.lab.video_files import Recording
 
 __all__ = ["Gym", "Session"]
 

@@ -7,8 +7,8 @@ from typing import Final
 
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError, shown
-from fmugym.lab.errors import LabError, as_lab_error
-from fmugym.pool.backend.clock import Clock
+from fmugym.lab.lab_error import LabError, as_lab_error
+from fmugym.pool.backend.clocks import Clock
 from fmugym.signals import ordinary
 
 __all__ = ["Timekeeper"]

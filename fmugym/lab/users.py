@@ -12,8 +12,8 @@ from typing import Any, Final
 from fmugym.checks import check_flag, check_integer, check_number
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.lab.data import UserInfo
-from fmugym.lab.errors import LabError
 from fmugym.lab.experiments import EXPERIMENTS
+from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
 
 __all__ = ["Account", "Accounts", "Bucket", "User"]

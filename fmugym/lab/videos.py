@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.errors import ConfigError, shown
-from fmugym.lab.errors import LabError
-from fmugym.lab.pictures import CellPicture
-from fmugym.lab.recording import Recording, check_can_record, write_video
+from fmugym.lab.cell_pictures import CellPicture
+from fmugym.lab.lab_error import LabError
+from fmugym.lab.video_files import Recording, check_can_record, write_video
 from fmugym.signals import ordinary
 
 __all__ = ["VideoFolder"]

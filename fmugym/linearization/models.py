@@ -19,11 +19,11 @@ from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
+from fmugym.pool.licences import licence_errors
 from fmugym.pool.local import local_pool
-from fmugym.pool.patience import licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 from fmugym.task.starting import checked_value, start_values
 
 __all__ = ["LinearModel", "linearize"]

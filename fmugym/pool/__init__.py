@@ -1,7 +1,7 @@
 """Pools: N instances of one FMU behind arrays, knowing nothing of actions and rewards."""
 
+from fmugym.pool.backend.backend_pool import Backend, BackendPool
 from fmugym.pool.backend.pacing import Paced
-from fmugym.pool.backend.pool import Backend, BackendPool
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.extension import has_native_pool
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec

@@ -79,7 +79,7 @@ class Pool(ABC):
     The pool returns the same two arrays for outputs and statuses each time; the next call
     overwrites them.
 
-    A status is a ``fmugym.fmi.status.Status``. A failure of an FMU is never raised, because it
+    A status is a ``fmugym.fmi.Status``. A failure of an FMU is never raised, because it
     concerns one instance only. Its status shows the failure, and ``failure`` gives the reason.
     Its outputs stay as they were before the call, and the next reset repairs or replaces the
     instance. The same holds for an instance whose inputs are not finite: it is not stepped.
@@ -237,8 +237,8 @@ class Pool(ABC):
         return ResetMethod.RESET
 
     @property
-    def is_attended(self) -> bool:
-        """Whether something goes with ``reset``, so that no other call should start episodes."""
+    def retries_resets(self) -> bool:
+        """Whether ``reset`` may be tried again, so that no other call should start episodes."""
         return False
 
     @property

@@ -9,7 +9,7 @@ import logging
 
 from fmugym.archive.description import ModelDescription
 from fmugym.pool.reports import as_record
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 
 __all__ = ["Receiver"]
 

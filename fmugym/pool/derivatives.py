@@ -14,8 +14,8 @@ from fmugym.fmi.chain import chained_jacobian
 from fmugym.pool.base import FloatArray
 from fmugym.pool.form import table_of
 from fmugym.pool.spec import PoolSpec
-from fmugym.systems.description import SystemDescription
-from fmugym.systems.layout import Layout
+from fmugym.systems.slots import Layout
+from fmugym.systems.system_description import SystemDescription
 
 __all__ = ["Question", "Variables", "differentiated"]
 

@@ -31,10 +31,10 @@ from fmugym.pool.spec import (
     ResetMethod,
     is_start_time,
 )
-from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.layout import Layout, PartLayout, array_key
-from fmugym.systems.plan import Loop
-from fmugym.wine.loader import windows_path, windows_uri
+from fmugym.systems.slots import Layout, PartLayout, array_key
+from fmugym.systems.system_description import PartVariable, SystemDescription
+from fmugym.systems.system_plan import Loop
+from fmugym.wine.installation import windows_path, windows_uri
 
 __all__ = [
     "START_TIME_TYPE",
@@ -82,8 +82,8 @@ _NO_CLOCK: Final = 2**32 - 1
 _BLANK: Final = 8
 """Every item begins at a multiple of so many bytes."""
 
-_RUNGS: Final = tuple(ResetMethod)
-"""In the order of ``Rung`` of ``native/system.h``."""
+_RESET_METHODS: Final = tuple(ResetMethod)
+"""In the order of ``ResetMethod`` of ``native/system.h``."""
 
 _NO_FMU: Final = 2, 0
 """Version and manner of functions that are never called."""
@@ -418,10 +418,10 @@ def _write_system(
     writer: Writer, description: SystemDescription, spec: PoolSpec, files: Files
 ) -> None:
     layout = Layout(description, spec.inputs, spec.outputs)
-    rungs = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
+    methods = spec.component_resets or (ResetMethod.RESET,) * len(layout.parts)
     writer.integers(layout.plan.master == "jacobi", len(layout.parts))
-    for part, rung, resources in zip(layout.parts, rungs, files.resources, strict=True):
-        _write_part(writer, part, spec, rung, resources)
+    for part, method, resources in zip(layout.parts, methods, files.resources, strict=True):
+        _write_part(writer, part, spec, method, resources)
     _write_routes(writer, layout)
     _write_arrays(writer, layout)
     _write_ends(writer, layout)
@@ -440,13 +440,13 @@ def _write_system(
 
 
 def _write_part(
-    writer: Writer, part: PartLayout, spec: PoolSpec, rung: ResetMethod, resources: bytes
+    writer: Writer, part: PartLayout, spec: PoolSpec, method: ResetMethod, resources: bytes
 ) -> None:
     description, label = part.description, part.label
     version = description.fmi_major_version
     for name in (part.component.name, label, f"{label}, whose outputs are not finite"):
         writer.text(name.encode())
-    writer.integers(version, manner_of(description), part.has_mode, _RUNGS.index(rung))
+    writer.integers(version, manner_of(description), part.has_mode, _RESET_METHODS.index(method))
     writer.integers(part.component.steps)
     _write_identity(writer, description, resources)
     _write_solving(writer, description, spec)

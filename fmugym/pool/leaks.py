@@ -20,7 +20,7 @@ from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.extension import passes_refusals
 from fmugym.pool.health import Column, HealthArray
-from fmugym.pool.memory import grown_bytes, heap_bytes, memory_is_known
+from fmugym.pool.process_memory import grown_bytes, heap_bytes, memory_is_known
 
 __all__ = ["LeakWatch", "watch_leaks"]
 

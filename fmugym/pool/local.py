@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 
 from fmugym.archive.loadable import LoadableFMU
-from fmugym.pool.attendant import Attendant
-from fmugym.pool.patience import licence_errors
-from fmugym.pool.saving import SavingPool
+from fmugym.pool.licences import licence_errors
+from fmugym.pool.retrying import ResetRetry
+from fmugym.pool.saving_pool import SavingPool
 from fmugym.pool.spec import PoolSpec
 
 __all__ = ["local_pool"]
@@ -47,5 +47,5 @@ def local_pool(
         threads=threads,
         private_libraries=private_libraries,
     )
-    pool.attend(Attendant.of(fmu.path.name, spec, log))
+    pool.retry_by(ResetRetry.of(fmu.path.name, spec, log))
     return pool

@@ -42,7 +42,7 @@ from fmugym.pool.health import no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.reports import Failure, describe_failure, loading_failed
-from fmugym.pool.saving import SavingPool, keeps_records
+from fmugym.pool.saving_pool import SavingPool, keeps_records
 from fmugym.signals import ordinary
 
 __all__ = ["NativePool", "prepare"]

@@ -127,7 +127,7 @@ class PoolSpec:
         max_step: The longest step of the solver, in seconds; None for no limit other than the
             communication step.
         records: Whether the inputs of episodes are kept, because it is not known yet whether the
-            FMU's states can be saved; see ``fmugym.pool.saving``.
+            FMU's states can be saved; see ``fmugym.pool.saving_pool``.
     """
 
     inputs: tuple[Variable, ...]

@@ -4,7 +4,7 @@
 they have written. ``plot`` draws an episode, and ``write_report`` makes a page of HTML.
 """
 
-from fmugym.series.pictures import plot
+from fmugym.series.plots import plot
 from fmugym.series.recorder import RecordSeries, RecordVectorSeries
 from fmugym.series.report import write_report
 from fmugym.series.timeseries import TimeSeries

@@ -10,7 +10,7 @@ from html import escape
 from typing import Final
 
 from fmugym.checks import check_path
-from fmugym.series.pictures import as_svg
+from fmugym.series.plots import as_svg
 from fmugym.series.summary import (
     Course,
     EpisodeSummary,

@@ -1,7 +1,7 @@
 """Systems: several FMUs that run as one.
 
-``system`` holds what users make, ``plan`` says what a master executes, ``fmu`` makes a system look
-like an FMU.
+``system`` holds what users make, ``system_plan`` says what a master executes, ``system_fmu`` makes
+a system look like an FMU.
 """
 
 from fmugym.systems.components import Component

@@ -21,7 +21,7 @@ from fmugym.checks import (
 )
 from fmugym.errors import ConfigError, FMULoadError, shown, unknown_name
 from fmugym.keys import COUNT, FLAG, Entries, Kind, check_fields, key, option
-from fmugym.systems import plan
+from fmugym.systems import system_plan
 
 __all__ = ["Component", "OpenComponent", "start_number"]
 
@@ -172,10 +172,10 @@ class OpenComponent:
         nothing: dict[str, frozenset[str]] = dict.fromkeys(told.in_step, frozenset())
         return Feedthrough(nothing, nothing, known=True)
 
-    def planned(self) -> plan.Component:
+    def planned(self) -> system_plan.Component:
         """The component as the master executes it."""
         limits, preload = self.fmu.limits, self.fmu.preload
-        return plan.Component(
+        return system_plan.Component(
             self.name,
             self.fmu.path,
             self.fmu.interface,

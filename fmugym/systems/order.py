@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from fmugym.archive.structure import Feedthrough
-from fmugym.systems.plan import Evaluation, Group, Link, Loop
+from fmugym.systems.system_plan import Evaluation, Group, Link, Loop
 
 __all__ = ["Order", "order_of", "strong_components"]
 

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from fmugym.systems.plan import Connector, Link
+from fmugym.systems.system_plan import Connector, Link
 from fmugym.systems.wired import WiredSystem
 
 __all__ = ["Box", "Layout", "Wire", "layout_of"]

@@ -11,8 +11,7 @@ from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import FMUGymError
 from fmugym.systems.drawing import draw
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.ssp.reading import arguments_of
+from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.wired import WiredSystem
 
 __all__ = ["FMUSystem"]
@@ -83,6 +82,8 @@ class FMUSystem(WiredSystem):
             FMULoadError: If the archive or an FMU cannot be read, or it has something that changes
                 results and is not supported, such as signal dictionaries.
         """
+        from fmugym.systems.ssp.archives import arguments_of  # optional: only archives need it
+
         arguments = arguments_of(path, limits)
         if master is not None:
             arguments["master"] = master

@@ -28,7 +28,7 @@ from fmugym.retired import without_retired
 from fmugym.systems.components import Component, OpenComponent
 from fmugym.systems.connections import CONNECTION
 from fmugym.systems.order import Order, order_of
-from fmugym.systems.plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
+from fmugym.systems.system_plan import LOOP_METHODS, MASTERS, Connector, Link, Loop, SystemPlan
 from fmugym.systems.wiring import Port, Wiring
 
 __all__ = ["LOOPS", "SYSTEM", "WiredSystem"]

@@ -12,7 +12,7 @@ from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.components import OpenComponent
 from fmugym.systems.connections import Connection
-from fmugym.systems.plan import Connector, End, Link
+from fmugym.systems.system_plan import Connector, End, Link
 
 __all__ = ["Port", "Wiring"]
 

@@ -17,7 +17,7 @@ from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_
 from fmugym.pool.base import FloatArray
 from fmugym.task.starting import checked_value
 from fmugym.task.values import ParameterValues
-from fmugym.trial.episodes import Starts
+from fmugym.trial.trial_episodes import Starts
 
 __all__ = ["Draw", "Episode", "EpisodePlan", "Sampler"]
 

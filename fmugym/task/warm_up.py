@@ -19,8 +19,8 @@ from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.pool.patience import failed_reset
-from fmugym.pool.states import StateFiles, essence
+from fmugym.pool.licences import failed_reset
+from fmugym.pool.state_files import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
 from fmugym.task.values import EpisodeVariables, ParameterValues

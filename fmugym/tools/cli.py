@@ -88,7 +88,7 @@ from fmugym.tools.options import add_common, free_outputs, note, speaking
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
 from fmugym.tools.renamed import renamed
 from fmugym.tools.showing import add_demo
-from fmugym.tools.streams import (
+from fmugym.tools.standard_streams import (
     drop_output,
     escape_what_consoles_lack,
     keep_output_from_fmus,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress import progress
+from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, simulate
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported

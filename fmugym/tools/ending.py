@@ -18,7 +18,7 @@ __all__ = ["SignalledEnd", "end_as_after_ctrl_c", "exit_code"]
 
 _NAMES: Final = ("SIGTERM", "SIGHUP")
 
-_PATIENCE: Final = 5.0
+_TIMEOUT: Final = 5.0
 """Seconds until the process is ended by force: its FMU may hang, and Python waits for the call."""
 
 _begun: Final = threading.Event()
@@ -80,7 +80,7 @@ def _end_by_force(reader: socket.socket, numbers: set[int]) -> None:
     number = 0
     while number not in numbers:
         (number,) = reader.recv(1)
-    if _begun.wait(_PATIENCE):
+    if _begun.wait(_TIMEOUT):
         return
     if "fmugym.archive.temporary" in sys.modules:
         sys.modules["fmugym.archive.temporary"].remove_rest()

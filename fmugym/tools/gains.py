@@ -12,7 +12,7 @@ from typing import Any, Final
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
 from fmugym.declared.writing import as_toml
-from fmugym.episodes.progress import progress
+from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
     Commands,

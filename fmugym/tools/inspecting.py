@@ -30,7 +30,12 @@ from fmugym.tools.options import (
 from fmugym.tools.overview import as_text, overview
 from fmugym.tools.proposal import Proposal, preload_line
 from fmugym.tools.skeleton import Skeleton
-from fmugym.tools.systems import as_text_of_system, find_model, open_model, overview_of_system
+from fmugym.tools.system_overview import (
+    as_text_of_system,
+    find_model,
+    open_model,
+    overview_of_system,
+)
 from fmugym.tools.targets import maker_of
 from fmugym.tools.validation import validate
 

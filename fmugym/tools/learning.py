@@ -15,8 +15,8 @@ from typing import Any, Final
 from fmugym.baselines.tuning import LEAST_CANDIDATES
 from fmugym.checks import check_number
 from fmugym.episodes.evaluation import Score, table
-from fmugym.episodes.progress import Advance, no_progress, progress
-from fmugym.episodes.records import title_of
+from fmugym.episodes.output_files import title_of
+from fmugym.episodes.progress_bars import Advance, no_progress, progress
 from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.tools.options import (

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
-from fmugym.episodes.progress import quiet
+from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
-from fmugym.systems.plan import MASTERS
+from fmugym.systems.system_plan import MASTERS
 from fmugym.training.agents import agent_player
 
 __all__ = [

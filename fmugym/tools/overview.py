@@ -12,8 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
+from fmugym.archive.dependencies import missing_tool, note_on
 from fmugym.archive.fmu import FMU
-from fmugym.archive.missing import missing_tool, note_on
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, plain
 from fmugym.pool.base import first_of

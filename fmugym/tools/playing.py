@@ -10,8 +10,8 @@ from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, each_score, plot_scores, table
-from fmugym.episodes.progress import progress
-from fmugym.episodes.records import Recording, require_format, require_picture, title_of
+from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
+from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import FMUGymError, plain
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset

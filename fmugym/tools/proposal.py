@@ -23,7 +23,7 @@ from fmugym.declared.declarations import is_reserved
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.repair.stand_in import replaceable
 from fmugym.search.guessing import guessed_controller
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
 

@@ -18,14 +18,14 @@ from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
 from fmugym.baselines.entrants import NO_MERIT, Merit
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.env import FMUEnv
-from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.agent import Agent
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.probe import MOST_PROBED, Probe, document_of
 from fmugym.search.search import EPISODES, POPULATION, Search
 from fmugym.signals import Ignoring, ordinary
-from fmugym.tools.judging import Verdict, judge
+from fmugym.tools.comparing import Verdict, judge
 from fmugym.training.agents import FACTS
 from fmugym.training.diary import EVALUATIONS
 from fmugym.training.training import require_new

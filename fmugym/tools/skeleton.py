@@ -18,7 +18,7 @@ import numpy as np
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, plain
-from fmugym.systems.description import SystemDescription
+from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 
 __all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]

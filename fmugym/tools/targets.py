@@ -16,7 +16,7 @@ from fmugym.declared import Task, load
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.proposal import Proposal
-from fmugym.tools.systems import open_model
+from fmugym.tools.system_overview import open_model
 
 __all__ = ["maker_of", "scenarios_of"]
 

@@ -14,7 +14,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.series import RecordSeries, RecordVectorSeries
-from fmugym.series.pictures import COLOURS, drawing_style
+from fmugym.series.plots import COLOURS, drawing_style
 from fmugym.vector import FMUVectorEnv
 
 __all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve"]

@@ -10,11 +10,11 @@ from typing import Any
 
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import HELD_OUT_SEED
-from fmugym.episodes.records import About
+from fmugym.episodes.output_files import About
 from fmugym.episodes.simulation import simulate
 from fmugym.errors import ConfigError
 from fmugym.series import RecordSeries, TimeSeries, write_report
-from fmugym.series.pictures import svg_of
+from fmugym.series.plots import svg_of
 from fmugym.training.agents import FACTS, agent_player
 from fmugym.training.diary import CURVE, REPORT, Diary, curve_of, draw_curve
 from fmugym.training.training import Plan

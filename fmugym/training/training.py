@@ -26,7 +26,7 @@ from fmugym.episodes.evaluation import (
     evaluate,
     warning_of_one_reward,
 )
-from fmugym.episodes.progress import Advance, no_progress
+from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.episodes.simulation import Player
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.scaling import can_be_scaled

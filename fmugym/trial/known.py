@@ -73,7 +73,7 @@ def with_harm(verdict: Verdict, fmu: FMU) -> Verdict:
 
 
 def state_files(fmu: FMU) -> str:
-    """Where states of an FMU are kept; see ``fmugym.pool.states``."""
+    """Where states of an FMU are kept; see ``fmugym.pool.state_files``."""
     try:
         return str(cache_folder("states") / content_key(fmu))
     except ordinary(OSError):  # there is no folder for caches

@@ -23,10 +23,10 @@ from fmugym.archive.loadable import LoadableFMU
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.process.library_data import library_data
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.episodes import Starts, start, steps
 from fmugym.trial.inputs import inputs_of_two, moving_inputs
 from fmugym.trial.rehearsal import Rehearsal
 from fmugym.trial.subject import Subject, TriedPool
+from fmugym.trial.trial_episodes import Starts, start, steps
 from fmugym.trial.verdict import FRUGAL, Neighbours, Verdict
 
 __all__ = ["disturb_in_threads", "need_in_turn", "need_of_several"]

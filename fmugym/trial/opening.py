@@ -8,23 +8,23 @@ from functools import partial
 from typing import Any
 
 from fmugym.archive.fmu import FMU
-from fmugym.pool.attendant import Attendant
-from fmugym.pool.backend.choice import pool_of_backend
+from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.licences import LicenceWait, licence_errors
 from fmugym.pool.local import local_pool
-from fmugym.pool.patience import Patience, licence_errors
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
-from fmugym.pool.saving import SavingPool, offered_method
+from fmugym.pool.retrying import ResetRetry
+from fmugym.pool.saving_pool import SavingPool, offered_method
 from fmugym.pool.seats import take
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes
-from fmugym.trial.episodes import Starts
 from fmugym.trial.known import is_exempt, known_resuming
 from fmugym.trial.plan import Plan, is_alone
 from fmugym.trial.resuming import method_that_works
 from fmugym.trial.trial import compare, examine
+from fmugym.trial.trial_episodes import Starts
 from fmugym.trial.verdict import Grade, Verdict
 
 __all__ = ["make_pool"]
@@ -65,7 +65,7 @@ def make_pool(
     def attempt() -> Pool:
         return _open(_made(wishing, starts, spare=spare), log)
 
-    return Patience(spec.licence_wait, log).call(attempt)
+    return LicenceWait(spec.licence_wait, log).call(attempt)
 
 
 def _made(plan: Plan, starts: Starts | None, *, spare: bool) -> Plan:
@@ -125,5 +125,5 @@ def _pool(plan: Plan, log: logging.Logger) -> SavingPool:
         own_files=plan.own_files,
         call_timeout=how.call_timeout,
     )
-    pool.attend(Attendant.of(plan.fmu.path.name, plan.spec, log))
+    pool.retry_by(ResetRetry.of(plan.fmu.path.name, plan.spec, log))
     return pool

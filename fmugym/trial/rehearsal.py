@@ -21,9 +21,9 @@ import numpy as np
 from fmugym.fmi.status import WARNING_CODE, Status
 from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.episodes import Starts, start, steps
 from fmugym.trial.inputs import inputs_of_two
 from fmugym.trial.subject import Subject, TriedPool
+from fmugym.trial.trial_episodes import Starts, start, steps
 from fmugym.trial.verdict import Grade
 
 __all__ = ["Rehearsal"]

@@ -21,10 +21,10 @@ from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.bundle import Bundle, SaveMethod
 from fmugym.pool.seats import taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.episodes import Starts, start, steps
 from fmugym.trial.inputs import moving_inputs
 from fmugym.trial.known import known_resuming, note_resuming
 from fmugym.trial.subject import Subject
+from fmugym.trial.trial_episodes import Starts, start, steps
 from fmugym.trial.verdict import Grade
 
 __all__ = ["method_that_works"]

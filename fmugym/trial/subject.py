@@ -19,7 +19,7 @@ from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, IndexArray
-from fmugym.pool.patience import licence_errors, speaks_of_licence
+from fmugym.pool.licences import licence_errors, speaks_of_licence
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.supervisor import Loss, WorkerError
 from fmugym.pool.progress import progress

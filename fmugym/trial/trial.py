@@ -17,16 +17,16 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import FMULoadError, LicenceError, SimulationError
-from fmugym.pool.patience import speaks_of_licence
+from fmugym.pool.component_resets import find_component_resets, offers_of
+from fmugym.pool.licences import speaks_of_licence
 from fmugym.pool.process.supervisor import WorkerError
-from fmugym.pool.rungs import find_rungs, offers_of
 from fmugym.pool.seats import taking
 from fmugym.pool.spec import PoolSpec, ResetMethod
-from fmugym.trial.episodes import Starts, start
 from fmugym.trial.known import content_key, recall, remember, verdict_key, with_harm
 from fmugym.trial.neighbours import need_in_turn, need_of_several
 from fmugym.trial.rehearsal import Rehearsal
 from fmugym.trial.subject import CLOSING, STEP, DeathError, Subject
+from fmugym.trial.trial_episodes import Starts, start
 from fmugym.trial.verdict import FRUGAL, Grade, Neighbours, Verdict
 
 __all__ = ["compare", "examine"]
@@ -225,4 +225,6 @@ def _components(verdict: Verdict, rehearsal: Rehearsal) -> tuple[ResetMethod, ..
     if not tried or rehearsal.is_frugal or not parts:
         return ()
     offers = [offers_of(part, reloads=subject.can_copy_libraries) for part in parts]
-    return find_rungs(offers, base, lambda found: rehearsal.grade(base, found) is Grade.BITWISE)
+    return find_component_resets(
+        offers, base, lambda found: rehearsal.grade(base, found) is Grade.BITWISE
+    )

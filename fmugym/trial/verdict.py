@@ -9,7 +9,7 @@ from enum import StrEnum
 from typing import Final
 
 from fmugym.pool.spec import ResetMethod
-from fmugym.systems.plan import SystemPlan
+from fmugym.systems.system_plan import SystemPlan
 
 __all__ = ["FRUGAL", "Grade", "Neighbours", "Verdict"]
 

@@ -17,8 +17,8 @@ from typing import Final, NamedTuple
 
 from fmugym.errors import FMULoadError, printable
 from fmugym.signals import ordinary
-from fmugym.wine.loader import find_wine, obstacle_to_wine, wine_version
-from fmugym.wine.program import alone, wine_folder, worker_program
+from fmugym.wine.installation import find_wine, obstacle_to_wine, wine_version
+from fmugym.wine.windows_worker import alone, wine_folder, worker_program
 
 __all__ = ["Wine"]
 

@@ -33,8 +33,8 @@ from fmugym.envs.house import HOUSE_TASK
 from fmugym.pool import PoolSpec
 from fmugym.pool.local import local_pool
 from fmugym.pool.spec import SOLVERS, START_TIME
-from fmugym.systems.fmu import SystemFMU
-from fmugym.systems.plan import MASTERS
+from fmugym.systems.system_fmu import SystemFMU
+from fmugym.systems.system_plan import MASTERS
 
 LOG = logging.getLogger("fmugym.test")
 ROOT = Path(__file__).parents[2]

@@ -18,10 +18,10 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMULoadError, SimulationError
 from fmugym.fmi.status import Status, failed_call, sane
+from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callbacks
-from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.backend.rig import FaultError
-from fmugym.pool.patience import licence_errors
+from fmugym.pool.licences import licence_errors
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.spec import START_TIME, PoolSpec
 from fmugym.signals import ordinary

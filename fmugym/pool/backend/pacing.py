@@ -9,7 +9,7 @@ import numpy as np
 
 from fmugym.checks import number_of
 from fmugym.errors import ConfigError
-from fmugym.pool.backend.clock import Clock, RealClock
+from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = ["Paced", "Schedule"]
@@ -17,7 +17,7 @@ __all__ = ["Paced", "Schedule"]
 _TOLERANCE: Final = 0.1
 """How late a step may be without counting as a miss, in periods."""
 
-_PATIENCE: Final = 3
+_HOLD_AFTER: Final = 3
 """Periods without a step after which a backend holds, by default."""
 
 
@@ -49,9 +49,9 @@ class Paced:
                 raise ConfigError(f"hold_after must be positive, not {number}")
             object.__setattr__(self, "hold_after", number)
 
-    def patience(self, period: float) -> float:
+    def time_until_hold(self, period: float) -> float:
         """Return ``hold_after`` in s, or its default for a time step in s."""
-        return _PATIENCE * period if self.hold_after is None else self.hold_after
+        return _HOLD_AFTER * period if self.hold_after is None else self.hold_after
 
 
 class Schedule:

@@ -60,7 +60,7 @@ class Backend(Protocol):
             inputs: The inputs by name, in the order of the config.
 
         Returns:
-            The outputs, and a ``fmugym.Status``: ``Status.OK`` (0), or for example
+            The outputs, and a ``fmugym.fmi.Status``: ``Status.OK`` (0), or for example
             ``Status.TERMINATED`` if the episode should end.
         """
         ...
@@ -79,7 +79,7 @@ class FaultError(SimulationError):
 
     Args:
         text: The reason.
-        status: A ``fmugym.Status`` worse than a warning.
+        status: A ``fmugym.fmi.Status`` worse than a warning.
     """
 
     def __init__(self, text: str, status: int = Status.ERROR) -> None:
@@ -91,7 +91,7 @@ class Outcome(NamedTuple):
     """The result of a call.
 
     Attributes:
-        status: A ``fmugym.Status``.
+        status: A ``fmugym.fmi.Status``.
         values: The outputs if they are valid.
         reason: Why the call failed, or "".
         sample_time: When the outputs were measured, in s of the clock; NaN if this is unknown.

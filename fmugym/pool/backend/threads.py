@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
-from fmugym.pool.backend.clock import Clock
+from fmugym.pool.backend.clocks import Clock
 
 __all__ = ["Here", "Idle", "Worker", "ask_all"]
 
 _LEAST_WAIT: Final = 0.1
-"""The least time between two looks at the clock, as a share of the patience."""
+"""The least time between two looks at the clock, as a share of ``hold_after``."""
 
 
 _Order = tuple["Future[Any]", Callable[..., Any], Any]
@@ -27,12 +27,12 @@ class Idle(NamedTuple):
     """What to do while there is no request.
 
     Attributes:
-        action: Called whenever ``patience`` has passed without a request; it must not raise.
-        patience: In s of the clock's time.
+        action: Called whenever ``hold_after`` has passed without a request; it must not raise.
+        hold_after: In s of the clock's time.
     """
 
     action: Callable[[], None]
-    patience: float
+    hold_after: float
 
 
 class Here:
@@ -109,15 +109,15 @@ def _next(orders: _Orders, clock: Clock | None, idle: Idle | None) -> _Order | N
     if idle is None or clock is None:
         return orders.get()
     speed = getattr(clock, "speed", 1.0)
-    since, rest = clock.time(), idle.patience
+    since, rest = clock.time(), idle.hold_after
     while True:
         try:
-            return orders.get(timeout=max(rest, _LEAST_WAIT * idle.patience) / speed)
+            return orders.get(timeout=max(rest, _LEAST_WAIT * idle.hold_after) / speed)
         except queue.Empty:
             now = clock.time()
-        rest = since + idle.patience - now
+        rest = since + idle.hold_after - now
         if rest <= 0.0:
-            since, rest = now, idle.patience
+            since, rest = now, idle.hold_after
             idle.action()
 
 

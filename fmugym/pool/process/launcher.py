@@ -83,7 +83,7 @@ class Process(Protocol):
         """End the process at once, whatever it does."""
         ...
 
-    def exit_status(self, patience: float) -> int | None:
+    def exit_status(self, timeout: float) -> int | None:
         """Return the exit status, negative for a signal; None if it has not ended in time."""
         ...
 
@@ -245,10 +245,10 @@ class _GuardedProcess:
         with Ignoring(OSError):  # the guard has ended, and it has with it
             self._lifeline.shutdown(socket.SHUT_WR)
 
-    def exit_status(self, patience: float) -> int | None:
+    def exit_status(self, timeout: float) -> int | None:
         poll = select.poll()
         poll.register(self._lifeline, select.POLLIN)
-        if not poll.poll(1e3 * patience):
+        if not poll.poll(1e3 * timeout):
             return None
         status = self._answer()
         self.forget()
@@ -282,9 +282,9 @@ class _LoneProcess:
     def kill(self) -> None:
         self._process.kill()
 
-    def exit_status(self, patience: float) -> int | None:
+    def exit_status(self, timeout: float) -> int | None:
         try:
-            return self._process.wait(patience)
+            return self._process.wait(timeout)
         except subprocess.TimeoutExpired:
             return None
 

@@ -38,7 +38,6 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.pool.derivatives import Question, Variables, differentiated
 from fmugym.pool.form import table_of
 from fmugym.pool.health import HealthArray
-from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.requests import (
     Answer,
     Reader,
@@ -55,7 +54,8 @@ from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
-from fmugym.pool.saving import SavingPool
+from fmugym.pool.process.worker_group import WorkerGroup
+from fmugym.pool.saving_pool import SavingPool
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
@@ -150,8 +150,8 @@ class ProcessPool(SavingPool):
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._crew = Crew(fmu, setups, memory, log, timeout, closing_time)
-        self._states = StatesOfWorkers(self._crew)
+        self._group = WorkerGroup(fmu, setups, memory, log, timeout, closing_time)
+        self._states = StatesOfWorkers(self._group)
 
     # The contract of Pool.
 
@@ -162,13 +162,13 @@ class ProcessPool(SavingPool):
         values = np.asarray(values, np.float64)
         mask = self._as_mask(mask)
         with self._lock:
-            concerned = self._crew.of_any(mask)
+            concerned = self._group.of_any(mask)
             if self._spec.reset_method == ResetMethod.PROCESS:
                 self._retire_used(concerned)
             self._retire_grown(concerned, mask)
             for _ in range(2):
                 concerned = self._reset(concerned, variables, values, mask)
-            self._crew.note_lost()
+            self._group.note_lost()
 
     def _as_mask(self, mask: MaskArray | None) -> MaskArray:
         if mask is None:
@@ -185,7 +185,7 @@ class ProcessPool(SavingPool):
         """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
         number = self._numbers.setdefault(variables, len(self._numbers))
         used = [s for s in supervisors if not s.is_new]
-        alive = self._crew.revive(supervisors)
+        alive = self._group.revive(supervisors)
 
         def tell(supervisor: Supervisor) -> None:
             block = supervisor.block
@@ -195,17 +195,17 @@ class ProcessPool(SavingPool):
             content = request_reset(number, told, self._version, values[:, block], mask[block])
             supervisor.tell(Request.RESET, content, supervisor.read_growth)
 
-        for supervisor in self._crew.run("a reset", alive, tell):
+        for supervisor in self._group.run("a reset", alive, tell):
             supervisor.note_success()
             block = supervisor.block
-            self._crew.lost[block] &= ~mask[block]
+            self._group.lost[block] &= ~mask[block]
         return [s for s in used if s.is_new]
 
     def _retire_used(self, supervisors: Sequence[Supervisor]) -> None:
         """End the workers that have played an episode, so that each episode has a new process."""
         for supervisor in supervisors:
             if not supervisor.is_new:
-                self._crew.retire(supervisor, "each episode has a new process")
+                self._group.retire(supervisor, "each episode has a new process")
 
     def _retire_grown(self, supervisors: Sequence[Supervisor], mask: MaskArray) -> None:
         """Replace workers that leak.
@@ -218,7 +218,7 @@ class ProcessPool(SavingPool):
             if supervisor.growth > (limit if mask[supervisor.block].all() else 2 * limit):
                 grown = f"by {supervisor.growth / 2**20:.0f} MB"
                 reason = f"worker process {supervisor.pid} was replaced: it had grown {grown}"
-                self._crew.retire(supervisor, reason)
+                self._group.retire(supervisor, reason)
 
     def step(
         self,
@@ -256,15 +256,15 @@ class ProcessPool(SavingPool):
 
     def _step(self, skip: MaskArray | None) -> int:
         request = Request.STEP
-        if skip is not None or self._crew.any_lost:
+        if skip is not None or self._group.any_lost:
             request = Request.STEP_SOME
-            np.logical_or(self._crew.lost, False if skip is None else skip, out=self._mask)
-        replies = self._crew.run(
-            "a step", self._crew.able, lambda supervisor: supervisor.step(request)
+            np.logical_or(self._group.lost, False if skip is None else skip, out=self._mask)
+        replies = self._group.run(
+            "a step", self._group.able, lambda supervisor: supervisor.step(request)
         )
-        if not self._crew.any_lost and Answer.TROUBLE not in replies.values():
+        if not self._group.any_lost and Answer.TROUBLE not in replies.values():
             return 0
-        self._crew.note_lost()
+        self._group.note_lost()
         return int(np.count_nonzero(self.statuses > WARNING_CODE))
 
     # Compiled hooks
@@ -301,9 +301,9 @@ class ProcessPool(SavingPool):
             )
 
         with self._lock:
-            replies = self._crew.run(ROLLOUT, self._crew.able, tell)
-            self._crew.note_lost()
-        return int(np.count_nonzero(self._crew.lost)) + _take_rolled(replies, own)
+            replies = self._group.run(ROLLOUT, self._group.able, tell)
+            self._group.note_lost()
+        return int(np.count_nonzero(self._group.lost)) + _take_rolled(replies, own)
 
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.rollouts import PlayOfWorkers
@@ -333,9 +333,9 @@ class ProcessPool(SavingPool):
         """See ``Pool.write``."""
         with self._lock:
             self._require_present()
-            self._crew.run(
+            self._group.run(
                 "setting parameters",
-                self._crew.supervisors,
+                self._group.supervisors,
                 lambda s: s.tell(
                     Request.WRITE, request_write(variables, self._version, values[:, s.block])
                 ),
@@ -355,10 +355,10 @@ class ProcessPool(SavingPool):
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
         with self._lock:
-            supervisor = self._crew.of(index)
-            if not self._crew.lost[index]:
+            supervisor = self._group.of(index)
+            if not self._group.lost[index]:
                 within = index - supervisor.block.start
-                texts = self._crew.run(
+                texts = self._group.run(
                     "a question",
                     [supervisor],
                     lambda s: s.tell(
@@ -374,25 +374,27 @@ class ProcessPool(SavingPool):
     def _count_steps(self) -> None:
         """See ``CountedPool``; the steps of a dead worker's last episode are not counted."""
         with self._lock:
-            if not self._crew.refusal:
-                self._crew.run("a question", self._crew.able, lambda s: s.tell(Request.COUNT_STEPS))
+            if not self._group.refusal:
+                self._group.run(
+                    "a question", self._group.able, lambda s: s.tell(Request.COUNT_STEPS)
+                )
 
     def _memory_growth(self) -> HealthArray:
         growth = np.zeros(self.num_instances, np.int64)
-        for supervisor in self._crew.supervisors:
+        for supervisor in self._group.supervisors:
             growth[supervisor.block] = supervisor.growth
         return growth
 
     def _find_text(self, number: float) -> str | None:
         """Ask the workers for a text that an FMU of theirs has given."""
         with self._lock:
-            if self._crew.refusal or not self._gives_texts:
+            if self._group.refusal or not self._gives_texts:
                 return None
-            crew = self._crew
+            group = self._group
             content = request_text_of(number)
-            answers = crew.run(
+            answers = group.run(
                 "a question",
-                crew.able,
+                group.able,
                 lambda s: s.tell(Request.TEXT_OF, content, Reader.text),
             )
             return next(filter(None, answers.values()), None)
@@ -423,7 +425,7 @@ class ProcessPool(SavingPool):
         """Ask all workers for arrays of this shape and their instances, in the order of blocks."""
         with self._lock:
             self._require_present()
-            crew = self._crew
+            group = self._group
 
             def tell(supervisor: Supervisor) -> None:
                 count = supervisor.block.stop - supervisor.block.start
@@ -431,7 +433,7 @@ class ProcessPool(SavingPool):
                     request, content, lambda reader: read_values(reader, (*shape, count))
                 )
 
-            parts = crew.run(doing, crew.supervisors, tell)
+            parts = group.run(doing, group.supervisors, tell)
             self._require_present()
             return list(parts.values())
 
@@ -439,30 +441,30 @@ class ProcessPool(SavingPool):
         """See ``Pool.close``."""
         with self._lock:
             try:
-                self._crew.close()
+                self._group.close()
             finally:
                 self._return_seats()
 
     @property
     def initializations(self) -> int:
         """How many initializations the workers have begun."""
-        return sum(supervisor.initializations for supervisor in self._crew.supervisors)
+        return sum(supervisor.initializations for supervisor in self._group.supervisors)
 
     @property
     def losses(self) -> list[Loss]:
         """How worker processes died or hung, in the order of the workers."""
-        return self._crew.losses
+        return self._group.losses
 
     def limit_calls(self, call_timeout: float) -> None:
         """Let the next calls take so long; see ``call_timeout``."""
-        self._crew.call_timeout = call_timeout
+        self._group.call_timeout = call_timeout
 
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""
-        return [supervisor.pid for supervisor in self._crew.supervisors]
+        return [supervisor.pid for supervisor in self._group.supervisors]
 
     def _require_present(self, mask: MaskArray | None = None) -> None:
-        lost = self._crew.lost
+        lost = self._group.lost
         missing = np.flatnonzero(lost if mask is None else lost & mask)
         if missing.size:
             raise SimulationError(self.failure(int(missing[0])))

@@ -19,10 +19,10 @@ from fmugym.pool.form import Files, Writer, form_of_pool
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.process.launcher import Order
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
-from fmugym.pool.saving import keeps_records
+from fmugym.pool.saving_pool import keeps_records
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
-from fmugym.wine.loader import windows_path
+from fmugym.wine.installation import windows_path
 from fmugym.wine.prefix import Wine
 
 __all__ = ["Setup"]

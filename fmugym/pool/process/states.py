@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray, ended_state
-from fmugym.pool.process.crew import Crew
 from fmugym.pool.process.requests import (
     Reader,
     Request,
@@ -18,6 +17,7 @@ from fmugym.pool.process.requests import (
     request_save_states,
 )
 from fmugym.pool.process.supervisor import Supervisor
+from fmugym.pool.process.worker_group import WorkerGroup
 
 __all__ = ["SnapshotOfWorkers", "StatesOfWorkers"]
 
@@ -36,20 +36,20 @@ class SnapshotOfWorkers:
 
 
 class StatesOfWorkers:
-    """Saves and restores the instances of a crew of workers, for a caller that holds the pool.
+    """Saves and restores the instances of a group of workers, for a caller that holds the pool.
 
     Args:
-        crew: The workers.
+        group: The workers.
     """
 
-    def __init__(self, crew: Crew) -> None:
-        self._crew = crew
+    def __init__(self, group: WorkerGroup) -> None:
+        self._group = group
 
     def save(self) -> SnapshotOfWorkers:
         """Let each worker keep the state of its block."""
-        numbers = self._crew.run(
+        numbers = self._group.run(
             "saving a state",
-            self._crew.supervisors,
+            self._group.supervisors,
             lambda s: s.tell(Request.SAVE, read=_read_number),
         )
         return SnapshotOfWorkers({s: (s.generation, number) for s, number in numbers.items()})
@@ -61,7 +61,7 @@ class StatesOfWorkers:
             SimulationError: If it is one, or no snapshot.
         """
         parts = snapshot.parts if isinstance(snapshot, SnapshotOfWorkers) else {}
-        if parts.keys() != set(self._crew.supervisors):
+        if parts.keys() != set(self._group.supervisors):
             raise SimulationError("the snapshot was taken from another pool")
 
     def restore(self, snapshot: SnapshotOfWorkers, mask: MaskArray) -> None:
@@ -70,22 +70,22 @@ class StatesOfWorkers:
         Raises:
             SimulationError: If one of these processes was replaced since.
         """
-        parts, concerned = snapshot.parts, self._crew.of_any(mask)
+        parts, concerned = snapshot.parts, self._group.of_any(mask)
         for supervisor in concerned:
             _require_generation(supervisor, parts[supervisor][0])
-        self._crew.run(
+        self._group.run(
             "restoring a state",
             concerned,
             lambda s: s.tell(Request.RESTORE, request_restore(parts[s][1], mask[s.block])),
         )
-        self._crew.note_lost()
+        self._group.note_lost()
 
     def save_states(
         self, indices: IndexArray, records: bool, start_time: float, outputs: FloatArray
     ) -> list[bytes]:
         """Save instances; the episodes of those that are lost have ended with these outputs."""
         states: dict[int, bytes] = {}
-        parts = self._by_worker(indices[~self._crew.lost[indices]])
+        parts = self._by_worker(indices[~self._group.lost[indices]])
 
         def tell(supervisor: Supervisor) -> None:
             own = _within(supervisor, parts[supervisor])
@@ -95,10 +95,10 @@ class StatesOfWorkers:
                 lambda reader: read_states(reader, len(own), len(outputs)),
             )
 
-        replies = self._crew.run("saving states", list(parts), tell)
+        replies = self._group.run("saving states", list(parts), tell)
         for supervisor, reply in replies.items():
             states.update(zip(parts[supervisor].tolist(), reply, strict=True))
-        lost = indices[self._crew.lost[indices]].tolist()  # some of them maybe just now
+        lost = indices[self._group.lost[indices]].tolist()  # some of them maybe just now
         states |= {index: ended_state(start_time, outputs[:, index]) for index in lost}
         return [states[index] for index in indices.tolist()]
 
@@ -106,7 +106,7 @@ class StatesOfWorkers:
         """Restore instances; a lost worker is replaced."""
         parts = self._by_worker(indices)
         state_of = dict(zip(indices.tolist(), states, strict=True))
-        alive = self._crew.revive(parts)
+        alive = self._group.revive(parts)
 
         def tell(supervisor: Supervisor) -> None:
             wanted = parts[supervisor]
@@ -114,15 +114,16 @@ class StatesOfWorkers:
             content = request_restore_states(own, _within(supervisor, wanted))
             supervisor.tell(Request.RESTORE_STATES, content)
 
-        for supervisor in self._crew.run("restoring states", alive, tell):
+        for supervisor in self._group.run("restoring states", alive, tell):
             supervisor.note_success()
-            self._crew.lost[parts[supervisor]] = False
-        self._crew.note_lost()
+            self._group.lost[parts[supervisor]] = False
+        self._group.note_lost()
 
     def _by_worker(self, indices: IndexArray) -> dict[Supervisor, IndexArray]:
         """Divide instances among their workers."""
         blocks = {
-            s: (indices >= s.block.start) & (indices < s.block.stop) for s in self._crew.supervisors
+            s: (indices >= s.block.start) & (indices < s.block.stop)
+            for s in self._group.supervisors
         }
         return {s: indices[own] for s, own in blocks.items() if own.any()}
 

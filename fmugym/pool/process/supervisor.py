@@ -41,7 +41,7 @@ __all__ = [
     "RefusedError",
     "Supervisor",
     "WorkerError",
-    "patience_with",
+    "timeout_factor",
 ]
 
 INSTANTIATION: Final = "the instantiation"
@@ -67,7 +67,7 @@ _TAIL: Final = 10
 """How many of the FMU's last messages the cause of a death quotes."""
 
 
-def patience_with(doing: str) -> int:
+def timeout_factor(doing: str) -> int:
     """How many call time-outs something may take."""
     return INITIALIZATION_FACTOR if doing in _SLOW else 1
 
@@ -488,13 +488,13 @@ class Supervisor:
         done = self._progress.tobytes()
         if doing != ROLLOUT or done == self._done:
             self._end_hang(doing)
-        patience = deadline - self._asked
+        timeout = deadline - self._asked
         self._done, self._asked = done, time.monotonic()
-        return self._asked + patience
+        return self._asked + timeout
 
     def _end_hang(self, doing: str) -> NoReturn:
         """End a worker that is late; messages that it has not sent yet are lost."""
-        factor = "ten times " if patience_with(doing) > 1 else ""
+        factor = "ten times " if timeout_factor(doing) > 1 else ""
         seconds = time.monotonic() - self._asked
         how = f"took longer than {factor}call_timeout for {doing} and was ended after"
         self._end(f"{how} {seconds:.3g} s", is_late=True)

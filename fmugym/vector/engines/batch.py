@@ -21,7 +21,7 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
-from fmugym.pool.patience import failed_reset
+from fmugym.pool.licences import failed_reset
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
@@ -132,7 +132,7 @@ class BatchEngine(Engine):
             memory.surroundings(task, drawn, (StepResult, *layout.form, arrays, tell)),
         )
         has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
-        is_free = env.inside.warm_ups is None and not self._pool.is_attended
+        is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
         self._settle_starts()
 

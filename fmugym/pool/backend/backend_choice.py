@@ -7,8 +7,8 @@ from typing import Final
 
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError, unknown_name
+from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.by_fmpy import fmpy_pool
-from fmugym.pool.backend.pool import BackendPool
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.spec import PoolSpec

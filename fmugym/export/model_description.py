@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 from fmugym.archive.description import BASE_UNITS, Unit
 from fmugym.archive.variable import Variable
-from fmugym.export.agent import Agent
+from fmugym.export.exportable import Agent
 
 __all__ = ["Port", "kind_of", "model_description", "ports_of"]
 

@@ -25,21 +25,21 @@ from fmugym.pool.process.supervisor import (
     RefusedError,
     Supervisor,
     WorkerError,
-    patience_with,
+    timeout_factor,
 )
 
-__all__ = ["Crew"]
+__all__ = ["WorkerGroup"]
 
-_crews: weakref.WeakSet[Crew] = weakref.WeakSet()
+_groups: weakref.WeakSet[WorkerGroup] = weakref.WeakSet()
 
 
-class Crew:
+class WorkerGroup:
     """The supervisors of a pool's workers, and what became of their instances.
 
     Args:
-        fmu: The FMU; closed with the crew.
+        fmu: The FMU; closed with the group.
         setups: What each worker needs to know.
-        memory: Shared with the workers; closed with the crew.
+        memory: Shared with the workers; closed with the group.
         log: Gets the FMU's messages.
         call_timeout: How long a call may take, in seconds; infinite for ever.
         closing_time: How long workers may take to free their instances at the end, in seconds.
@@ -71,7 +71,7 @@ class Crew:
         self._arrays, self.call_timeout = memory.arrays, call_timeout
         self.note_lost()
         self._close = weakref.finalize(self, _close, self.supervisors, memory, fmu, closing_time)
-        _crews.add(self)
+        _groups.add(self)
         self._open()
 
     def _open(self) -> None:
@@ -101,7 +101,7 @@ class Crew:
         return [loss for supervisor in self.supervisors for loss in supervisor.losses]
 
     def _deadline(self, doing: str) -> float:
-        return time.monotonic() + self.call_timeout * patience_with(doing)
+        return time.monotonic() + self.call_timeout * timeout_factor(doing)
 
     def run(
         self,
@@ -210,8 +210,8 @@ def _raise_any(replies: Iterable[Any]) -> None:
             raise SimulationError(str(reply))
 
 
-def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience: float) -> None:
-    deadline = time.monotonic() + patience
+def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, timeout: float) -> None:
+    deadline = time.monotonic() + timeout
     try:
         for supervisor in supervisors:
             supervisor.begin_closing()
@@ -222,10 +222,10 @@ def _close(supervisors: Sequence[Supervisor], memory: Memory, fmu: FMU, patience
         fmu.close()
 
 
-def _forget_crews() -> None:
-    for crew in list(_crews):
-        crew.forget()
+def _forget_groups() -> None:
+    for group in list(_groups):
+        group.forget()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_crews)
+    os.register_at_fork(after_in_child=_forget_groups)

@@ -15,7 +15,7 @@ from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
 
-__all__ = ["Patience", "failed_reset", "licence_errors", "require_licence", "speaks_of_licence"]
+__all__ = ["LicenceWait", "failed_reset", "licence_errors", "require_licence", "speaks_of_licence"]
 
 R = TypeVar("R")
 
@@ -79,7 +79,7 @@ def failed_reset(failure: str) -> SimulationError:
     return LicenceError(failure) if speaks_of_licence(failure) else SimulationError(failure)
 
 
-class Patience:
+class LicenceWait:
     """How long to wait for a licence that was refused.
 
     Args:

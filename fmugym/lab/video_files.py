@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.extras import installation
-from fmugym.lab.errors import LabError
-from fmugym.lab.pictures import CellPicture
+from fmugym.lab.cell_pictures import CellPicture
+from fmugym.lab.lab_error import LabError
 from fmugym.signals import ordinary
 
 __all__ = ["FRAME_RATE", "Moment", "Recording", "check_can_record", "write_video"]

@@ -15,10 +15,10 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.attendant import AttendedPool
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
 from fmugym.pool.records import Record, record_in
+from fmugym.pool.retrying import RetryingPool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
 __all__ = ["SavingPool", "keeps_records", "offered_method"]
@@ -42,7 +42,7 @@ def offered_method(description: ModelDescription, spec: PoolSpec) -> SaveMethod:
     return SaveMethod.STATE if able.can_serialize_fmu_state else SaveMethod.COPY
 
 
-class SavingPool(AttendedPool):
+class SavingPool(RetryingPool):
     """A pool that saves states, or keeps the inputs of episodes to play them again.
 
     A subclass calls ``_prepare_saving`` in its constructor.

@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
-from fmugym.pool.patience import require_licence
+from fmugym.pool.licences import require_licence
 
 __all__ = ["Starts", "start", "steps"]
 

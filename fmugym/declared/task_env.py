@@ -6,7 +6,7 @@ import logging
 from types import MethodType
 from typing import Any, Final, Never
 
-from fmugym.declared.plan import Plan
+from fmugym.declared.resolved_task import ResolvedTask
 from fmugym.declared.systems import describe, fmu_of
 from fmugym.declared.task import Task
 from fmugym.env import FMUEnv
@@ -66,25 +66,25 @@ class TaskEnv(FMUEnv):
         self.task = Task.of(config)
         source = fmu_of(self.task, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
-        plan = Plan(self.task, describe(self.task, source), needs_reward)
-        self.inside.quantities = plan.quantities
-        self.cost_limits, self._warm_up = plan.cost_limits, plan.warm_up
-        self.unphysical_keys = plan.unphysical_keys
-        if plan.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
+        resolved = ResolvedTask(self.task, describe(self.task, source), needs_reward)
+        self.inside.quantities = resolved.quantities
+        self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
+        self.unphysical_keys = resolved.unphysical_keys
+        if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(
                 f"{type(self).__name__} has a _get_inputs of its own, so that the file cannot say "
                 "what happens in the warm-up"
             )
-        self._observation_names, self._masks = plan.observation_names, plan.action_masks
+        self._observation_names, self._masks = resolved.observation_names, resolved.action_masks
         own = _own_hooks(type(self))
         own |= {"_explain"} if "_reward_policy" in own else set()
-        for name, function in plan.hooks.items():
+        for name, function in resolved.hooks.items():
             if name not in own:
                 setattr(self, name, MethodType(function, self))
         with self.task.root.placing():
             super().__init__(
                 source,
-                plan.config,
+                resolved.config,
                 log_level,
                 render_mode=render_mode,
                 backend=backend,

@@ -1,4 +1,4 @@
-"""What goes with resets of demanding FMUs: waiting for licences, and telling what takes long."""
+"""Resets of demanding FMUs: repeated while licences are refused, and told of if they are slow."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from fmugym.errors import LicenceError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.health import CountedPool
-from fmugym.pool.patience import Patience, speaks_of_licence
+from fmugym.pool.licences import LicenceWait, speaks_of_licence
 from fmugym.pool.progress import progress
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Attendant", "AttendedPool"]
+__all__ = ["ResetRetry", "RetryingPool"]
 
 Reset = Callable[[tuple[Variable, ...], FloatArray, MaskArray | None], Any]
-"""A pool's own function for resets, without an attendant."""
+"""A pool's own function for resets, which tries once."""
 
 
-class Attendant:
-    """Waits for licences, and tells what takes long.
+class ResetRetry:
+    """Tries resets again while licences are refused, and tells what takes long.
 
     Args:
         name: The FMU, for messages.
@@ -36,17 +36,17 @@ class Attendant:
 
     def __init__(self, name: str, spec: PoolSpec, log: logging.Logger) -> None:
         self._name, self._log = name, log
-        self._patience = Patience(spec.licence_wait, log)
+        self._wait = LicenceWait(spec.licence_wait, log)
 
     @classmethod
-    def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> Attendant | None:
-        """Make the attendant that a pool needs; None if it needs none."""
+    def of(cls, name: str, spec: PoolSpec, log: logging.Logger) -> ResetRetry | None:
+        """Make one; None if a pool neither waits for licences nor tells of slow resets."""
         needed = spec.licence_wait or log.isEnabledFor(logging.INFO)
         return cls(name, spec, log) if needed else None
 
     def reset(
         self,
-        pool: AttendedPool,
+        pool: RetryingPool,
         reset: Reset,
         variables: tuple[Variable, ...],
         values: FloatArray,
@@ -74,7 +74,7 @@ class Attendant:
                 raise LicenceError(next(iter(refused.values())))
 
         with contextlib.suppress(LicenceError):  # the statuses tell, as for every failure
-            self._patience.call(attempt)
+            self._wait.call(attempt)
 
 
 def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
@@ -84,15 +84,15 @@ def _refusals(pool: Pool, chosen: MaskArray) -> dict[int, str]:
     return {index: text for index, text in texts.items() if speaks_of_licence(text)}
 
 
-class AttendedPool(CountedPool):
-    """A pool whose resets may have an attendant."""
+class RetryingPool(CountedPool):
+    """A pool whose resets may be tried again."""
 
-    _attendant: Attendant | None = None
+    _retry: ResetRetry | None = None
 
     @property
-    def is_attended(self) -> bool:
-        """See ``Pool.is_attended``."""
-        return self._attendant is not None
+    def retries_resets(self) -> bool:
+        """See ``Pool.retries_resets``."""
+        return self._retry is not None
 
     _release: Callable[[], None] | None = None
 
@@ -104,22 +104,22 @@ class AttendedPool(CountedPool):
         if self._release is not None:
             self._release()
 
-    def attend(self, attendant: Attendant | None) -> None:
-        """Give all calls of ``reset`` an attendant from now on."""
-        self._attendant = attendant
+    def retry_by(self, retry: ResetRetry | None) -> None:
+        """Let all calls of ``reset`` be tried again from now on; None for one try."""
+        self._retry = retry
 
     def reset(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
     ) -> tuple[FloatArray, StatusArray]:
         """See ``Pool.reset``."""
-        if self._attendant is None:
+        if self._retry is None:
             self._reset_some(variables, values, mask)
         else:
-            self._attendant.reset(self, self._reset_some, variables, values, mask)
+            self._retry.reset(self, self._reset_some, variables, values, mask)
         return self.outputs, self.statuses
 
     @abstractmethod
     def _reset_some(
         self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None
     ) -> Any:
-        """Do what ``reset`` does, without an attendant."""
+        """Do what ``reset`` does, once."""

@@ -13,7 +13,7 @@ import numpy as np
 from fmugym.archive.description import Capabilities, ModelDescription, Unit
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
-from fmugym.systems.plan import Connector, End, SystemPlan
+from fmugym.systems.system_plan import Connector, End, SystemPlan
 
 __all__ = ["PartVariable", "SystemDescription", "describe_system"]
 
@@ -29,7 +29,7 @@ class PartVariable:
     Attributes:
         part: The index of the component.
         variable: As its FMU describes it.
-        gain, offset: See ``fmugym.systems.plan.End``.
+        gain, offset: See ``fmugym.systems.system_plan.End``.
         is_target: Whether the system's variable is the source of this one: an input or a parameter.
     """
 

@@ -8,9 +8,9 @@ from typing import Final
 from fmugym.archive.description import ModelDescription
 from fmugym.pool.spec import ResetMethod
 
-__all__ = ["find_rungs", "offers_of"]
+__all__ = ["find_component_resets", "offers_of"]
 
-Rungs = tuple[ResetMethod, ...]
+ComponentResets = tuple[ResetMethod, ...]
 
 _METHODS: Final = list(ResetMethod)
 
@@ -28,11 +28,11 @@ def offers_of(component: ModelDescription, *, reloads: bool) -> list[ResetMethod
     return [*offers, ResetMethod.LIBRARY] if reloads else offers
 
 
-def find_rungs(
+def find_component_resets(
     offers: Sequence[Sequence[ResetMethod]],
     base: ResetMethod,
-    is_right: Callable[[Rungs], bool],
-) -> Rungs:
+    is_right: Callable[[ComponentResets], bool],
+) -> ComponentResets:
     """Find the fastest reset method of each component with which the system begins anew.
 
     Often all honest components can begin by the fastest method that they offer. If not, each one
@@ -72,18 +72,20 @@ def _at_least(base: ResetMethod, offers: Sequence[ResetMethod]) -> ResetMethod:
 
 
 def _fastest(
-    slow: Rungs,
+    slow: ComponentResets,
     index: int,
     offers: Sequence[ResetMethod],
-    is_right: Callable[[Rungs], bool],
+    is_right: Callable[[ComponentResets], bool],
 ) -> ResetMethod:
-    for rungs in _faster(slow, index, offers):
-        if is_right(rungs):
-            return rungs[index]
+    for methods in _faster(slow, index, offers):
+        if is_right(methods):
+            return methods[index]
     return slow[index]
 
 
-def _faster(slow: Rungs, index: int, offers: Sequence[ResetMethod]) -> Iterator[Rungs]:
+def _faster(
+    slow: ComponentResets, index: int, offers: Sequence[ResetMethod]
+) -> Iterator[ComponentResets]:
     """Let one component begin by each of its faster methods, and the others as before."""
     for method in offers:
         if not _is_no_faster(method, slow[index]):

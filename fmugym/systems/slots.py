@@ -13,8 +13,8 @@ from typing import TypeAlias
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError
-from fmugym.systems.description import PartVariable, SystemDescription
-from fmugym.systems.plan import Component, Evaluation, Group, Link
+from fmugym.systems.system_description import PartVariable, SystemDescription
+from fmugym.systems.system_plan import Component, Evaluation, Group, Link
 
 __all__ = ["Layout", "PartLayout", "Route", "array_key"]
 

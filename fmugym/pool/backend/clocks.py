@@ -78,7 +78,7 @@ class ManualClock:
     def __init__(self, start: float = 0.0) -> None:
         self._now = check_number("start", start)
         self._changed = threading.Condition()
-        self._crew: set[threading.Thread] = set()
+        self._awaited: set[threading.Thread] = set()
         self._working_for: dict[threading.Thread, set[threading.Thread]] = {}
         self._sleepers: dict[threading.Thread, float] = {}
 
@@ -128,7 +128,7 @@ class ManualClock:
         Returns:
             The thread, not started.
         """
-        return _CrewThread(self, target, args, name)
+        return _AwaitedThread(self, target, args, name)
 
     @contextmanager
     def handed_over(self, threads: Sequence[threading.Thread]) -> Iterator[None]:
@@ -140,10 +140,10 @@ class ManualClock:
         """
         caller = threading.current_thread()
         with self._changed:
-            if caller in self._crew:
-                self._crew.discard(caller)
+            if caller in self._awaited:
+                self._awaited.discard(caller)
                 self._working_for[caller] = set(threads)
-            self._crew.update(threads)
+            self._awaited.update(threads)
             self._jump()
         try:
             yield
@@ -154,26 +154,26 @@ class ManualClock:
     def leave(self, thread: threading.Thread) -> None:
         """Let time wait for a thread no longer."""
         with self._changed:
-            self._crew.discard(thread)
+            self._awaited.discard(thread)
             for caller, threads in list(self._working_for.items()):
                 threads.discard(thread)
                 if not threads:
                     del self._working_for[caller]
-                    self._crew.add(caller)
+                    self._awaited.add(caller)
             self._jump()
 
     def _join(self, thread: threading.Thread) -> None:
         with self._changed:
-            self._crew.add(thread)
+            self._awaited.add(thread)
 
     def _jump(self) -> None:
         """Go to the first waking if nobody is at work; those overdue are at work."""
-        if self._sleepers and self._crew <= self._sleepers.keys():
+        if self._sleepers and self._awaited <= self._sleepers.keys():
             self._now = max(self._now, min(self._sleepers.values()))
             self._changed.notify_all()
 
 
-class _CrewThread(threading.Thread):
+class _AwaitedThread(threading.Thread):
     def __init__(
         self,
         clock: ManualClock,

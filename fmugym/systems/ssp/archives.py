@@ -28,7 +28,7 @@ from fmugym.systems.ssp.elements import (
     read_system,
     read_units,
 )
-from fmugym.systems.ssp.flattening import Flat
+from fmugym.systems.ssp.flat import Flat
 
 __all__ = ["arguments_of"]
 

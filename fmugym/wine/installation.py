@@ -15,7 +15,7 @@ import fmpy
 
 from fmugym.errors import FMULoadError
 from fmugym.signals import ordinary
-from fmugym.wine.program import is_buildable, known_program
+from fmugym.wine.windows_worker import is_buildable, known_program
 
 __all__ = [
     "can_run_windows",

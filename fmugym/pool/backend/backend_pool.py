@@ -18,7 +18,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import has_method
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE, Status
-from fmugym.pool.backend.clock import Clock
+from fmugym.pool.backend.clocks import Clock
 from fmugym.pool.backend.pacing import Paced, Schedule
 from fmugym.pool.backend.rig import Backend, Outcome, Rig, describe_error
 from fmugym.pool.backend.threads import Here, Idle, Worker, ask_all
@@ -101,8 +101,8 @@ class BackendPool(CountedPool):
         paced, name = self._paced, f"backend-{index}"
         if paced is None:
             return Worker(name)
-        patience = paced.patience(self._spec.time_step)
-        return Worker(name, paced.clock, Idle(rig.hold, patience))
+        hold_after = paced.time_until_hold(self._spec.time_step)
+        return Worker(name, paced.clock, Idle(rig.hold, hold_after))
 
     def prepare_play(self, *parts: Any) -> Play:
         """See ``Pool.prepare_play``."""

@@ -45,7 +45,7 @@ from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.quantity import Quantities
 
-__all__ = ["Plan"]
+__all__ = ["ResolvedTask"]
 
 WORST: Final = "worst reward"
 """The episode variable with the lowest reward until now, or 0."""
@@ -56,7 +56,7 @@ _LONG_AGO: Final = 1e9
 Hook = Callable[..., Any]
 
 
-class Plan:
+class ResolvedTask:
     """What an environment needs to know of its task.
 
     Args:

@@ -15,8 +15,8 @@ from fmugym.checks import check_flag, check_number, float_or_nan
 from fmugym.errors import shown, unknown_name
 from fmugym.lab.data import CellType
 from fmugym.lab.disturbance import Disturbance, resolve
-from fmugym.lab.errors import LabError, as_lab_error
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
+from fmugym.lab.lab_error import LabError, as_lab_error
 from fmugym.signals import ordinary
 
 __all__ = ["Request", "cell_types_of", "check_range", "entries_of", "gains_of", "text_of"]

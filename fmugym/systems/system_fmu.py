@@ -17,9 +17,9 @@ from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.errors import ConfigError, FMULoadError
-from fmugym.systems.description import SystemDescription, describe_system
-from fmugym.systems.layout import Layout
-from fmugym.systems.plan import Component, SystemPlan
+from fmugym.systems.slots import Layout
+from fmugym.systems.system_description import SystemDescription, describe_system
+from fmugym.systems.system_plan import Component, SystemPlan
 
 __all__ = ["SystemFMU"]
 

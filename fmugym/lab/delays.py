@@ -11,13 +11,13 @@ import numpy as np
 from fmugym.lab.presets import Options
 from fmugym.lab.timekeeper import Timekeeper
 
-__all__ = ["Network"]
+__all__ = ["Delays"]
 
 _P99: Final = 2.3263478740408408  # the 99th percentile of the standard normal distribution
 
 
-class Network:
-    """Delays requests.
+class Delays:
+    """Delays requests on their way.
 
     Delays have a log-normal distribution with the median and the 99th percentile of the options.
     Some requests stall in addition. A request takes effect after its whole delay.
