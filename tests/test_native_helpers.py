@@ -92,8 +92,9 @@ def test_the_caller_wakes_a_helper_first_where_an_instance_takes_milliseconds(co
 
 
 def test_a_long_job_wakes_no_more_helpers_than_there_are(counted):
+    """A helper of the job before the first may still wake another."""
     long = counted["long"]
-    assert 0 < long["wakes"] <= 2 * long["rounds"]
+    assert 0 < long["wakes"] <= 2 * (long["rounds"] + 1)
 
 
 @on_linux
