@@ -18,16 +18,85 @@
 
 #if defined _WIN32
 
-static void *open_handle(const char *path, char *error, size_t size) {
-    wchar_t wide[4096];
+enum { DEPTH = 8 }; /* of libraries that need libraries; some need each other */
+
+/* The libraries that a module needs; the last one has no name. NULL if it needs none. */
+static const IMAGE_IMPORT_DESCRIPTOR *imports_of(HMODULE module) {
+    const char *base = (const char *)module;
+    const IMAGE_DOS_HEADER *start = (const IMAGE_DOS_HEADER *)base;
+    const IMAGE_NT_HEADERS *headers = (const IMAGE_NT_HEADERS *)(base + start->e_lfanew);
+    const IMAGE_DATA_DIRECTORY *imports =
+        &headers->OptionalHeader.DataDirectory[IMAGE_DIRECTORY_ENTRY_IMPORT];
+
+    return imports->Size == 0 ? NULL
+                              : (const IMAGE_IMPORT_DESCRIPTOR *)(base + imports->VirtualAddress);
+}
+
+static void append_name(const char *name, char *names, size_t size) {
+    const size_t used = strlen(names);
+
+    if (strstr(names, name) == NULL) {
+        snprintf(names + used, size - used, "%s%s", used == 0 ? "" : ", ", name);
+    }
+}
+
+/* Whether the loader finds a library that lies in no folder of the FMU. */
+static bool is_found(const char *name) {
+    HMODULE module = LoadLibraryA(name);
+
+    if (module != NULL) {
+        FreeLibrary(module);
+    }
+    return module != NULL;
+}
+
+/* Appends the names of libraries that are missing: those that the library at a path needs, or that
+ * one beside it needs. The loader itself tells only that there are such libraries. */
+static void append_missing(const wchar_t *path, int depth, char *names, size_t size) {
+    /* maps the library, but neither runs it nor looks for what it needs */
+    HMODULE module = LoadLibraryExW(path, NULL, DONT_RESOLVE_DLL_REFERENCES);
+    const wchar_t *end = wcsrchr(path, L'\\');
+    const int folder = end == NULL ? 0 : (int)(end - path) + 1;
+
+    if (module == NULL) {
+        return;
+    }
+    const char *base = (const char *)module;
+    for (const IMAGE_IMPORT_DESCRIPTOR *i = imports_of(module); i != NULL && i->Name != 0; i++) {
+        wchar_t beside[4096];
+        const int length = swprintf(beside, 4096, L"%.*ls%hs", folder, path, base + i->Name);
+        if (length > 0 && GetFileAttributesW(beside) != INVALID_FILE_ATTRIBUTES) {
+            if (depth < DEPTH) {
+                append_missing(beside, depth + 1, names, size);
+            }
+        } else if (!is_found(base + i->Name)) {
+            append_name(base + i->Name, names, size);
+        }
+    }
+    FreeLibrary(module);
+}
+
+static void describe_failure(const wchar_t *path, unsigned long code, char *error, size_t size) {
+    char names[400] = "";
+
+    if (code == ERROR_MOD_NOT_FOUND && GetFileAttributesW(path) != INVALID_FILE_ATTRIBUTES) {
+        append_missing(path, 0, names, sizeof names);
+    }
+    snprintf(error, size, "LoadLibrary failed with Windows error %lu%s%s", code,
+             *names == '\0' ? "" : "; it needs libraries that are missing: ", names);
+}
+
+void *library_load(const char *path, char *error, size_t size) {
+    wchar_t wide[4096] = L"";
+    /* searches the library's own folder for those that it depends on */
+    const DWORD flags = strpbrk(path, "\\/") == NULL ? 0 : LOAD_WITH_ALTERED_SEARCH_PATH;
     HMODULE handle = NULL;
 
     if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0) {
-        /* searches the FMU's own folder for the libraries that it depends on */
-        handle = LoadLibraryExW(wide, NULL, LOAD_WITH_ALTERED_SEARCH_PATH);
+        handle = LoadLibraryExW(wide, NULL, flags);
     }
     if (handle == NULL) {
-        snprintf(error, size, "LoadLibrary failed with Windows error %lu", GetLastError());
+        describe_failure(wide, GetLastError(), error, size);
     }
     return (void *)handle;
 }
@@ -65,7 +134,7 @@ static void leave_folder(int here) {
 }
 
 /* Some libraries read files of their own folder when they are loaded. */
-static void *open_handle(const char *path, char *error, size_t size) {
+void *library_load(const char *path, char *error, size_t size) {
     static pthread_mutex_t loading = PTHREAD_MUTEX_INITIALIZER;
 
     pthread_mutex_lock(&loading);
@@ -95,7 +164,7 @@ static Function find(void *handle, const char *name) {
 #endif
 
 bool library_open(Library *library, const char *path, char *error, size_t size) {
-    library->handle = open_handle(path, error, size);
+    library->handle = library_load(path, error, size);
     return library->handle != NULL;
 }
 

@@ -14,6 +14,10 @@ typedef struct {
     void *functions;        /* the table of the FMI version */
 } Library;
 
+/* Loads a library at a path, or one that the loader knows by its name. Returns its handle, or NULL;
+ * then error says why. */
+void *library_load(const char *path, char *error, size_t size);
+
 /* Returns whether the library was loaded; if not, error says why. */
 bool library_open(Library *library, const char *path, char *error, size_t size);
 void library_close(Library *library);

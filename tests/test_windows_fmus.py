@@ -197,6 +197,14 @@ class ForcedCartPole(fmugym.FMI2CSEnv):
         return abs(self.state[0]) > 2.4
 
 
+def _link(path, source, *needed):
+    """Compile a library for Windows that needs others of its folder."""
+    path.with_suffix(".c").write_text(source)
+    command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu", "-shared"]
+    command += [f"{path.stem}.c", *(f"{name}.lib" for name in needed), "-o", path.name]
+    subprocess.run(command, check=True, cwd=path.parent)
+
+
 @pytest.mark.usefixtures("wine")
 class TestInWine:
     @pytest.mark.parametrize(
@@ -280,6 +288,23 @@ class TestInWine:
         for step in range(5):
             row = single.step(np.full(1, 2.0, np.float32))[0]
             np.testing.assert_array_equal(rolled.observations[1, step], row)
+
+    def test_missing_libraries_are_named(self, tmp_path):
+        """The FMU's library needs one that lies beside it, which needs one that nobody has."""
+        folder = tmp_path / "binaries/win64"
+        folder.mkdir(parents=True)
+        _link(folder / "Absent.dll", "double absent(void) { return 1.0; }")
+        beside = "double absent(void); double beside(void) { return absent(); }"
+        _link(folder / "Beside.dll", beside, "Absent")
+        top = "double beside(void); double top(void) { return beside(); }"
+        _link(folder / "CartPole.dll", top, "Beside")
+        names = ("CartPole.dll", "Beside.dll")
+        kept = {f"binaries/win64/{name}": (folder / name).read_bytes() for name in names}
+        files = read_fmu(bundled_fmu("CartPole"))
+        files = {n: c for n, c in files.items() if not n.startswith("binaries/")} | kept
+        path = write_fmu(tmp_path / "Needy.fmu", files)
+        with pytest.raises(FMULoadError, match=r"libraries that are missing: Absent\.dll$"):
+            open_pool(path)
 
     def test_compiled_hooks_tell_of_a_death(self, faulty, opened):
         envs = opened(

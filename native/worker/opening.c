@@ -4,6 +4,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "../library.h"
 #include "worker.h"
 
 #if !defined _WIN32
@@ -50,14 +51,13 @@ static char *map_memory(const Worker *w, const char *name, size_t size) {
 }
 
 static bool load_before(const char *name, const char *path, char *error, size_t size) {
-    wchar_t wide[4096];
+    char reason[512];
 
     (void)name;
-    if (MultiByteToWideChar(CP_UTF8, 0, path, -1, wide, 4096) != 0 && LoadLibraryW(wide) != NULL) {
+    if (library_load(path, reason, sizeof reason) != NULL) {
         return true;
     }
-    snprintf(error, size, "the library '%s' cannot be loaded: Windows error %lu", path,
-             GetLastError());
+    snprintf(error, size, "the library '%s' cannot be loaded: %s", path, reason);
     return false;
 }
 
