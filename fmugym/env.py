@@ -193,28 +193,28 @@ class FMUEnv(Constructed):
                 or the environment is closed.
         """
         check_misplaced(misplaced)
-        pool = self._open_pool("reset")
-        if not self.inside.was_reset:
+        pool, inside = self._open_pool("reset"), self.inside
+        if not inside.was_reset:
             prepare_hooks(self)  # the constructor of the class may have set some as attributes
             self._require_way(pool)
         seed, plan = check_seed(seed), plan_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
         episode = plan.draw(self.np_random if generator is None else generator)
-        self.inside.ended = True  # there is no episode if the FMU fails
+        inside.ended = True  # there is no episode if the FMU fails
         try:
-            if self.inside.warm_ups is None:
+            if inside.warm_ups is None:
                 self._reset_pool(pool, plan, episode)
                 self._begin_episode(episode)
             else:
-                self._begin_with_warm_up(self.inside.warm_ups, pool, plan, episode)
-            self.inside.was_reset, self.inside.ended = True, False
+                self._begin_with_warm_up(inside.warm_ups, pool, plan, episode)
+            inside.was_reset, inside.ended = True, False
             observation, info = first_observation(self)
-            if not self.inside.has_chosen:
+            if not inside.has_chosen:
                 self._choose_player(pool)
         except BaseException:
-            self.inside.ended = True
-            self.inside.halt()
+            inside.ended = True
+            inside.halt()
             raise
         info["drawn"] = episode.drawn
         if self.render_mode == "human":
@@ -272,24 +272,26 @@ class FMUEnv(Constructed):
             )
 
     def _begin_episode(self, episode: Episode) -> None:
-        if self.inside.player is not None:
-            self.inside.player.begin(self.inside)
-        read = self.inside.readings
+        inside = self.inside
+        if inside.player is not None:
+            inside.player.begin(inside)
+        read = inside.readings
         read.parameters = episode.parameters
         read.variables.update(episode.variables)
         read.step_count = 0
-        read.action = read.previous_action = self.inside.no_action
+        read.action = read.previous_action = inside.no_action
         given = episode.parameters.get
-        read.inputs = tuple([given(name, start) for name, start in self.inside.start_inputs])
+        read.inputs = tuple([given(name, start) for name, start in inside.start_inputs])
         read.done = read.after_end = False
         self._read_outputs()
-        self.inside.pictured = None, 0.0
+        inside.pictured = None, 0.0
 
     def _read_outputs(self) -> None:
         """Let hooks read the outputs of an episode that has not stepped yet."""
-        read = self.inside.readings
-        read.values = tuple(self.inside.output_row.tolist())
-        read.state = read.previous_state = read.values[: self.inside.output_count]
+        inside = self.inside
+        read = inside.readings
+        read.values = tuple(inside.output_row.tolist())
+        read.state = read.previous_state = read.values[: inside.output_count]
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.

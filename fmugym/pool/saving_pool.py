@@ -6,6 +6,7 @@ import logging
 import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -93,12 +94,12 @@ class SavingPool(RetryingPool):
         self, bundle: Bundle, sources: IndexArray, indices: IndexArray
     ) -> npt.NDArray[np.int8]:
         """See ``Pool.restore_instances``."""
-        states = [bundle.states[source] for source in sources.tolist()]
+        states = bundle.states_at(sources)
         if bundle.replays:
             there = self._restore_copies(bundle, sources, indices)
             there |= [not head_of(state).is_record for state in states]
-            self._replay([states[p] for p in np.flatnonzero(~there)], indices[~there])
-            states, indices = [states[p] for p in np.flatnonzero(there)], indices[there]
+            self._replay(list(compress(states, ~there)), indices[~there])
+            states, indices = tuple(compress(states, there)), indices[there]
         elif self.save_method is not SaveMethod.STATE:
             raise SimulationError(
                 "the snapshot has serialized FMU states, which do not work in this pool"

@@ -98,14 +98,15 @@ def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
         ConfigError: If a hook returns something unusable.
         SimulationError: If the observation is not finite.
     """
-    env.inside.in_hooks = True
+    inside = env.inside
+    inside.in_hooks = True
     try:
         observation = env._get_observation()
-        if not env.inside.is_finite(observation):
+        if not inside.is_finite(observation):
             raise SimulationError(f"the first observation is not finite: {shown(observation)}")
         return observation, info_of(env)
     finally:
-        env.inside.in_hooks = False
+        inside.in_hooks = False
 
 
 def _fault_of_hooks(

@@ -14,8 +14,10 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
 from fmugym.task.saving import READ, read_columns
 from fmugym.task.snapshot import Columns, Snapshot
+from fmugym.vector.hooks.results import environments_first, environments_last
 
 __all__ = [
+    "Which",
     "chosen",
     "columns_of",
     "place_column",
@@ -82,22 +84,15 @@ def which_of(indices: IndexArray, count: int) -> Which:
     return slice(None) if in_order else indices
 
 
-def columns_of(env: FMUEnv, indices: IndexArray) -> Columns:
-    """Copy what hooks read in some environments of a batch.
-
-    Args:
-        env: The prototype.
-        indices: The environments, shape (M,).
-    """
-    which = which_of(indices, len(env.step_count))
+def columns_of(env: FMUEnv, which: Which) -> Columns:
+    """Copy what hooks read in some environments of a batch, whose prototype this is."""
     columns = read_columns(env, lambda values: _rows(values, which))
     return columns | {"pictured": None, "attributes": None}
 
 
 def _rows(values: Any, which: Which) -> npt.NDArray[Any]:
     """Values with environments on the last axis, as a new array with them on the first."""
-    rows = np.asarray(values)[..., which]
-    return np.array(rows if rows.ndim == 1 else np.moveaxis(rows, -1, 0), order="C")
+    return np.array(environments_first(np.asarray(values)[..., which]), order="C")
 
 
 def place_columns(env: FMUEnv, columns: Columns, sources: Which, which: Which) -> None:
@@ -111,7 +106,7 @@ def place_column(row: npt.NDArray[Any], column: Any, sources: Which, which: Whic
     values = np.asarray(column)[sources]
     if values.dtype == np.object_:  # None where an episode has no such parameter
         values = values.astype(row.dtype)
-    row[..., which] = values if values.ndim == 1 else np.moveaxis(values, 0, -1)
+    row[..., which] = environments_last(values)
 
 
 def require_fit(columns: Columns) -> None:

@@ -24,6 +24,7 @@ from fmugym.task.generators import row_of, state_of
 
 if TYPE_CHECKING:
     from fmugym._native import Draws
+    from fmugym.vector.saving import Which
 
 __all__ = ["EpisodeStreams", "no_draws"]
 
@@ -70,17 +71,15 @@ class EpisodeStreams:
         chosen = ((index, seeds[index]) for index in indices.tolist())
         self._seed({index: seed for index, seed in chosen if seed is not None})
 
-    def taken(self, indices: IndexArray) -> tuple[npt.NDArray[np.uint64], npt.NDArray[Any]]:
-        """The streams and the seeds of some environments."""
+    def taken(self, which: Which) -> tuple[npt.NDArray[np.uint64], npt.NDArray[Any]]:
+        """Copies of the streams and the seeds of some environments."""
         self.require_seeds()
-        return self.states[indices], self._seeds[indices]
+        return np.array(self.states[which]), np.array(self._seeds[which])
 
-    def put(
-        self, indices: IndexArray, rows: npt.NDArray[np.uint64], seeds: npt.NDArray[Any]
-    ) -> None:
+    def put(self, which: Which, rows: npt.NDArray[np.uint64], seeds: npt.NDArray[Any]) -> None:
         """Let environments go on with other streams, shape (M, 6), and their seeds."""
-        self.states[indices] = rows
-        self._seeds[indices] = seeds
+        self.states[which] = rows
+        self._seeds[which] = seeds
 
     def require_seeds(self) -> None:
         """Seed all that have no seed yet; native code may then draw from the streams."""

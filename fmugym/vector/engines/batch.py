@@ -459,9 +459,10 @@ class BatchEngine(Engine):
 
     def columns(self, indices: IndexArray) -> Columns:
         """See ``Engine.columns``."""
-        return columns_of(self.env, indices) | {
-            "ended": self.ended[indices],
-            **dict(zip(("streams", "seeds"), self._streams.taken(indices), strict=True)),
+        which = which_of(indices, self._n)
+        return columns_of(self.env, which) | {
+            "ended": np.array(self.ended[which]),
+            **dict(zip(("streams", "seeds"), self._streams.taken(which), strict=True)),
         }
 
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
@@ -475,7 +476,7 @@ class BatchEngine(Engine):
             place_column(self._row(name), column, whence, where)
         if isinstance(columns["streams"], np.ndarray):
             seeds = np.array(columns["seeds"], object)[whence]
-            self._streams.put(indices, columns["streams"][whence], seeds)
+            self._streams.put(where, columns["streams"][whence], seeds)
         self._streams.require_seeds()
         self.ended[where] = columns["ended"][whence]
         self.any_ended = bool(np.count_nonzero(self.ended))
