@@ -2,11 +2,10 @@
 
     python examples/ilqr_pendulum.py
 
-Each iteration linearizes the trajectory by one call of `linearize_along`. It then solves a
-linear-quadratic problem backwards in time, and tries the new torques forwards with several lengths
-of step, all in one rollout (Y. Tassa, T. Erez, E. Todorov, "Synthesis and stabilization of complex
-behaviors through online trajectory optimization", IROS 2012). The result is a plan and a feedback
-for each step. With the feedback, the plan also works for a pendulum that is 5 % heavier.
+Each iteration linearizes the trajectory by `linearize_along`, solves a linear-quadratic problem
+backwards in time, and tries the new torques forwards with several lengths of step in one rollout
+(Y. Tassa, T. Erez, E. Todorov, "Synthesis and stabilization of complex behaviors through online
+trajectory optimization", IROS 2012). With its feedback, the plan suits a 5 % heavier pendulum, too.
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ class Cell:
         (token, is_leased), self._session = self._session, None
         try:
             self._client.set_torque(0.0, token)
-        except ordinary(RuntimeError) as error:  # the lab has ended the session
+        except ordinary(Exception) as error:  # whatever it is, the session is to be stopped
             logger.debug("the torque was not taken away: %s", error)
         stop = self._client.stop_episode if is_leased else self._client.stop_experiment
         try:
