@@ -36,6 +36,7 @@ from fmugym.training.agents import (
     agent_player,
     algorithm_of,
     imported_for_training,
+    names_of,
     policy_with,
     save,
 )
@@ -475,7 +476,9 @@ class _Training:
             self._tracker.log({"evaluation/reward": mean, **each}, steps)
 
     def _keep(self, **more: float) -> None:
-        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **more}
+        (env,) = self._venv.get_attr("unwrapped", 0)
+        names = names_of(env)
+        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **names, **more}
         save(self._plan.folder, self._model, self._normalization(), facts)
 
 
