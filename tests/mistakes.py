@@ -254,6 +254,9 @@ def of_keys() -> Iterator[Mistake]:
         yield task({key: wrong}, key, shown(wrong[0] if key in _TIMES else wrong), WANTED)
     for key in task_format.CONFIG_OF_TASK.elsewhere:
         yield task(nested(f"config.{key}", 1), f"'{key}' is no key of [config]")
+    for key in (field.name for field in fields(EnvConfig) if field.name not in TABLES[""]):
+        place = re.compile(r"\[\w+\]|'reward'|the FMU")
+        yield task({key: 1}, f"'{key}' is no key: ", place)
     for key in ("controller", "cache"):
         wrong = misspelt(key)
         yield task({"warm_up": {"period": "1s", wrong: "x"}}, wrong, f"'{key}'")

@@ -20,8 +20,8 @@ from pythonfmu.builder import FmuBuilder
 
 import fmugym
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
-from fmugym.tools.cli import main
-from fmugym.tools.options import EXAMPLES
+from fmugym.tools.cli import _parser, main
+from fmugym.tools.options import EXAMPLES, speaking
 
 XML = """<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="2.0" modelName="{model}" guid="{{1}}" description="{description}">
@@ -463,11 +463,18 @@ class TestCommand:
             assert "time_step" in printed.out
             assert bool(printed.err) is notes
 
-    def test_verbose_shows_the_log_of_this_command_only(self, capsys):
-        before = logging.getLogger("fmugym").handlers[:]
-        arguments = ["simulate", "fmugym/Pendulum-v0", "--steps", "1"]
-        assert main([*arguments, "-v"]) == 0
-        assert logging.getLogger("fmugym").handlers == before
+    @pytest.mark.parametrize(("option", "told"), [("-v", "0 1 2"), ("-q", "2")])
+    def test_the_log_of_this_command_only(self, option, told, capsys):
+        logger = logging.getLogger("fmugym")
+        before = logger.handlers[:], logger.level
+        for name, parser in _parser()[1].items():
+            given = ["a", "b", "--output", "c", "--task", "d", option]
+            arguments, _ = parser.parse_known_args(given)
+            with speaking(arguments):
+                for text, level in enumerate((logging.INFO, logging.WARNING, logging.ERROR)):
+                    logger.log(level, text)
+            assert capsys.readouterr().err.split() == told.split(), name
+        assert (logger.handlers, logger.level) == before
 
     @pytest.mark.parametrize("program", [["-m", "fmugym"], ["-c", PROGRAM]])
     def test_classes_in_the_working_directory_are_found(self, tmp_path, program):

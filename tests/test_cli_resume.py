@@ -300,7 +300,16 @@ class TestDamagedAgents:
         code, out, err = cli("simulate", CART_POLE, "--agent", agent)
         assert (code, out) == (1, "")
         assert "another task" in err
+        for fact in ("observes q, q_dot", "also gives x, x_dot", "writes tau, here f"):
+            assert fact in err
         assert err.count("\n") == 1
+
+    def test_for_a_task_of_the_same_shape(self, agent, tmp_path, cli):
+        names = PENDULUM["agent"]["observations"][::-1]
+        other = PENDULUM | {"agent": PENDULUM["agent"] | {"observations": names}}
+        fmugym.Task.from_dict(other).write(tmp_path / "other.toml")
+        code, _, err = cli("simulate", tmp_path / "other.toml", "--agent", agent)
+        assert (code, "another task: the order of the observations" in err) == (1, True)
 
 
 def recorded(path):

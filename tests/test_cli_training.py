@@ -214,6 +214,8 @@ class TestTrain:
         arguments = "n_steps=128", "batch_size=256"
         code, out, err = trained(capsys, CART_POLE, *arguments, *options)
         assert code == 0
+        plan = "PPO learns for up to 6000 steps of 8 environments; 3 episodes are played every 600"
+        assert err.startswith(plan)
         assert "5120 steps: reward" in err  # five rollouts of 128 steps in 8 environments
         assert "held-out seeds" in out
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
@@ -393,7 +395,8 @@ class TestTrain:
         ("arguments", "fact"),
         [
             (["--algorithm", "PPOO"], "'PPO'"),
-            (["n_step=3"], "n_step"),
+            (["n_step=3"], "'n_steps'"),
+            (["learningrate=1e-3"], "'learning_rate'"),
             (["n_steps"], "'n_steps'"),
             (["--steps", "0"], "--steps"),
         ],

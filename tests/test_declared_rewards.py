@@ -108,6 +108,21 @@ def test_what_is_too_large_is_refused_at_once(task, case):
     assert time.process_time() - begin < 1.0
 
 
+def test_a_row_that_users_write_is_taken_at_once(task):
+    """Seven names, each of which is the largest of eight operands."""
+    path = task(REWARD)
+    fmugym.load(path).close()
+    row = in_a_row("max(E, -1, -2, E / 2, -3, -4, theta_dot - 5, tau)", 8)
+    path.write_text(path.read_text().replace(*row))
+    begin = time.process_time()
+    with fmugym.load(path) as env:
+        env.reset(seed=0)
+        (theta, _), reward, *_ = env.step(env.action_space.low)
+        assert theta > 0
+        assert reward == pytest.approx(theta)
+    assert time.process_time() - begin < 1.0
+
+
 @pytest.mark.parametrize(("text", "count"), [("E + E", 12), ("E if E > 0 else -E", 7)])
 def test_what_many_expressions_read_is_written_once(task, monkeypatch, text, count):
     path = task(REWARD)

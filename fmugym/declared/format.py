@@ -712,6 +712,11 @@ TASK: Final = Table(
         "config": Key(
             CONFIG_OF_TASK, "More keys of the [config](config.md#config-keys), such as `on_fault`."
         ),
-    }
+    },
+    elsewhere={
+        **dict.fromkeys(CONFIG_OF_TASK.keys, ": it stands in [config]"),
+        **dict.fromkeys(FOREIGN.keys, ": it stands in [foreign]"),
+        **CONFIG_OF_TASK.elsewhere,
+    },
 )
 """The keys of a task file."""

@@ -15,7 +15,7 @@ from fmugym.baselines.base import Controller, FloatArray, attribute_of, limited
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of, width_of
 
-__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale"]
+__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale", "names_that_differ"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -220,19 +220,10 @@ class Policy(Controller):
         if self.task is None or self.task == (self.names, str(self.space)):
             return
         names, space = self.task
-        own, other = (
-            [n for n in a if n not in b] for a, b in ((names, self.names), (self.names, names))
-        )
-        told = "; ".join(
-            text
-            for found, text in (
-                (own, f"it observes {', '.join(own)}, which this task does not give"),
-                (other, f"this task also gives {', '.join(other)}"),
-                (space != str(self.space), f"its actions are {space}, here they are {self.space}"),
-            )
-            if found
-        )
-        raise ConfigError(f"the agent is for another task: {told or 'the order differs'}")
+        told = names_that_differ(names, self.names)
+        if space != str(self.space):
+            told.append(f"its actions are {space}, here they are {self.space}")
+        raise ConfigError(f"the agent is for another task: {'; '.join(told)}")
 
     def _require_sizes(self, form: Form, weights: FloatArray) -> None:
         sizes = len(self.names), self.acting
@@ -350,6 +341,15 @@ class Policy(Controller):
         return [
             one[0] + part.argmax(axis=0) for one, part in zip(self._choices, split, strict=True)
         ]
+
+
+def names_that_differ(own: Sequence[str], here: Sequence[str]) -> list[str]:
+    """Say how the observations of an agent and of a task differ; nothing if they do not."""
+    gone, more = ([n for n in a if n not in b] for a, b in ((own, here), (here, own)))
+    told = [f"it observes {', '.join(gone)}, which this task does not give"] if gone else []
+    if more:
+        told.append(f"this task also gives {', '.join(more)}")
+    return told or (["the order of the observations differs"] if list(own) != list(here) else [])
 
 
 def _masks_of(env: Any) -> Callable[[], npt.NDArray[np.bool_]] | None:

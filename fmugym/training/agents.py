@@ -23,6 +23,7 @@ from fmugym.errors import ConfigError, reason, shown
 from fmugym.extras import imported
 from fmugym.scaling import are_scaled, unscaled
 from fmugym.search.agent import AGENT, Agent
+from fmugym.search.policy import names_that_differ
 from fmugym.signals import ordinary
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "algorithm_of",
     "imported_for_training",
     "load_agent",
+    "names_of",
     "policy_with",
     "read_agent",
     "save",
@@ -73,7 +75,8 @@ def save(folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any])
         folder: The folder; an agent that is there is replaced.
         model: The model of Stable-Baselines3.
         normalization: A ``VecNormalize``, or None.
-        facts: What to tell about the agent, ``algorithm`` at least.
+        facts: What to tell about the agent, ``algorithm`` at least, and for ``bind`` the names of
+            its ``observations`` and ``actions``.
     """
     model.save(folder / _MODEL)
     if normalization is not None:
@@ -99,7 +102,7 @@ def load_agent(folder: str | os.PathLike[str]) -> Controller | TrainedModel:
     model, normalization = read_agent(path)
     if isinstance(model, Agent):
         return model.policy()
-    return TrainedModel(path, model, normalization)
+    return TrainedModel(path, model, normalization, {} if path.is_file() else _facts_in(path))
 
 
 def agent_player(folder: Path) -> Player:
@@ -115,12 +118,16 @@ class TrainedModel:
         folder: Where it comes from, for errors.
         model: The model.
         normalization: Its ``VecNormalize``, or None.
+        facts: What ``save`` was told.
     """
 
     is_physical: Final = False
 
-    def __init__(self, folder: Path, model: Any, normalization: Any) -> None:
+    def __init__(
+        self, folder: Path, model: Any, normalization: Any, facts: Mapping[str, Any]
+    ) -> None:
         self._folder, self._model, self._normalization = folder, model, normalization
+        self._facts = facts
 
     def bind(self, env: Any) -> Self:
         """Prepare for an environment.
@@ -128,15 +135,28 @@ class TrainedModel:
         Raises:
             ConfigError: If the agent was trained for other observations or actions.
         """
+        self._require_names(env.unwrapped)
         for what in ("observation", "action"):
             own, other = getattr(self._model, f"{what}_space"), getattr(env, f"{what}_space")
             if type(own) is not type(other) or own.shape != other.shape:
                 raise ConfigError(
                     f"the agent in {shown(str(self._folder))} is for another task: its {what}s are "
-                    f"{_kind(own)}, those of the task are {_kind(other)} ({_names(what, env)})"
+                    f"{_kind(own)}, those of the task are {_kind(other)} "
+                    f"({', '.join(names_of(env.unwrapped)[what + 's'])})"
                 )
         self._policy = policy_with(self._model, self._normalization, env.unwrapped)
         return self
+
+    def _require_names(self, env: FMUEnv) -> None:
+        """Refuse other names than those of the training, if these are known."""
+        here = names_of(env)
+        own = {what: self._facts.get(what, names) for what, names in here.items()}
+        told = names_that_differ(own["observations"], here["observations"])
+        if own["actions"] != here["actions"]:
+            told.append(f"it writes {', '.join(own['actions'])}, here {', '.join(here['actions'])}")
+        if told:
+            folder = shown(str(self._folder))
+            raise ConfigError(f"the agent in {folder} is for another task: {'; '.join(told)}")
 
     def act(self, observation: Any, info: Any = None) -> Any:
         """Choose the best action."""
@@ -166,7 +186,7 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
     if (path / AGENT).exists():
         return Agent.load(path), None
     file = path if path.is_file() else path / _MODEL
-    kind = algorithm_of(algorithm if path.is_file() else _algorithm_in(path))
+    kind = algorithm_of(algorithm if path.is_file() else _facts_in(path)["algorithm"])
     try:
         return kind.load(file, device="cpu"), _normalization_in(file.parent)
     except ConfigError:
@@ -177,10 +197,10 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
         ) from error
 
 
-def _algorithm_in(folder: Path) -> str:
+def _facts_in(folder: Path) -> dict[str, Any]:
     try:
-        facts = json.loads((folder / FACTS).read_text(encoding="utf-8"))
-        return str(facts["algorithm"])
+        facts: dict[str, Any] = json.loads((folder / FACTS).read_text(encoding="utf-8"))
+        return {"algorithm": facts["algorithm"], **facts}
     except ordinary(OSError, ValueError, KeyError, TypeError):
         raise ConfigError(f"{shown(str(folder))} is no folder of 'fmugym train'") from None
 
@@ -203,9 +223,10 @@ def _kind(space: Any) -> str:
     return f"{type(space).__name__} of shape {space.shape}"
 
 
-def _names(what: str, env: FMUEnv) -> str:
+def names_of(env: FMUEnv) -> dict[str, list[str]]:
+    """The names of what an agent observes and of the inputs that it writes."""
     seen = env.observation_names or env.config.model_output_names
-    return ", ".join(seen if what == "observation" else env.config.model_input_names)
+    return {"observations": list(seen), "actions": list(env.config.model_input_names)}
 
 
 def policy_with(model: Any, normalization: Any, env: FMUEnv) -> Policy:

@@ -36,6 +36,7 @@ from fmugym.training.agents import (
     agent_player,
     algorithm_of,
     imported_for_training,
+    names_of,
     policy_with,
     save,
 )
@@ -305,6 +306,7 @@ class _Training:
         else:
             self._model = _new_model(plan, venv)
             self._require_an_update()
+            self._tell_of_the_plan()
             plan.folder.mkdir(parents=True, exist_ok=True)
         facts: dict[str, Any] = {"schema": 1, "steps": plan.steps, **plan.facts()}
         if plan.diary is not None:
@@ -358,6 +360,14 @@ class _Training:
                 f"{between // plan.num_envs} in {plan.num_envs} environments), more than the "
                 f"{plan.steps} of the training: give a smaller {name}, or fewer environments"
             )
+
+    def _tell_of_the_plan(self) -> None:
+        plan = self._plan
+        self._watch.tell(
+            f"{plan.algorithm} learns for up to {plan.steps} steps of {plan.num_envs} "
+            f"environments; {plan.episodes * len(plan.held_out)} episodes are played every "
+            f"{self._due} steps, and the best agent is kept"
+        )
 
     def close(self) -> None:
         """Close all logs."""
@@ -466,7 +476,9 @@ class _Training:
             self._tracker.log({"evaluation/reward": mean, **each}, steps)
 
     def _keep(self, **more: float) -> None:
-        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **more}
+        (env,) = self._venv.get_attr("unwrapped", 0)
+        names = names_of(env)
+        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **names, **more}
         save(self._plan.folder, self._model, self._normalization(), facts)
 
 
