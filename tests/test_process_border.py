@@ -147,3 +147,20 @@ def test_shared_memory_cannot_be_shrunk():
         file.truncate(1)
     memory.map[memory.size - 1] = 1
     memory.close()
+
+
+@linux_only
+@pytest.mark.parametrize("byte", [0, 127, 255])
+def test_shared_memory_full_of_garbage_harms_no_later_episode(byte):
+    fmu = FMU(bundled_fmu("CartPole"))
+    spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05)
+    with contextlib.closing(ProcessPool(fmu, spec, 2, LOG, workers=1, call_timeout=5.0)) as pool:
+        rows = []
+        for _ in range(2):
+            pool.reset((), np.empty((0, 2)))
+            outputs, statuses = pool.step(np.ones((1, 2)))
+            assert not statuses.any(), pool.failure(0)
+            rows.append(outputs.copy())
+            np.frombuffer(pool.outputs.base, np.uint8)[:] = byte
+            pool.step()  # of whatever the inputs are now
+    np.testing.assert_array_equal(*rows)

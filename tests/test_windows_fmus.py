@@ -156,13 +156,16 @@ class TestProgram:
         built.touch()
         assert windows_worker.known_program() == built
 
-    def test_a_compiler_that_fails_is_quoted(self, monkeypatch, tmp_path):
+    def test_a_build_is_announced_and_a_compiler_that_fails_quoted(
+        self, monkeypatch, tmp_path, caplog
+    ):
         monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path))
         broken = tmp_path / "broken.c"
         broken.write_text("#error nonsense\n")
         monkeypatch.setattr(windows_worker, "sources", lambda: (broken,))
         with pytest.raises(FMULoadError, match="nonsense"):
             windows_worker.worker_program()
+        assert "takes some minutes" in caplog.text
         assert not list(tmp_path.glob("wine/*.exe"))
 
 
