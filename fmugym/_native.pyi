@@ -4,7 +4,7 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final, ParamSpec, TypedDict, TypeVar, final
 
 import numpy.typing as npt
@@ -261,36 +261,15 @@ class Pool:
             ValueError: If the snapshot is another pool's, or an instance was replaced since.
         """
 
-    def read(self, variables: Access, values: Array, /) -> int:
-        """Read variables of all; returns the instance that refuses, or -1."""
-
-    def differentiate(
-        self, adjoint: bool, part: int, seeded: Access, others: Access, derivatives: Array, /
-    ) -> int:
-        """Differentiate variables of all by others, with the inputs set.
-
-        Args:
-            adjoint: Whether the others are what is differentiated by.
-            part: The FMU of a system that the variables are of; otherwise 0.
-            seeded: One after the other.
-            others: All at once.
-            derivatives: To be filled, shape (seeded * others, N).
+    def ask(self, request: int, content: bytes, /) -> tuple[int, bytes]:
+        """Ask for something else; see ``fmugym.pool.requests``.
 
         Returns:
-            The instance that refuses, or -1.
+            The code and the content of the answer.
+
+        Raises:
+            ValueError: If there is no such request.
         """
-
-    def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
-        """Tell what failed last.
-
-        Returns:
-            The call (a whole sentence where the status is -1), whether in the warm-up, the status,
-            the time of a step (else NaN), the String that could not be set (else 2**32 - 1), what
-            the FMU logged, and the inputs or outputs where these are the reason.
-        """
-
-    def count_steps(self) -> None:
-        """Let ``health`` have all steps until now, which it otherwise gets at resets."""
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
@@ -305,28 +284,3 @@ class Pool:
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
-
-    def write(self, access: Access, values: Array, /) -> int:
-        """Set variables of all instances between two steps.
-
-        Returns:
-            The index of an instance that failed, or -1.
-        """
-
-    def save_states(self, indices: Array, records: bool, /) -> list[bytes] | int:
-        """Save the states of M instances, or the records of their episodes.
-
-        Args:
-            indices: The instances, int64, shape (M,).
-            records: Whether to save records.
-
-        Returns:
-            The states, or the index of an instance that failed.
-        """
-
-    def restore_states(self, states: Sequence[bytes], indices: Array, /) -> int:
-        """Restore a state in each of M instances; see ``SavingPool.restore_states``.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """

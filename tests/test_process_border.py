@@ -14,7 +14,7 @@ from process_tools import linux_only
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.process.requests import Answer
+from fmugym.pool.requests import Answer
 from fmugym.pool.process.shared_memory import Memory
 
 LOG = logging.getLogger("fmugym.test")

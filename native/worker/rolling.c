@@ -306,37 +306,33 @@ static bool has_bad_action(const Rollout *o) {
 /* An index outside of a table is told in the place of the troubled instances. */
 enum { OUTSIDE = -1 };
 
-static void roll_out(Worker *w, Rolling *r, Rollout *o) {
-    Writer writer = {.bytes = NULL};
+static Answer roll_out(Worker *w, Rolling *r, Rollout *o, Writer *writer) {
     bool outside = false;
 
-    write_integer(&writer, 0);
+    write_integer(writer, 0);
     measure(w, r, o);
-    make_room(w, o, &writer);
-    settle_rollout(w, r, o, &writer, sizeof(int64_t));
-    if (has_bad_action(o)) {
-        free(writer.bytes);
-        send_error(w, "an action is out of range");
-        return;
+    make_room(w, o, writer);
+    if (writer->failed) {
+        return answer_refusal(writer, "out of memory");
     }
-    pool_enter(&w->pool);
+    settle_rollout(w, r, o, writer, sizeof(int64_t));
+    if (has_bad_action(o)) {
+        return answer_refusal(writer, "an action is out of range");
+    }
     const size_t troubled = pool_rollout(&w->pool, &o->call, o->horizon, &outside);
-    pool_leave(&w->pool);
-    worker_report(w);
     const int64_t result = outside ? OUTSIDE : (int64_t)troubled;
-    memcpy(writer.bytes, &result, sizeof result);
-    send_result(w, &writer);
+    memcpy(writer->bytes, &result, sizeof result);
+    return ANSWER_RESULT;
 }
 
-void answer_roll_out(Worker *w, Reader *reader) {
+Answer answer_roll_out(Worker *w, Reader *reader, Writer *writer) {
     if (read_flag(reader)) {
         prepare(w, read_block(reader));
     }
     Rolling *r = w->rolling;
     Rollout o = {.horizon = (size_t)read_integer_in(reader, 1, INT32_MAX)};
     if (r == NULL) {
-        send_error(w, "what surrounds the steps of a rollout is damaged");
-        return;
+        return answer_refusal(writer, "what surrounds the steps of a rollout is damaged");
     }
     const Actions *a = &r->play.actions;
     const Block actions = read_block(reader);
@@ -345,9 +341,8 @@ void answer_roll_out(Worker *w, Reader *reader) {
     }
     read_values(w, reader, r);
     if (reader->fault != NULL) {
-        send_error(w, reader->fault);
-        return;
+        return answer_refusal(writer, reader->fault);
     }
     o.turn.actions = actions.bytes;
-    roll_out(w, r, &o);
+    return roll_out(w, r, &o, writer);
 }

@@ -10,10 +10,10 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
+from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -32,30 +33,16 @@ from fmugym.pool.base import (
     PoolSpec,
     StatusArray,
     available_processors,
-    naming,
 )
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.derivatives import Question, Variables, differentiated
-from fmugym.pool.form import table_of
+from fmugym.pool.form import Writer
 from fmugym.pool.health import HealthArray
-from fmugym.pool.process.requests import (
-    Answer,
-    Reader,
-    Request,
-    read_values,
-    request_differentiate,
-    request_index,
-    request_listing,
-    request_reset,
-    request_text_of,
-    request_write,
-)
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
-from fmugym.pool.saving_pool import SavingPool
+from fmugym.pool.requests import Answer, Reader, Request, request_reset
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
@@ -64,10 +51,12 @@ if TYPE_CHECKING:
 
 __all__ = ["ProcessPool"]
 
+R = TypeVar("R")
+
 _CLOSING_TIME: Final = 5.0
 
 
-class ProcessPool(SavingPool):
+class ProcessPool(AskingPool):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -129,7 +118,6 @@ class ProcessPool(SavingPool):
         except BaseException:
             fmu.close()
             raise
-        self._version = table_of(fmu.description)
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
@@ -329,18 +317,6 @@ class ProcessPool(SavingPool):
             self._states.restore(snapshot, mask)
         return self.outputs, self.statuses
 
-    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
-        """See ``Pool.write``."""
-        with self._lock:
-            self._require_present()
-            self._group.run(
-                "setting parameters",
-                self._group.supervisors,
-                lambda s: s.tell(
-                    Request.WRITE, request_write(variables, self._version, values[:, s.block])
-                ),
-            )
-
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
@@ -358,13 +334,14 @@ class ProcessPool(SavingPool):
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
                 within = index - supervisor.block.start
+                content = Writer().integers(within).form()
                 texts = self._group.run(
                     "a question",
                     [supervisor],
                     lambda s: s.tell(
                         Request.FAILURE,
-                        request_index(within),
-                        lambda reader: s.failure_in(reader, within),
+                        content,
+                        lambda reader: s.answers.failure(reader, within),
                     ),
                 )
                 for text in texts.values():
@@ -391,7 +368,7 @@ class ProcessPool(SavingPool):
             if self._group.refusal or not self._gives_texts:
                 return None
             group = self._group
-            content = request_text_of(number)
+            content = Writer().numbers(number).form()
             answers = group.run(
                 "a question",
                 group.able,
@@ -402,35 +379,24 @@ class ProcessPool(SavingPool):
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         self._gives_texts |= any(variable.kind == "string" for variable in variables)
-        content = request_listing(variables, self._version)
-        try:
-            found = self._asked("reading variables", Request.READ, content, (len(variables),))
-        except SimulationError as error:
-            raise SimulationError(naming(str(error), variables)) from None
-        return np.concatenate(found, axis=1)
+        return super().read(variables)
 
-    def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
-        """See ``Pool.differentiate``."""
-        about = self._setup.description, self._spec, self.num_instances
-        return differentiated(*about, self._differentiate, unknowns, knowns)
-
-    def _differentiate(self, question: Question) -> FloatArray:
-        content = request_differentiate(*question)
-        doing, shape = "a directional derivative", (len(question.seeded), len(question.others))
-        return np.concatenate(self._asked(doing, Request.DIFFERENTIATE, content, shape), axis=2)
-
-    def _asked(
-        self, doing: str, request: Request, content: bytes, shape: tuple[int, ...]
-    ) -> list[FloatArray]:
-        """Ask all workers for arrays of this shape and their instances, in the order of blocks."""
+    def _ask(
+        self,
+        doing: str,
+        request: Request,
+        content: Callable[[slice], bytes],
+        read: Callable[[Reader, int], R],
+    ) -> list[R]:
+        """See ``AskingPool._ask``; each worker has a block."""
         with self._lock:
             self._require_present()
             group = self._group
 
             def tell(supervisor: Supervisor) -> None:
-                count = supervisor.block.stop - supervisor.block.start
+                count = supervisor.answers.count
                 supervisor.tell(
-                    request, content, lambda reader: read_values(reader, (*shape, count))
+                    request, content(supervisor.block), lambda reader: read(reader, count)
                 )
 
             parts = group.run(doing, group.supervisors, tell)

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.form import Writer
-from fmugym.pool.process.requests import DamagedError, Reader
 from fmugym.pool.process.shared_memory import Arrays
+from fmugym.pool.requests import DamagedError, Reader
 
 __all__ = ["PlayOfWorkers", "Rolled", "read_rolled"]
 

@@ -12,24 +12,26 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
-from fmugym.errors import FMULoadError, SimulationError, printable
+import numpy as np
+
+from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.callbacks import Receiver
+from fmugym.pool.form import Writer
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.last_words import describe_exit, lines_of_echo
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
-from fmugym.pool.process.requests import (
-    Answer,
-    DamagedError,
-    Reader,
-    Request,
-    read_failure,
-    request_indices,
-)
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.reports import loading_failed
+from fmugym.pool.requests import (
+    Answer,
+    Answers,
+    DamagedError,
+    Reader,
+    Request,
+)
 from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
@@ -114,6 +116,7 @@ class Supervisor:
 
     Attributes:
         block: The indices of the worker's instances.
+        answers: Reads the worker's answers.
         generation: The number of processes that have ended.
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
@@ -133,6 +136,7 @@ class Supervisor:
         log: logging.Logger,
     ) -> None:
         self.block = setup.block
+        self.answers = Answers(setup.description, setup.spec, setup.block)
         self.generation = 0
         self.reason = ""
         self.losses: list[Loss] = []
@@ -365,7 +369,7 @@ class Supervisor:
         while self.released:
             owner, number = self.released.popleft()
             numbers += [number] if owner == generation else []
-        self._channel.send(Request.RELEASE, request_indices(numbers), self.deadline)
+        self._channel.send(Request.RELEASE, Writer().array(numbers, np.int64).form(), self.deadline)
 
     def reply(self, deadline: float, doing: str) -> Any:
         """Wait for the reply.
@@ -437,15 +441,10 @@ class Supervisor:
             self._pass_on(reader)
         elif code == Answer.FAULT:
             self._fault = reader.integer()
-        elif code == Answer.ERROR:
-            return (SimulationError(reader.text()),)
-        elif code == Answer.FAILURE:
-            index = reader.index(self._setup.count)
-            return (SimulationError(self.failure_in(reader, index)),)
-        elif code == Answer.RESULT and read is not None:
-            return (read(reader),)
-        else:
+        elif read is None:
             raise DamagedError(f"the code {code}")
+        else:
+            return (self.answers.result(code, reader, read),)
         return None
 
     def read_growth(self, reader: Reader) -> None:
@@ -454,12 +453,6 @@ class Supervisor:
         reader.end()
         self.initializations += max(0, count - self._initializations)
         self._initializations = count
-
-    def failure_in(self, reader: Reader, index: int) -> str:
-        """Read why an instance has failed, counted within the block; "" if it has not."""
-        setup = self._setup
-        name = f"{setup.description.model_identifier}_{self.block.start + index}"
-        return read_failure(reader, setup.description, setup.spec, name)
 
     def _pass_on(self, reader: Reader) -> None:
         index = reader.index(self.receiver.sources * self._setup.count)

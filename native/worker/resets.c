@@ -1,9 +1,5 @@
-/* The answers to requests for steps, resets and values. */
+/* The answer to requests for resets. */
 
-#include <stdlib.h>
-#include <string.h>
-
-#include "../derivatives.h"
 #include "worker.h"
 
 #if defined _WIN32
@@ -61,8 +57,6 @@ static int64_t growth_after(Worker *w, const char *mask) {
     return now - w->first_memory;
 }
 
-/* Resets */
-
 Matrix shared_inputs(const Worker *w) {
     return (Matrix){(const char *)w->shared.inputs, (ptrdiff_t)(w->shared.stride * sizeof(double)),
                     sizeof(double)};
@@ -103,102 +97,23 @@ static Matrix read_values(Worker *w, Reader *reader, const Access *access) {
     return (Matrix){(const char *)first, (ptrdiff_t)(n * sizeof(double)), sizeof(double)};
 }
 
-void answer_reset(Worker *w, Reader *reader) {
+Answer answer_reset(Worker *w, Reader *reader, Writer *writer) {
     const Access *start = find_list(w, reader);
     const Matrix values = read_values(w, reader, start);
     const Block mask = read_block(reader);
-    Call call = {.inputs = shared_inputs(w), .start = start, .start_values = values};
+    const Call call = {.inputs = shared_inputs(w),
+                       .start = start,
+                       .start_values = values,
+                       .mask = {mask.bytes, 1},
+                       .observations = w->observations};
 
     if (mask.size != w->opening.settings.count) {
         reader_refuse(reader, "a mask has another length");
     }
-    if (reader->fault != NULL) {
-        send_error(w, reader->fault);
-        return;
+    if (reader->fault == NULL) {
+        pool_reset(&w->pool, &call);
+        write_integer(writer, growth_after(w, mask.bytes));
+        write_integer(writer, (int64_t)number_of_initializations());
     }
-    call.mask = (Mask){mask.bytes, 1};
-    call.observations = w->observations;
-    pool_enter(&w->pool);
-    pool_reset(&w->pool, &call);
-    pool_leave(&w->pool);
-    worker_report(w);
-    worker_publish(w);
-    Writer writer = {.bytes = NULL};
-    write_integer(&writer, growth_after(w, mask.bytes));
-    write_integer(&writer, (int64_t)number_of_initializations());
-    send_result(w, &writer);
-}
-
-/* Values */
-
-void answer_write(Worker *w, Reader *reader) {
-    Access access;
-    ptrdiff_t failed = -1;
-
-    read_access(reader, w->opening.settings.fmi, &access);
-    const Matrix values = read_values(w, reader, &access);
-    if (reader->fault != NULL) {
-        send_error(w, reader->fault);
-    } else {
-        Writer nothing = {.bytes = NULL};
-        pool_enter(&w->pool);
-        failed = pool_write(&w->pool, &access, (const double *)(const void *)values.data);
-        pool_leave(&w->pool);
-        worker_report(w);
-        send_result_unless(w, failed, &nothing);
-    }
-    access_close(&access);
-}
-
-void answer_read(Worker *w, Reader *reader) {
-    Writer writer = {.bytes = NULL};
-    Access access;
-
-    if (!read_access(reader, w->opening.settings.fmi, &access)) {
-        send_error(w, reader->fault);
-    } else {
-        char *values =
-            write_room(&writer, access.count * w->opening.settings.count * sizeof(double));
-        pool_enter(&w->pool);
-        const ptrdiff_t failed = pool_read(&w->pool, &access, (double *)(void *)values);
-        pool_leave(&w->pool);
-        worker_report(w);
-        send_result_unless(w, failed, &writer);
-    }
-    access_close(&access);
-}
-
-static void answer_question(Worker *w, const Question *question) {
-    Writer writer = {.bytes = NULL};
-    const size_t count =
-        question->seeded->count * question->others->count * w->opening.settings.count;
-    char *derivatives = write_room(&writer, count * sizeof(double));
-
-    pool_enter(&w->pool);
-    const ptrdiff_t failed = pool_differentiate(&w->pool, shared_inputs(w), question,
-                                                (double *)(void *)derivatives);
-    pool_leave(&w->pool);
-    worker_report(w);
-    send_result_unless(w, failed, &writer);
-}
-
-/* The variables of a part of a system have the functions of its FMU. */
-void answer_differentiate(Worker *w, Reader *reader) {
-    const System *system = w->opening.system;
-    const bool adjoint = read_flag(reader);
-    const int64_t parts = system == NULL ? 1 : (int64_t)system->count;
-    const size_t part = (size_t)read_integer_in(reader, 0, parts - 1);
-    const Fmi *fmi = system == NULL ? w->opening.settings.fmi : system->parts[part].fmi;
-    Access seeded, others;
-
-    read_access(reader, fmi, &seeded);
-    read_access(reader, fmi, &others);
-    if (reader->fault != NULL) {
-        send_error(w, reader->fault);
-    } else {
-        const Question question = {adjoint, part, &seeded, &others};
-        answer_question(w, &question);
-    }
-    access_close(&seeded);
-    access_close(&others);
+    return answer_after(&w->pool, reader, writer, -1);
 }

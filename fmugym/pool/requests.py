@@ -1,13 +1,15 @@
-"""The requests to workers, and their answers; see ``native/worker``.
+"""What the engine is asked for besides steps, in this process or through a worker, and its answers.
 
-Contents are forms; see ``fmugym.pool.form``. A worker runs foreign code, so its answers may be
-anything. What does not fit the question is an error, which ends the worker.
+Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
+foreign code, so its answers may be anything. What does not fit the question is an error, which ends
+the worker.
 """
 
 from __future__ import annotations
 
+import functools
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, Final
 
@@ -16,6 +18,7 @@ import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
+from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
 from fmugym.pool.form import Writer
@@ -24,27 +27,22 @@ from fmugym.pool.spec import PoolSpec
 
 __all__ = [
     "Answer",
+    "Answers",
     "DamagedError",
     "Reader",
     "Request",
-    "read_failure",
     "read_states",
     "read_values",
-    "request_differentiate",
-    "request_index",
-    "request_indices",
     "request_listing",
     "request_reset",
-    "request_restore",
     "request_restore_states",
     "request_save_states",
-    "request_text_of",
-    "request_write",
+    "request_values",
 ]
 
 
 class Request(IntEnum):
-    """The codes of requests, in the order of ``native/worker/frames.h``."""
+    """The codes of requests, in the order of ``native/requests.h``."""
 
     OPEN = 0
     STEP = 1
@@ -66,7 +64,7 @@ class Request(IntEnum):
 
 
 class Answer(IntEnum):
-    """The codes of what workers send; the letters are those of ``native/worker/frames.h``."""
+    """The codes of what workers send; the letters are those of ``native/requests.h``."""
 
     FINE = ord("F")
     """The step was done, and no status is worse than a warning."""
@@ -141,41 +139,93 @@ class Reader:
             raise DamagedError(f"an array of another shape than {shape}")
         return np.frombuffer(data, wanted).reshape(shape)
 
+    def blocks(self, count: int) -> list[bytes]:
+        """Read so many blocks."""
+        return [self._take(_INTEGER.unpack(self._take(_BLANK))[0]) for _ in range(count)]
+
     def end(self) -> None:
         """Require that nothing follows."""
         if self._place != len(self._data):
             raise DamagedError("an answer is too long")
 
 
+class Answers:
+    """Reads the answers of some instances.
+
+    Args:
+        description: That of the FMU or system.
+        spec: That of their pool.
+        block: The indices of these instances.
+    """
+
+    def __init__(self, description: ModelDescription, spec: PoolSpec, block: slice) -> None:
+        self._description, self._spec, self._block = description, spec, block
+
+    @property
+    def count(self) -> int:
+        """How many instances there are."""
+        return int(self._block.stop - self._block.start)
+
+    def result(self, code: int, reader: Reader, read: Callable[[Reader], Any]) -> Any:
+        """What an answer says as ``read`` reads it, or the error that it tells.
+
+        Raises:
+            DamagedError: If it is no answer.
+        """
+        if code == Answer.RESULT:
+            return read(reader)
+        if code == Answer.ERROR:
+            return SimulationError(reader.text())
+        if code == Answer.FAILURE:
+            return SimulationError(self.failure(reader, reader.index(self.count)))
+        raise DamagedError(f"the code {code}")
+
+    def failure(self, reader: Reader, index: int) -> str:
+        """Read why an instance has failed, counted within the block; "" if it has not."""
+        if not reader.integer():
+            return ""
+        doing, in_warm_up, status = reader.text(), bool(reader.integer()), reader.integer()
+        time, reference, said = reader.number(), reader.integer(), reader.text()
+        has_values, values, part = bool(reader.integer()), reader.block(), reader.text()
+        reader.end()
+        failure = Failure(
+            doing, in_warm_up, status, time, reference, said, values if has_values else None, part
+        )
+        name = f"{self._description.model_identifier}_{self._block.start + index}"
+        try:
+            return describe_failure(failure, self._description, self._spec, name)
+        except (ValueError, StopIteration):  # another number of values, or unknown numbers
+            raise DamagedError("a failure that cannot be") from None
+
+
+def read_states(reader: Reader, count: int, outputs: int) -> list[bytes]:
+    """Read states, so many of them; each has a head and the outputs."""
+    states = reader.blocks(count)
+    reader.end()
+    if any(len(state) < SIZE_OF_HEAD + 8 * outputs for state in states):
+        raise DamagedError("a state is too short")
+    return states
+
+
+def read_values(reader: Reader, shape: tuple[int, ...]) -> FloatArray:
+    """Read floating-point numbers."""
+    values: FloatArray = reader.array(shape, np.float64)
+    reader.end()
+    return values
+
+
 # Requests
 
 
-def request_indices(numbers: Sequence[int]) -> bytes:
-    """A list of numbers."""
-    writer = Writer()
-    writer.array(numbers, np.int64)
-    return writer.form()
-
-
-def request_index(number: int) -> bytes:
-    """A number."""
-    writer = Writer()
-    writer.integers(number)
-    return writer.form()
-
-
+@functools.lru_cache(maxsize=64)
 def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
     """A list of variables; see ``fmugym.pool.form.table_of``."""
-    writer = Writer()
-    writer.listing(variables, version)
-    return writer.form()
+    return Writer().listing(variables, version).form()
 
 
-def request_text_of(number: float) -> bytes:
-    """A text with this number."""
-    writer = Writer()
-    writer.numbers(number)
-    return writer.form()
+def request_values(values: FloatArray) -> bytes:
+    """Floating-point numbers."""
+    return Writer().array(values, np.float64).form()
 
 
 def request_reset(
@@ -194,96 +244,23 @@ def request_reset(
         values: As for ``Pool.reset``.
         mask: Which instances, shape (N,).
     """
-    writer = Writer()
-    writer.integers(number, variables is not None)
+    writer = Writer().integers(number, variables is not None)
     if variables is not None:
         writer.listing(variables, version)
-    writer.array(values, np.float64)
-    writer.array(mask, np.bool_)
-    return writer.form()
-
-
-def request_restore(number: int, mask: MaskArray) -> bytes:
-    """Restore the snapshot with this number."""
-    writer = Writer()
-    writer.integers(number)
-    writer.array(mask, np.bool_)
-    return writer.form()
-
-
-def request_write(variables: tuple[Variable, ...], version: int, values: FloatArray) -> bytes:
-    """Write variables; see ``Pool.write``."""
-    writer = Writer()
-    writer.listing(variables, version)
-    writer.array(values, np.float64)
-    return writer.form()
+    return writer.array(values, np.float64).array(mask, np.bool_).form()
 
 
 def request_save_states(indices: IndexArray, records: bool) -> bytes:
     """Save states; see ``SavingPool.save_states``."""
-    writer = Writer()
-    writer.array(indices, np.int64)
-    writer.integers(records)
-    return writer.form()
+    return Writer().array(indices, np.int64).integers(records).form()
 
 
 def request_restore_states(states: Sequence[bytes], indices: IndexArray) -> bytes:
-    """Restore states; see ``SavingPool.restore_states``."""
-    writer = Writer()
-    writer.array(indices, np.int64)
-    for state in states:
+    """Restore states; see ``SavingPool.restore_states``. Each object is sent once."""
+    known = {id(state): state for state in states}
+    places = {key: place for place, key in enumerate(known)}
+    writer = Writer().array(indices, np.int64)
+    writer.array([places[id(state)] for state in states], np.int64).integers(len(known))
+    for state in known.values():
         writer.block(state)
     return writer.form()
-
-
-def request_differentiate(
-    adjoint: bool,
-    part: int,
-    version: int,
-    seeded: tuple[Variable, ...],
-    others: tuple[Variable, ...],
-) -> bytes:
-    """Differentiate; see ``Question`` of ``native/derivatives.h``."""
-    writer = Writer()
-    writer.integers(adjoint, part)
-    writer.listing(seeded, version)
-    writer.listing(others, version)
-    return writer.form()
-
-
-# Answers
-
-
-def read_failure(reader: Reader, description: ModelDescription, spec: PoolSpec, name: str) -> str:
-    """Read why an instance of this name has failed; "" if it has not."""
-    if not reader.integer():
-        return ""
-    doing, in_warm_up, status = reader.text(), bool(reader.integer()), reader.integer()
-    time, reference, said = reader.number(), reader.integer(), reader.text()
-    has_values, values, part = bool(reader.integer()), reader.block(), reader.text()
-    reader.end()
-    failure = Failure(
-        doing, in_warm_up, status, time, reference, said, values if has_values else None, part
-    )
-    try:
-        return describe_failure(failure, description, spec, name)
-    except (ValueError, StopIteration):  # another number of values, or unknown numbers
-        raise DamagedError("a failure that cannot be") from None
-
-
-def read_states(reader: Reader, count: int, outputs: int) -> list[bytes]:
-    """Read states, so many of them; each has a head and the outputs."""
-    if reader.integer() != count:
-        raise DamagedError(f"another number of states than {count}")
-    states = [reader.block() for _ in range(count)]
-    reader.end()
-    if any(len(state) < SIZE_OF_HEAD + 8 * outputs for state in states):
-        raise DamagedError("a state is too short")
-    return states
-
-
-def read_values(reader: Reader, shape: tuple[int, ...]) -> FloatArray:
-    """Read floating-point numbers."""
-    values: FloatArray = reader.array(shape, np.float64)
-    reader.end()
-    return values
