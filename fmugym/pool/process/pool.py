@@ -40,7 +40,7 @@ from fmugym.pool.health import HealthArray
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
-from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
+from fmugym.pool.process.supervisor import A_STEP, RESET, ROLLOUT, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.requests import Answer, Reader, Request, request_reset
 from fmugym.pool.spec import ResetMethod
@@ -138,8 +138,11 @@ class ProcessPool(AskingPool):
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._group = WorkerGroup(fmu, setups, memory, log, timeout, closing_time)
+        self._group = self._grouped(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._group)
+
+    def _grouped(self, *arguments: Any) -> WorkerGroup:
+        return WorkerGroup(*arguments)
 
     # The contract of Pool.
 
@@ -183,7 +186,7 @@ class ProcessPool(AskingPool):
             content = request_reset(number, told, self._version, values[:, block], mask[block])
             supervisor.tell(Request.RESET, content, supervisor.read_growth)
 
-        for supervisor in self._group.run("a reset", alive, tell):
+        for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()
             block = supervisor.block
             self._group.lost[block] &= ~mask[block]
@@ -248,7 +251,7 @@ class ProcessPool(AskingPool):
             request = Request.STEP_SOME
             np.logical_or(self._group.lost, False if skip is None else skip, out=self._mask)
         replies = self._group.run(
-            "a step", self._group.able, lambda supervisor: supervisor.step(request)
+            A_STEP, self._group.able, lambda supervisor: supervisor.step(request)
         )
         if not self._group.any_lost and Answer.TROUBLE not in replies.values():
             return 0
@@ -415,15 +418,6 @@ class ProcessPool(AskingPool):
     def initializations(self) -> int:
         """How many initializations the workers have begun."""
         return sum(supervisor.initializations for supervisor in self._group.supervisors)
-
-    @property
-    def losses(self) -> list[Loss]:
-        """How worker processes died or hung, in the order of the workers."""
-        return self._group.losses
-
-    def limit_calls(self, call_timeout: float) -> None:
-        """Let the next calls take so long; see ``call_timeout``."""
-        self._group.call_timeout = call_timeout
 
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""

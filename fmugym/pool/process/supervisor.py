@@ -36,7 +36,9 @@ from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
+    "A_STEP",
     "INSTANTIATION",
+    "RESET",
     "ROLLOUT",
     "Loss",
     "LostError",
@@ -47,8 +49,10 @@ __all__ = [
 ]
 
 INSTANTIATION: Final = "the instantiation"
+RESET: Final = "a reset"
+A_STEP: Final = "a step"
 ROLLOUT: Final = "a rollout"
-_SLOW: Final = (INSTANTIATION, "a reset")
+_SLOW: Final = (INSTANTIATION, RESET)
 """What may take ten times as long as other calls: models may need minutes to initialize."""
 
 _MOST_DEATHS: Final = 5
