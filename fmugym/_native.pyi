@@ -80,13 +80,6 @@ def statistics() -> dict[str, int]:
 def initializations() -> int:
     """How many initializations the pools of this process have begun."""
 
-def echo_to(memory: Array, /) -> None:
-    """Write what FMUs say to memory as well, before they go on.
-
-    Args:
-        memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
-    """
-
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 

@@ -28,7 +28,7 @@ R = TypeVar("R")
 
 
 class AskingPool(SavingPool):
-    """A pool whose instances are in blocks, here or in other processes, which are asked by forms."""
+    """A pool whose instances are in blocks, here or in other processes, asked by forms."""
 
     @abstractmethod
     def _ask(

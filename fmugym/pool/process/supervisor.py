@@ -69,9 +69,6 @@ _LONGEST_KILL: Final = 2.0
 
 _STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
 
-_TAIL: Final = 10
-"""How many of the FMU's last messages the cause of a death quotes."""
-
 
 def timeout_factor(doing: str) -> int:
     """How many call time-outs something may take."""
@@ -205,7 +202,6 @@ class Supervisor:
             self.forget()
             self._opening = False
             raise
-        self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
@@ -460,9 +456,7 @@ class Supervisor:
 
     def _pass_on(self, reader: Reader) -> None:
         index = reader.index(self.receiver.sources * self._setup.count)
-        record = index, reader.integer(), reader.text(), reader.text()
-        self._tail.append(self.receiver.text_of(*record))
-        self.receiver(*record)
+        self.receiver(index, reader.integer(), reader.text(), reader.text())
 
     @property
     def _name(self) -> str:
@@ -507,7 +501,7 @@ class Supervisor:
         self.losses.append(Loss(how, is_late, self._last_messages() + self._output.lines()))
 
     def _last_messages(self) -> list[str]:
-        return lines_of_echo(self._echo.tobytes()) or list(self._tail)
+        return lines_of_echo(self._echo.tobytes())
 
     def _cause(self, text: str) -> str:
         said = quoted(as_messages(self._last_messages()))
