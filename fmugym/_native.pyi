@@ -5,7 +5,7 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, ParamSpec, TypedDict, TypeVar, final
+from typing import Any, Final, ParamSpec, TypeVar, final
 
 import numpy.typing as npt
 
@@ -138,13 +138,6 @@ class Draws:
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
-class Episodes(TypedDict):
-    """See ``NativePool.prepare_play``."""
-
-    step_counts: Array
-    ended: Array
-    limit: int
-
 @final
 class Pool:
     """N instances of one FMU.
@@ -193,21 +186,20 @@ class Pool:
     def prepare_play(
         self,
         *,
+        form: bytes,
+        rows: tuple[Array, ...],
         start: Access,
         start_values: Array,
-        inputs: Program,
-        judgement: Program,
-        actions: dict[str, Any],
+        shape: tuple[int, ...],
+        letter: str,
+        current: Array | None,
+        previous: Array | None,
         draws: Draws,
         states: Array,
-        episodes: Episodes,
+        step_counts: Array,
+        ended: Array,
         kept: Array,
         done: Array | None,
-        reads_kept: bool,
-        copies: tuple[tuple[Array, Array], ...],
-        variable_starts: tuple[tuple[Array, bytes], ...],
-        drawn_variables: tuple[tuple[Array, int], ...],
-        input_starts: tuple[tuple[int, float], ...],
         results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""

@@ -177,7 +177,9 @@ class TestSingle:
             pool.reset((fmu.variable("m_cart"),), np.array([[-1.0]]))
         memory = pool._group.supervisors[0]._echo.tobytes()
         text, _, rest = memory.partition(b"\0")
-        message = "[logStatusError] fmi2ExitInitializationMode: m_cart, m_pole and pole_length must be "
+        message = (
+            "[logStatusError] fmi2ExitInitializationMode: m_cart, m_pole and pole_length must be "
+        )
         everything = 5 * f"{message}positive\n"
         assert text.decode() == everything[-size + 1 :]
         assert set(rest) <= {0}

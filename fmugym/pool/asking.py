@@ -18,7 +18,6 @@ from fmugym.pool.requests import (
     Request,
     read_values,
     request_listing,
-    request_values,
 )
 from fmugym.pool.saving_pool import SavingPool
 
@@ -79,7 +78,7 @@ class AskingPool(SavingPool):
         self._ask(
             "setting parameters",
             Request.WRITE,
-            lambda block: listing + request_values(values[:, block]),
+            lambda block: Writer().forms(listing).array(values[:, block], np.float64).form(),
             lambda reader, _: reader.end(),
         )
 
@@ -91,8 +90,8 @@ class AskingPool(SavingPool):
 
     def _differentiate(self, question: Question) -> FloatArray:
         adjoint, part, version, seeded, others = question
-        content = Writer().integers(adjoint, part).form()
-        content += request_listing(seeded, version) + request_listing(others, version)
+        lists = request_listing(seeded, version), request_listing(others, version)
+        content = Writer().integers(adjoint, part).forms(*lists).form()
         shape = len(seeded), len(others)
         doing = "a directional derivative"
         return self._ask_for_values(doing, Request.DIFFERENTIATE, content, *shape)

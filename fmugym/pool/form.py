@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -98,6 +98,11 @@ class Writer:
     def form(self) -> bytes:
         """What has been written."""
         return b"".join(self._parts)
+
+    def forms(self, *forms: bytes) -> Self:
+        """Write what others have written."""
+        self._parts += forms
+        return self
 
     def integers(self, *numbers: int) -> Self:
         """Write integers or flags."""
@@ -525,7 +530,6 @@ def form_of_program(
     code: bytes,
     constants: bytes,
     slots: bytes,
-    rows: Iterable[int],
     tables: Sequence[Any],
     registers: int,
     seen: int,
@@ -537,7 +541,6 @@ def form_of_program(
         code: The instructions.
         constants: Registers that keep a value.
         slots: Elements of observations that are stored.
-        rows: The numbers of the rows that are loaded or stored, among those that come with it.
         tables: Values to look up.
         registers: How many registers there are.
         seen: How many arrays the slots refer to.
@@ -547,7 +550,6 @@ def form_of_program(
     writer.integers(registers, seen)
     for data in (code, constants, slots):
         writer.block(data)
-    writer.array(list(rows), np.int64)
     writer.array(results, np.int64)
     writer.integers(len(tables))
     for table in tables:

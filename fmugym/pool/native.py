@@ -39,6 +39,7 @@ from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.reports import loading_failed
 from fmugym.pool.requests import (
@@ -422,17 +423,19 @@ def prepare(
     surroundings: Mapping[str, Any],
 ) -> None:
     """Do ``NativePool.prepare_play``, with the access to its variables."""
-    count, ended, limit = episodes
+    counts, ended, limit = episodes
+    rows = Rows()
     pool.prepare_play(
+        form=form_of_play(rows, programs, actions, limit, surroundings),
+        rows=tuple(rows.arrays),
         start=start,
         start_values=start_values,
-        inputs=programs[0],
-        judgement=programs[1],
-        actions=dict(actions),
         draws=draws[0],
         states=draws[1],
-        episodes={"step_counts": count, "ended": ended, "limit": limit},
-        **surroundings,
+        step_counts=counts,
+        ended=ended,
+        **{name: actions[name] for name in ("shape", "letter", "current", "previous")},
+        **{name: surroundings[name] for name in ("kept", "done", "results")},
     )
 
 

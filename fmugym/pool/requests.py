@@ -37,7 +37,6 @@ __all__ = [
     "request_reset",
     "request_restore_states",
     "request_save_states",
-    "request_values",
 ]
 
 
@@ -221,11 +220,6 @@ def read_values(reader: Reader, shape: tuple[int, ...]) -> FloatArray:
 def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
     """A list of variables; see ``fmugym.pool.form.table_of``."""
     return Writer().listing(variables, version).form()
-
-
-def request_values(values: FloatArray) -> bytes:
-    """Floating-point numbers."""
-    return Writer().array(values, np.float64).form()
 
 
 def request_reset(
