@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -47,7 +47,7 @@ from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
-    from fmugym.pool.process.rollouts import PlayOfWorkers, Rolled
+    from fmugym.pool.process.rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
 
@@ -275,7 +275,7 @@ class ProcessPool(AskingPool):
 
     def roll_out(self, *arrays: Any) -> int:
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
-        from fmugym.pool.process.rollouts import read_rolled
+        from fmugym.pool.process.rollouts import OUTSIDE, read_rolled
 
         actions, seen, *judged = arrays
         play = self._play = self._play or self._describe_play()
@@ -284,17 +284,18 @@ class ProcessPool(AskingPool):
         def tell(supervisor: Supervisor) -> None:
             block, is_known = supervisor.block, supervisor.knows_play(self._plays)
             supervisor.begin_progress(play.counts[block])
-            count = block.stop - block.start
             supervisor.tell(
                 Request.ROLL_OUT,
                 play.request(block, actions, is_known=is_known),
-                lambda reader: read_rolled(reader, count, own),
+                lambda reader: read_rolled(reader, block, own),
             )
 
         with self._lock:
-            replies = self._group.run(ROLLOUT, self._group.able, tell)
+            troubled = self._group.run(ROLLOUT, self._group.able, tell).values()
             self._group.note_lost()
-        return int(np.count_nonzero(self._group.lost)) + _take_rolled(replies, own)
+        if OUTSIDE in troubled:
+            raise IndexError("a hook looks up an index outside of its table")
+        return int(np.count_nonzero(self._group.lost) + sum(troubled))
 
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.rollouts import PlayOfWorkers
@@ -428,16 +429,6 @@ class ProcessPool(AskingPool):
         missing = np.flatnonzero(lost if mask is None else lost & mask)
         if missing.size:
             raise SimulationError(self.failure(int(missing[0])))
-
-
-def _take_rolled(replies: Mapping[Supervisor, Rolled], arrays: Sequence[npt.NDArray[Any]]) -> int:
-    """Put the results of rollouts together; returns how many instances had trouble."""
-    if any(reply.is_outside for reply in replies.values()):
-        raise IndexError("a hook looks up an index outside of its table")
-    for supervisor, reply in replies.items():
-        for array, part in zip(arrays, reply.arrays, strict=True):
-            array[:, supervisor.block] = part
-    return sum(reply.troubled for reply in replies.values())
 
 
 def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:

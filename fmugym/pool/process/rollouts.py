@@ -8,36 +8,21 @@ reads what is written here.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray
 from fmugym.pool.form import Writer
 from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.process.shared_memory import Arrays
 from fmugym.pool.requests import DamagedError, Reader
 
-__all__ = ["PlayOfWorkers", "Rolled", "read_rolled"]
+__all__ = ["OUTSIDE", "PlayOfWorkers", "read_rolled"]
 
-_OUTSIDE: Final = -1
+OUTSIDE: Final = -1
 """In the place of a number of instances: a hook has looked up an index outside of its table."""
-
-
-class Rolled(NamedTuple):
-    """What a rollout of a block has led to.
-
-    Attributes:
-        troubled: How many instances or numbers were in trouble.
-        is_outside: Whether a hook has looked up an index outside of its table.
-        arrays: The observations, rewards, terminated and truncated, with the steps on the first
-            axis.
-    """
-
-    troubled: int
-    is_outside: bool
-    arrays: tuple[npt.NDArray[Any], ...]
 
 
 class PlayOfWorkers:
@@ -84,25 +69,25 @@ class PlayOfWorkers:
         return writer.form()
 
 
-def read_rolled(reader: Reader, count: int, arrays: Sequence[npt.NDArray[Any]]) -> Rolled:
+def read_rolled(reader: Reader, block: slice, arrays: Sequence[npt.NDArray[Any]]) -> int:
     """Read the answer to a rollout.
 
     Args:
         reader: Reads it.
-        count: The number of the worker's instances.
-        arrays: Those of all instances, which are of the same types.
+        block: The indices of the worker's instances.
+        arrays: The observations, rewards, terminated and truncated of all instances, with the steps
+            on the first axis. Those of the worker's are filled.
+
+    Returns:
+        How many instances or numbers were in trouble, or ``OUTSIDE``.
     """
     troubled = reader.integer()
-    if troubled < _OUTSIDE:
+    if troubled < OUTSIDE:
         raise DamagedError(f"{troubled} instances in trouble")
-    found = tuple(_read_like(reader, count, array) for array in arrays)
+    for array in arrays:
+        part = array[:, block]
+        is_flag = array.dtype == np.bool_
+        found = reader.array(part.shape, np.uint8 if is_flag else array.dtype)
+        part[...] = found != 0 if is_flag else found  # a byte may be anything
     reader.end()
-    return Rolled(max(0, troubled), troubled == _OUTSIDE, found)
-
-
-def _read_like(reader: Reader, count: int, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    shape = len(array), count, *array.shape[2:]
-    if array.dtype != np.bool_:
-        return reader.array(shape, array.dtype)
-    flags: MaskArray = reader.array(shape, np.uint8) != 0  # a byte may be anything
-    return flags
+    return troubled
