@@ -412,18 +412,9 @@ class NativePool(AskingPool):
         return self._pool.step_one
 
 
-def prepare(
-    pool: _native.Pool,
-    start: _native.Access,
-    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
-    actions: Mapping[str, Any],
-    start_values: FloatArray,
-    draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
-    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-    surroundings: Mapping[str, Any],
-) -> None:
+def prepare(pool: _native.Pool, start: _native.Access, *parts: Any) -> None:
     """Do ``NativePool.prepare_play``, with the access to its variables."""
-    counts, ended, limit = episodes
+    programs, actions, start_values, draws, (counts, ended, limit), surroundings = parts
     rows = Rows()
     pool.prepare_play(
         form=form_of_play(rows, programs, actions, limit, surroundings),

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
 from fmugym.errors import SimulationError
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
 from fmugym.pool.form import Writer
 from fmugym.pool.reports import Failure, describe_failure
@@ -34,7 +34,6 @@ __all__ = [
     "read_states",
     "read_values",
     "request_listing",
-    "request_reset",
     "request_restore_states",
     "request_save_states",
 ]
@@ -220,28 +219,6 @@ def read_values(reader: Reader, shape: tuple[int, ...]) -> FloatArray:
 def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
     """A list of variables; see ``fmugym.pool.form.table_of``."""
     return Writer().listing(variables, version).form()
-
-
-def request_reset(
-    number: int,
-    variables: tuple[Variable, ...] | None,
-    version: int,
-    values: FloatArray,
-    mask: MaskArray,
-) -> bytes:
-    """A reset.
-
-    Args:
-        number: The number of the list of variables.
-        variables: The list; None if the process knows it already.
-        version: See ``fmugym.pool.form.table_of``.
-        values: As for ``Pool.reset``.
-        mask: Which instances, shape (N,).
-    """
-    writer = Writer().integers(number, variables is not None)
-    if variables is not None:
-        writer.listing(variables, version)
-    return writer.array(values, np.float64).array(mask, np.bool_).form()
 
 
 def request_save_states(indices: IndexArray, records: bool) -> bytes:

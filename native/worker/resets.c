@@ -1,5 +1,8 @@
 /* The answer to requests for resets. */
 
+#include <stdlib.h>
+#include <string.h>
+
 #include "worker.h"
 
 #if defined _WIN32
@@ -62,27 +65,37 @@ Matrix shared_inputs(const Worker *w) {
                     sizeof(double)};
 }
 
-/* A list comes with its number the first time, and later as the number only. */
-static const Access *find_list(Worker *w, Reader *reader) {
-    const int64_t number = read_integer(reader);
-
-    if (read_flag(reader)) {
-        w->lists = memory_for(w->lists, (w->number_of_lists + 1) * sizeof *w->lists);
-        List *list = &w->lists[w->number_of_lists];
-        list->number = number;
-        if (!read_access(reader, w->opening.settings.fmi, &list->access)) {
-            access_close(&list->access);
-            return NULL;
-        }
-        w->number_of_lists++;
-    }
+static const Access *known_list(const Worker *w, Block form) {
     for (size_t i = 0; i < w->number_of_lists; i++) {
-        if (w->lists[i].number == number) {
-            return &w->lists[i].access;
+        const List *list = &w->lists[i];
+        if (list->size == form.size && memcmp(list->form, form.bytes, form.size) == 0) {
+            return &list->access;
         }
     }
-    reader_refuse(reader, "there is no such list of variables");
     return NULL;
+}
+
+/* The list of a reset, which stays: states of instances belong to it. */
+static const Access *find_list(Worker *w, Reader *reader) {
+    const Block form = read_block(reader);
+    const Access *known = reader->fault == NULL ? known_list(w, form) : NULL;
+
+    if (known != NULL || reader->fault != NULL) {
+        return known;
+    }
+    w->lists = memory_for(w->lists, (w->number_of_lists + 1) * sizeof *w->lists);
+    List *list = &w->lists[w->number_of_lists];
+    list->form = memcpy(memory_for(NULL, form.size), form.bytes, form.size);
+    list->size = form.size;
+    Reader own = {list->form, list->form + form.size, NULL};
+    if (!read_access(&own, w->opening.settings.fmi, &list->access)) {
+        reader_refuse(reader, own.fault);
+        access_close(&list->access);
+        free(list->form);
+        return NULL;
+    }
+    w->number_of_lists++;
+    return &list->access;
 }
 
 /* The values of a list of variables, one column for each instance. */

@@ -20,9 +20,10 @@ typedef struct {
     int64_t *health, *progress;
 } Shared;
 
-/* A list of variables that the other process refers to by a number. */
+/* A list of variables that are set before initialization, and its form. */
 typedef struct {
-    int64_t number;
+    char *form;
+    size_t size;
     Access access;
 } List;
 

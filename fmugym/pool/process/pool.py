@@ -42,7 +42,7 @@ from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
 from fmugym.pool.process.supervisor import A_STEP, RESET, ROLLOUT, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
-from fmugym.pool.requests import Answer, Reader, Request, request_reset
+from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
@@ -108,12 +108,21 @@ class ProcessPool(AskingPool):
         self.num_instances = num_instances
         self._spec = spec
         self._lock = RLock()
-        self._numbers: dict[tuple[Variable, ...], int] = {}
         self._play: PlayOfWorkers | None
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
-            setup = Setup.of(fmu, spec, num_instances, log, private_libraries)
+            setup = Setup.of(
+                fmu,
+                spec,
+                num_instances,
+                log,
+                threads=threads or max(1, available_processors() // self.workers),
+                own_files=own_files,
+                private_libraries=private_libraries,
+                checks_heap=checks_heap,
+                on_trial=on_trial,
+            )
             memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
@@ -125,16 +134,7 @@ class ProcessPool(AskingPool):
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
-        threads = threads or max(1, available_processors() // self.workers)
-        setup = replace(
-            setup,
-            threads=threads,
-            own_files=own_files,
-            checks_heap=checks_heap,
-            on_trial=on_trial,
-        )
-        self._setup, self._arrays = setup, arrays
-        self._plays, self._play = 0, None
+        self._arrays, self._plays, self._play = arrays, 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
@@ -174,17 +174,15 @@ class ProcessPool(AskingPool):
         mask: MaskArray,
     ) -> list[Supervisor]:
         """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
-        number = self._numbers.setdefault(variables, len(self._numbers))
+        listing = request_listing(variables, self._version)
         used = [s for s in supervisors if not s.is_new]
         alive = self._group.revive(supervisors)
 
         def tell(supervisor: Supervisor) -> None:
-            block = supervisor.block
-            told = None if number in supervisor.known else variables
-            supervisor.known.add(number)
+            block, writer = supervisor.block, Writer().block(listing)
+            writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
             supervisor.forget_output()
-            content = request_reset(number, told, self._version, values[:, block], mask[block])
-            supervisor.tell(Request.RESET, content, supervisor.read_growth)
+            supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
 
         for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()

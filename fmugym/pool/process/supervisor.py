@@ -122,7 +122,6 @@ class Supervisor:
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
-        known: The numbers of the lists of variables that this process knows.
         released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
@@ -144,7 +143,6 @@ class Supervisor:
         self.initializations = 0
         self.growth = 0
         self.is_new = True
-        self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
@@ -206,7 +204,6 @@ class Supervisor:
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
         self._initializations = 0
-        self.known.clear()
         self._play = -1
         self.tell(Request.OPEN, self._content)
         self._content = b""
