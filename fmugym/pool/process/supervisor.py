@@ -67,6 +67,9 @@ _LAST_MOMENT: Final = 0.5
 _LONGEST_KILL: Final = 2.0
 """Seconds that a killed process may take to end; a system call may hold it for longer."""
 
+_GIVEN_UP: Final = "ended with exit status 1"
+"""What Wine does if it gets no server."""
+
 _STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
 
 
@@ -398,6 +401,22 @@ class Supervisor:
         if isinstance(result, Exception):
             self.bury(f"{self._why_not_loaded(result.args[0])}{self.printed}")
             raise RefusedError(self.reason)
+
+    def opens_again(self) -> bool:
+        """Start a process in the place of one that Wine has ended before it could run.
+
+        Wine does so if its server takes more than six seconds to end. The next process gets a
+        server of its own.
+
+        Raises:
+            LostError: If the system refuses.
+        """
+        is_first = self._deaths == 1 and self._setup.wine is not None
+        if not is_first or not self.losses or self.losses[0].how != _GIVEN_UP:
+            return False
+        self.losses.clear()
+        self.start()
+        return True
 
     def _why_not_loaded(self, text: str) -> str:
         """Say which libraries are missing, or else what the worker has said."""
