@@ -4,7 +4,7 @@ Arrays may be anything with a buffer: float64 for values, bool for masks, float3
 int8 for statuses. Those that are only read may have any strides.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final, ParamSpec, TypeVar, final
 
 import numpy.typing as npt
@@ -246,11 +246,18 @@ class Pool:
             ValueError: If the snapshot is another pool's, or an instance was replaced since.
         """
 
-    def ask(self, request: int, content: bytes, /) -> tuple[int, bytes]:
+    def ask(
+        self, request: int, content: bytes, states: Sequence[bytes] = ..., /
+    ) -> tuple[int, Any]:
         """Ask for something else; see ``fmugym.pool.requests``.
 
+        Args:
+            request: What for.
+            content: The content of the request; without the states to restore.
+            states: These, if there are any.
+
         Returns:
-            The code and the content of the answer.
+            The code and the content of the answer; the states that were saved as a list.
 
         Raises:
             ValueError: If there is no such request.

@@ -159,8 +159,36 @@ static Answer answer_save_states(Asked *a) {
     return answer(a, failed);
 }
 
-/* Reads so many states into memory for one more; the caller frees it. */
-static State *read_states(Asked *a, size_t count) {
+static Answer restore(Asked *a, const int64_t *indices, const State *states, size_t count) {
+    for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
+        if (!state_is_sound(a->pool, states[i])) {
+            reader_refuse(a->reader, "a state is damaged, or not of this FMU");
+        }
+    }
+    if (a->reader->fault == NULL) {
+        for (size_t i = 0; i < count; i++) {
+            a->pool->chosen[i] = (uint32_t)indices[i];
+        }
+        pool_restore_states(a->pool, states, count);
+    }
+    return answer(a, -1);
+}
+
+Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
+                           size_t count) {
+    Asked asked = {.pool = pool, .reader = reader, .writer = writer};
+    size_t wanted;
+    const int64_t *indices = read_instances(&asked, &wanted);
+
+    if (wanted != count) {
+        reader_refuse(reader, "the states differ in number");
+    }
+    return restore(&asked, indices, states, count);
+}
+
+static Answer answer_restore_states(Asked *a) {
+    size_t count;
+    const int64_t *indices = read_instances(a, &count);
     State *states = calloc(count + 1, sizeof *states);
 
     if (states == NULL) {
@@ -169,38 +197,10 @@ static State *read_states(Asked *a, size_t count) {
     for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
         const Block block = read_block(a->reader);
         states[i] = (State){block.bytes, block.size};
-        if (a->reader->fault == NULL && !state_is_sound(a->pool, states[i])) {
-            reader_refuse(a->reader, "a state is damaged, or not of this FMU");
-        }
     }
-    return states;
-}
-
-/* Several instances may get one state. */
-static Answer answer_restore_states(Asked *a) {
-    size_t count, chosen;
-    const int64_t *indices = read_instances(a, &count);
-    const int64_t *places = read_array(a->reader, sizeof *places, &chosen);
-    const size_t number = (size_t)read_integer_in(a->reader, 0, (int64_t)count);
-    State *states = read_states(a, number), *each = calloc(count + 1, sizeof *each);
-
-    if (chosen != count || each == NULL) {
-        reader_refuse(a->reader, each == NULL ? "out of memory" : "the states differ in number");
-    }
-    for (size_t i = 0; i < count && a->reader->fault == NULL; i++) {
-        if (places[i] < 0 || (size_t)places[i] >= number) {
-            reader_refuse(a->reader, "there is no such state");
-        } else {
-            each[i] = states[places[i]];
-            a->pool->chosen[i] = (uint32_t)indices[i];
-        }
-    }
-    if (a->reader->fault == NULL) {
-        pool_restore_states(a->pool, each, count);
-    }
+    const Answer result = restore(a, indices, states, count);
     free(states);
-    free(each);
-    return answer(a, -1);
+    return result;
 }
 
 /* Questions */

@@ -5,6 +5,7 @@
 #define FMUGYM_REQUESTS_H
 
 #include "form.h"
+#include "states.h"
 #include "writer.h"
 
 /* In the order of fmugym/pool/requests.py. Workers answer each of them once, but for a release. */
@@ -43,6 +44,10 @@ typedef enum {
 /* Answers a request inside of the pool, and writes the content of the answer; it refuses those that only
  * a worker answers. The inputs are those of derivatives. */
 Answer pool_answer(Pool *pool, Matrix inputs, Request request, Reader *reader, Writer *writer);
+
+/* The same for a request to restore states, where the owner has them at hand. */
+Answer pool_answer_restore(Pool *pool, Reader *reader, Writer *writer, const State *states,
+                           size_t count);
 
 /* The answer to a request that is refused. */
 Answer answer_refusal(Writer *writer, const char *why);

@@ -186,7 +186,7 @@ class TestStates:
         states = pool.save_states(np.arange(2), False)
         with pytest.raises(SimulationError, match="a list of instances is damaged"):
             pool.restore_states(states, np.zeros(2, np.int64))
-        with pytest.raises(SimulationError, match="a number is out of range"):
+        with pytest.raises(SimulationError, match="the states differ in number"):
             pool.restore_states(states, np.zeros(1, np.int64))
 
 

@@ -43,10 +43,10 @@ from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.reports import loading_failed
 from fmugym.pool.requests import (
+    Answer,
     Answers,
     Reader,
     Request,
-    read_states,
     request_restore_states,
     request_save_states,
 )
@@ -229,8 +229,10 @@ class NativePool(AskingPool):
             self._ask_pool(request, content(slice(0, count)), lambda reader: read(reader, count))
         ]
 
-    def _ask_pool(self, request: Request, content: bytes, read: Callable[[Reader], R]) -> R:
-        code, answer = self._open_pool().ask(request, content)
+    def _ask_pool(
+        self, request: Request, content: bytes, read: Callable[[Reader], R], *states: Any
+    ) -> R:
+        code, answer = self._open_pool().ask(request, content, *states)
         found: R | SimulationError = self._answers.result(code, Reader(answer), read)
         if isinstance(found, SimulationError):
             raise found
@@ -238,15 +240,17 @@ class NativePool(AskingPool):
 
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``."""
-        content, outputs = request_save_states(indices, records), len(self.outputs)
-        return self._ask_pool(
-            Request.SAVE_STATES, content, lambda reader: read_states(reader, len(indices), outputs)
-        )
+        content = request_save_states(indices, records)
+        code, answer = self._open_pool().ask(Request.SAVE_STATES, content)
+        if code == Answer.RESULT:
+            states: list[bytes] = answer
+            return states
+        raise self._answers.result(code, Reader(answer), Reader.end)
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
-        """See ``SavingPool.restore_states``."""
-        content = request_restore_states(states, indices)
-        self._ask_pool(Request.RESTORE_STATES, content, Reader.end)
+        """See ``SavingPool.restore_states``; the states are not copied."""
+        content = request_restore_states((), indices)
+        self._ask_pool(Request.RESTORE_STATES, content, Reader.end, states)
 
     def _count_steps(self) -> None:
         if self._close.alive:

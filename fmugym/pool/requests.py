@@ -8,6 +8,7 @@ the worker.
 from __future__ import annotations
 
 import functools
+import math
 import struct
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -133,7 +134,7 @@ class Reader:
     def array(self, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
         """Read an array of this shape and type."""
         data, wanted = self.block(), np.dtype(dtype)
-        if len(data) != wanted.itemsize * int(np.prod(shape, dtype=object)):
+        if len(data) != wanted.itemsize * math.prod(shape):
             raise DamagedError(f"an array of another shape than {shape}")
         return np.frombuffer(data, wanted).reshape(shape)
 
@@ -227,11 +228,8 @@ def request_save_states(indices: IndexArray, records: bool) -> bytes:
 
 
 def request_restore_states(states: Sequence[bytes], indices: IndexArray) -> bytes:
-    """Restore states; see ``SavingPool.restore_states``. Each object is sent once."""
-    known = {id(state): state for state in states}
-    places = {key: place for place, key in enumerate(known)}
+    """Restore states; see ``SavingPool.restore_states``."""
     writer = Writer().array(indices, np.int64)
-    writer.array([places[id(state)] for state in states], np.int64).integers(len(known))
-    for state in known.values():
+    for state in states:
         writer.block(state)
     return writer.form()

@@ -150,6 +150,9 @@ typedef struct {
     Request request;
     Reader reader;
     Writer writer;
+    PyObject *held; /* a tuple of the states to restore, or NULL */
+    State *states;
+    size_t number_of_states;
     Answer answer;
 } Asking;
 
@@ -157,28 +160,81 @@ static void do_ask(PyPool *self, bool alone, void *context) {
     Asking *a = context;
 
     (void)alone;
-    a->answer = pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request, &a->reader,
-                            &a->writer);
+    a->answer = a->held == NULL
+                    ? pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request,
+                                  &a->reader, &a->writer)
+                    : pool_answer_restore(&self->pool, &a->reader, &a->writer, a->states,
+                                          a->number_of_states);
+}
+
+/* Takes a sequence of bytes, which is neither copied nor changed. */
+static bool take_states(PyObject *sequence, Asking *a) {
+    a->held = PySequence_Tuple(sequence);
+    if (a->held == NULL) {
+        return false;
+    }
+    a->number_of_states = (size_t)PyTuple_Size(a->held);
+    a->states = calloc(a->number_of_states + 1, sizeof *a->states);
+    if (a->states == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (size_t i = 0; i < a->number_of_states; i++) {
+        char *bytes;
+        Py_ssize_t size;
+        if (PyBytes_AsStringAndSize(PyTuple_GetItem(a->held, (Py_ssize_t)i), &bytes, &size) < 0) {
+            return false;
+        }
+        a->states[i] = (State){bytes, (size_t)size};
+    }
+    return true;
+}
+
+/* A list of the blocks that are all that was written. */
+static PyObject *list_of(const Writer *writer) {
+    Reader reader = {writer->bytes, writer->bytes + writer->size, NULL};
+    PyObject *list = PyList_New(0);
+
+    while (list != NULL && reader.at != reader.end) {
+        const Block block = read_block(&reader);
+        PyObject *bytes = PyBytes_FromStringAndSize(block.bytes, (Py_ssize_t)block.size);
+        if (bytes == NULL || PyList_Append(list, bytes) < 0) {
+            Py_CLEAR(list);
+        }
+        Py_XDECREF(bytes);
+    }
+    return list;
 }
 
 static PyObject *answer_of(const Asking *a) {
-    const char *bytes = a->writer.bytes == NULL ? "" : a->writer.bytes;
+    const Writer *writer = &a->writer;
+    const char *bytes = writer->bytes == NULL ? "" : writer->bytes;
 
-    return a->writer.failed
-               ? PyErr_NoMemory()
-               : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)a->writer.size);
+    if (writer->failed) {
+        return PyErr_NoMemory();
+    }
+    return a->request == REQUEST_SAVE_STATES && a->answer == ANSWER_RESULT
+               ? Py_BuildValue("iN", (int)a->answer, list_of(writer))
+               : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
 }
 
-/* The memory of bytes is aligned. */
+static PyObject *ask(PyPool *self, Asking *a, PyObject *states) {
+    if ((states != NULL && !take_states(states, a)) ||
+        !perform(self, NEVER_SHORT, do_ask, a) || !report_messages(self)) {
+        return NULL;
+    }
+    return answer_of(a);
+}
+
+/* Takes a request, its form, and maybe the states to restore. The memory of bytes is aligned. */
 PyObject *py_ask(PyObject *object, PyObject *args) {
-    PyPool *self = (PyPool *)object;
-    Asking a = {.writer = {.bytes = NULL}};
-    PyObject *result = NULL;
+    Asking a = {.held = NULL};
     int request;
     const char *form;
     Py_ssize_t size;
+    PyObject *states = NULL;
 
-    if (!PyArg_ParseTuple(args, "iy#:ask", &request, &form, &size)) {
+    if (!PyArg_ParseTuple(args, "iy#|O:ask", &request, &form, &size, &states)) {
         return NULL;
     }
     if (request < 0 || request >= REQUESTS) {
@@ -187,9 +243,9 @@ PyObject *py_ask(PyObject *object, PyObject *args) {
     }
     a.request = (Request)request;
     a.reader = (Reader){form, form + size, NULL};
-    if (perform(self, NEVER_SHORT, do_ask, &a) && report_messages(self)) {
-        result = answer_of(&a);
-    }
+    PyObject *result = ask((PyPool *)object, &a, states);
     free(a.writer.bytes);
+    free(a.states);
+    Py_XDECREF(a.held);
     return result;
 }
