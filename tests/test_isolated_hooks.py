@@ -22,6 +22,7 @@ from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
 from fmugym.pool.around import PlayAround
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.requests import Answer, Request, request_listing
 
 
 @pytest.fixture(name="make")
@@ -219,7 +220,9 @@ def test_a_pool_without_a_library_steps_nothing(make):
     assert around._pool.step_own() == 3
     nothing = _native.Access(form_of_listing(()))
     assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
-    assert around._pool.read(nothing, np.zeros((0, 3))) == 0
+    code, answer = around._pool.ask(Request.READ, request_listing((), 2))
+    assert code == Answer.FAILURE
+    assert answer[:8] == bytes(8)
     np.testing.assert_array_equal(envs.inside.pool.outputs, before)
     around._pool.close()
     with pytest.raises(SimulationError, match="closed"):

@@ -362,46 +362,6 @@ class TestFastWay:
         assert observations.tolist() == [[0, 1.5], [9, 9], [0, 1.5], [9, 9]]
 
 
-class TestEcho:
-    """What FMUs say is written to memory while they run: the process may not survive."""
-
-    @pytest.fixture
-    def echo_to(self):
-        from fmugym import _native
-
-        yield _native.echo_to
-        _native.echo_to(bytearray(1))
-
-    @pytest.fixture
-    def complain(self, native):
-        """Let the FMU say that the mass must be positive."""
-        pool = native(bundled_fmu("CartPole"), ["f"], ["x"])
-        variables = (pool.variable("m_cart"),)
-        return lambda: pool.reset(variables, np.array([[-1.0]]))
-
-    MESSAGE = "[logStatusError] fmi2ExitInitializationMode: m_cart, m_pole and pole_length must be "
-
-    def test_lines(self, echo_to, complain):
-        memory = bytearray(4096)
-        echo_to(memory)
-        complain()
-        complain()
-        text = memory.partition(b"\0")[0].decode()
-        assert text == 2 * f"{self.MESSAGE}positive\n"
-
-    @pytest.mark.parametrize("size", [1, 2, 3, 50, 150, 400])
-    def test_the_latest_bytes_are_kept(self, echo_to, complain, size):
-        memory = bytearray(size + 8)
-        echo_to(memoryview(memory)[:size])
-        for _ in range(5):
-            complain()
-        text, _, rest = memory.partition(b"\0")
-        everything = 5 * f"{self.MESSAGE}positive\n"
-        assert everything.endswith(text.decode())
-        assert len(text) == (size - 1 if size > 1 else 0)
-        assert set(rest) <= {0}
-
-
 class TestArguments:
     def test_strides_and_types(self, native):
         pool, other = (native(bundled_fmu("CartPole"), ["f"], ["x", "theta"], 6) for _ in range(2))
