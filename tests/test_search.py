@@ -22,7 +22,7 @@ from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
 from fmugym.search.agent import AGENT, Agent
-from fmugym.search.flattening import require_numbers, rows_of, width_of
+from fmugym.search.flattening import require_numbers, rows_of
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
 from fmugym.search.probe import MOST_PROBED, Probe
@@ -406,7 +406,7 @@ def test_rows_are_those_of_gymnasium(space):
     expected = [spaces.flatten(space, one).astype(float).tolist() for one in singles]
     assert rows_of(space, observations, 5).tolist() == expected
     assert [rows_of(space, one, 1)[0].tolist() for one in singles] == expected
-    assert {len(row) for row in expected} == {width_of(space)}
+    assert {len(row) for row in expected} == {spaces.flatdim(space)}
     require_numbers(space, NUMBERS)
 
 

@@ -10,10 +10,11 @@ from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
 from fmugym.baselines.base import Controller, FloatArray, attribute_of, limited
 from fmugym.errors import ConfigError
-from fmugym.search.flattening import choices_of, rows_of, width_of
+from fmugym.search.flattening import choices_of, rows_of
 
 __all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale", "names_that_differ"]
 
@@ -197,7 +198,7 @@ class Policy(Controller):
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
         names = attribute_of(env, "observation_names")
-        return names or tuple(map(str, range(width_of(self._seen))))
+        return names or tuple(map(str, range(spaces.flatdim(self._seen))))
 
     def _rows(self, observation: Any) -> FloatArray:
         return rows_of(self._seen, observation, self.count)
