@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.declared.mathematics import FUNCTIONS, OPERATIONS
+from fmugym.declared.mathematics import FUNCTIONS, OPERATIONS, float32, float64
 from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = ["CONSTANTS", "Code", "Expression", "Names", "code_of_number", "function_of"]
@@ -56,6 +56,7 @@ _NAMESPACE: Final[dict[str, Any]] = {
     "nan": math.nan,
     **OPERATIONS,
     **{f"fn_{name}": function.call for name, function in FUNCTIONS.items()},
+    "fn_float32": lambda value: float64(float32(value)),
 }
 """What the code of expressions may call."""
 

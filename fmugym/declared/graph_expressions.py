@@ -1,0 +1,348 @@
+"""Expressions: arithmetic over the names of a task, as text.
+
+The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons, ``and``, ``or``,
+``not``, ``a if condition else b``, and calls of the functions of ``fmugym.declared.mathematics``.
+``previous(x)`` is the value of ``x`` before the step. There are no attributes, subscripts, texts or
+assignments. Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
+
+An expression becomes a value, see ``fmugym.declared.computed``. Its only names are those that the
+caller gives. It works element by element, so that it serves one environment, arrays of them, and
+the trace that compiles hooks.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial, reduce
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from fmugym.declared.computed import Value, where
+from fmugym.declared.mathematics import FUNCTIONS
+from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.vector.hooks.graph import Graph
+
+__all__ = ["CONSTANTS", "Expression", "Names"]
+
+_LONGEST: Final = 2000
+_MOST_NODES: Final = 500
+_DEEPEST: Final = 40
+
+
+def _power(base: Any, exponent: Any) -> Any:
+    if exponent.constant == 2.0:  # a product takes far less time
+        return np.square(base)
+    return np.float_power(base, exponent)
+
+
+_OPERATIONS: Final[Mapping[type[ast.AST], Callable[..., Any]]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Mod: np.remainder,
+    ast.Pow: _power,
+    ast.USub: np.negative,
+    ast.And: np.bitwise_and,
+    ast.Or: np.bitwise_or,
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
+}
+
+
+class Names(NamedTuple):
+    """What names stand for where an expression is evaluated.
+
+    Attributes:
+        graph: Gets the nodes of expressions.
+        find: Returns the value of a name; None if there is no such name.
+        find_previous: Returns the value of a name before the step; None if it has none.
+        known: The names to suggest for one that is misspelt.
+    """
+
+    graph: Graph
+    find: Callable[[str], Value | None] = lambda name: None
+    find_previous: Callable[[str], Value | None] = lambda name: None
+    known: Callable[[], list[str]] = list
+
+
+CONSTANTS: Final[Mapping[str, float | bool]] = {"pi": math.pi, "true": True, "false": False}
+"""Names that have the same value everywhere."""
+
+
+@dataclass(frozen=True)
+class Expression:
+    """An expression whose grammar is checked.
+
+    Attributes:
+        text: As the user wrote it.
+        tree: What it consists of.
+    """
+
+    text: str
+    tree: ast.expr
+
+    @classmethod
+    def parse(cls, value: Any) -> Expression:
+        """Parse an expression.
+
+        Args:
+            value: A text; a number or a Boolean stands for itself.
+
+        Raises:
+            ConfigError: If it is no expression. The text tells the column.
+        """
+        if isinstance(value, bool | int | float):
+            value = repr(value)
+        if not isinstance(value, str):
+            raise ConfigError(f"expected an expression, got {shown(value)}")
+        if len(value) > _LONGEST:
+            raise ConfigError(f"an expression has at most {_LONGEST} characters, got {len(value)}")
+        tree = _parsed(value)
+        _check_size(value, tree)
+        return cls(value, tree)
+
+    @property
+    def names(self) -> set[str]:
+        """The names that it reads."""
+        called = {id(node.func) for node in ast.walk(self.tree) if isinstance(node, ast.Call)}
+        nodes = [node for node in ast.walk(self.tree) if isinstance(node, ast.Name)]
+        return {node.id for node in nodes if id(node) not in called}
+
+    @property
+    def previous_names(self) -> set[str]:
+        """The names whose values before the step it reads."""
+        calls = [node for node in ast.walk(self.tree) if isinstance(node, ast.Call)]
+        return {
+            argument.id
+            for call in calls
+            if isinstance(call.func, ast.Name) and call.func.id == "previous"
+            for argument in call.args
+            if isinstance(argument, ast.Name)
+        }
+
+    def value(self, names: Names) -> Value:
+        """Make nodes of it.
+
+        Args:
+            names: What the names stand for.
+
+        Raises:
+            ConfigError: If a name is unknown, or the expression has something that is not in the
+                grammar. The text tells the column.
+        """
+        try:
+            return _Evaluation(self.text, names).evaluate(self.tree)
+        except RecursionError:
+            raise ConfigError("expressions read each other in too long a row") from None
+
+    def constant(self) -> float:
+        """The value of an expression without names.
+
+        Raises:
+            ConfigError: If it has names, or the value is not finite.
+        """
+        value = self.value(Names(Graph())).number.constant
+        if value is None or not math.isfinite(value):
+            raise ConfigError(f"{self.text!r} is no finite number, but {value}")
+        return float(value)
+
+
+def _parsed(text: str) -> ast.expr:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Python's own grammar
+            return ast.parse(text.strip(), mode="eval").body
+    except SyntaxError as error:
+        raise ConfigError(f"{shown(text)} is no expression: {_misfit(text, error)}") from None
+    except (ValueError, MemoryError, RecursionError):
+        raise ConfigError(f"{shown(text)} is no expression") from None
+
+
+def _misfit(text: str, error: SyntaxError) -> str:
+    """Say what is wrong, and where."""
+    if not error.offset:
+        return "it ends too early" if text.strip() else "it is empty"
+    column = _column(text, error.offset - 1)
+    if error.msg != "invalid syntax":  # such as "'(' was never closed"
+        return f"{error.msg} (column {column})"
+    hint = "; comparisons are == != < <= > >=" if text[column - 1 : column] == "=" else ""
+    return f"column {column} does not fit{hint}"
+
+
+def _column(text: str, offset: int) -> int:
+    return 1 + offset + len(text) - len(text.lstrip())
+
+
+def _check_size(text: str, tree: ast.expr) -> None:
+    count, level = 0, [tree]
+    for _ in range(_DEEPEST):
+        count += len(level)
+        level = [child for node in level for child in _operands(node)]
+        if not level:
+            break
+    if level or count > _MOST_NODES:
+        raise ConfigError(
+            f"{shown(text)} is too long: an expression has at most {_MOST_NODES} parts, nested "
+            f"{_DEEPEST} times"
+        )
+
+
+def _operands(node: ast.AST) -> list[Any]:
+    return [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
+
+
+class _Evaluation:
+    """Evaluates an expression: its operators and functions make nodes.
+
+    Args:
+        text: The expression, for errors.
+        names: What names stand for.
+    """
+
+    def __init__(self, text: str, names: Names) -> None:
+        self._text, self._names = text, names
+
+    def evaluate(self, node: ast.expr) -> Value:
+        """The value of a part of the expression."""
+        method = getattr(self, f"_value_of_{type(node).__name__.lower()}", None)
+        if isinstance(node, ast.Attribute | ast.Subscript):
+            name = ast.get_source_segment(self._text.strip(), node)
+            raise self._error(
+                node,
+                f"{shown(name)} cannot stand in an expression; a variable of this name needs an "
+                f'alias in [variables]: alias = {{ name = "{name}" }}',
+            )
+        if method is None:
+            what = type(node).__name__.lower()
+            raise self._error(node, f"{what} is not allowed here")
+        value: Value = method(node)
+        return value
+
+    def _error(self, node: ast.AST, text: object) -> ConfigError:
+        offset = len(self._text.strip().encode()[: getattr(node, "col_offset", 0)].decode())
+        return ConfigError(f"{text} (column {_column(self._text, offset)} of {shown(self._text)})")
+
+    def _value_of_constant(self, node: ast.Constant) -> Value:
+        value = node.value
+        if isinstance(value, bool):
+            return self._constant(value)
+        if isinstance(value, int | float):
+            number = _as_float(value)
+            if math.isfinite(number):
+                return self._constant(number)
+        raise self._error(node, f"{shown(value)} is no number")
+
+    def _value_of_name(self, node: ast.Name) -> Value:
+        if node.id in CONSTANTS:
+            return self._constant(CONSTANTS[node.id])
+        value = self._names.find(node.id)
+        if value is None:
+            raise self._error(node, unknown_name("name", node.id, self._known()))
+        return value
+
+    def _constant(self, number: float | bool) -> Value:
+        return Value.of(self._names.graph, number)
+
+    def _known(self) -> list[str]:
+        return list(dict.fromkeys([*self._names.known(), *CONSTANTS]))
+
+    def _value_of_unaryop(self, node: ast.UnaryOp) -> Value:
+        operand = self.evaluate(node.operand)
+        if isinstance(node.op, ast.Not):
+            return self._flag(node.operand, operand) ^ True
+        if isinstance(node.op, ast.Invert):
+            raise self._error(node, "the operator ~ is not allowed here; write 'not'")
+        return (
+            operand.number if isinstance(node.op, ast.UAdd) else _applied(node.op, operand.number)
+        )
+
+    def _value_of_binop(self, node: ast.BinOp) -> Value:
+        if type(node.op) not in _OPERATIONS:
+            what = shown(ast.get_source_segment(self._text.strip(), node))
+            raise self._error(
+                node,
+                f"the operator in {what} is not allowed here; there are + - * / % ** (power) and "
+                "or not",
+            )
+        first, second = self.evaluate(node.left), self.evaluate(node.right)
+        return _applied(node.op, first.number, second.number)
+
+    def _value_of_boolop(self, node: ast.BoolOp) -> Value:
+        flags = [self._flag(part, self.evaluate(part)) for part in node.values]
+        return reduce(partial(_applied, node.op), flags)
+
+    def _flag(self, node: ast.expr, value: Value) -> Value:
+        if value.is_flag:
+            return value
+        raise self._error(node, "expected a condition such as 'x > 1', got a number")
+
+    def _value_of_compare(self, node: ast.Compare) -> Value:
+        operands = [self.evaluate(part).number for part in (node.left, *node.comparators)]
+        parts = []
+        for sign, first, second in zip(node.ops, operands, operands[1:], strict=False):
+            if type(sign) not in _OPERATIONS:
+                raise self._error(node, f"{type(sign).__name__} is not allowed here")
+            parts.append(_applied(sign, first, second))
+        return reduce(partial(_applied, ast.And()), parts)
+
+    def _value_of_ifexp(self, node: ast.IfExp) -> Value:
+        condition = self._flag(node.test, self.evaluate(node.test))
+        first, second = self.evaluate(node.body), self.evaluate(node.orelse)
+        if first.is_flag and second.is_flag:
+            return (condition & first) | ((condition ^ True) & second)
+        return where(condition, first.number, second.number)
+
+    def _value_of_call(self, node: ast.Call) -> Value:
+        if not isinstance(node.func, ast.Name):
+            raise self._error(node, "only functions by their names can be called")
+        name = node.func.id
+        if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
+            raise self._error(node, f"{name} takes arguments by place only")
+        if name == "previous":
+            return self._value_of_previous(node)
+        function = FUNCTIONS.get(name)
+        if function is None:
+            raise self._error(node, unknown_name("function", name, [*FUNCTIONS, "previous"]))
+        count = len(node.args)
+        if count < function.fewest or (function.most is not None and count > function.most):
+            few = f"at least {function.fewest}" if function.most is None else function.fewest
+            raise self._error(node, f"{name} takes {few} arguments, got {count}")
+        arguments = [self.evaluate(argument).number for argument in node.args]
+        value: Value = function.call(*arguments)
+        return value
+
+    def _value_of_previous(self, node: ast.Call) -> Value:
+        names = [argument.id for argument in node.args if isinstance(argument, ast.Name)]
+        if len(names) != 1 or len(node.args) != 1:
+            raise self._error(node, "previous takes one name")
+        self.evaluate(node.args[0])  # which refuses an unknown name
+        value = self._names.find_previous(names[0])
+        if value is None:
+            raise self._error(
+                node,
+                f"{names[0]!r} has no value before the step here; previous is for observed "
+                "variables and actions",
+            )
+        return value
+
+
+def _applied(sign: ast.AST, *operands: Value) -> Value:
+    value: Value = _OPERATIONS[type(sign)](*operands)
+    return value
+
+
+def _as_float(value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
