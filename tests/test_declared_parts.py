@@ -9,8 +9,8 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
-from fmugym.declared import expressions, graph_expressions
 from fmugym.declared.computed import Value, function_of
+from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.quantities import duration
 from fmugym.vector.hooks.graph import Graph
@@ -21,27 +21,14 @@ class Env:
         self.a, self.b = a, b
 
 
-def by_text(text):
-    code = expressions.Code
-    names = expressions.Names(
-        {"a": code("env.a"), "b": code("env.b"), "flag": code("(env.a > 0.0)", True)}.get,
-        lambda name: None,
-        lambda: ["a", "b", "flag"],
-    )
-    value = expressions.Expression.parse(text).code(names)
-    return expressions.function_of(value.text, {}, "test")
-
-
-def by_graph(text):
+def function_of_text(text):
     graph = Graph()
     a, b = (Value.read(graph, name) for name in "ab")
     found = {"a": a, "b": b, "flag": a > 0.0}
-    names = graph_expressions.Names(graph, found.get, known=lambda: list(found))
-    value = graph_expressions.Expression.parse(text).value(names)
+    names = Names(graph, found.get, known=lambda: list(found))
+    value = Expression.parse(text).value(names)
     return function_of(value)
 
-
-ways = pytest.mark.parametrize("way", [by_text, by_graph])
 
 VALUES = np.array([0.0, -0.0, 0.3, -0.7, 1.5, -2.5, 3.0, 1e-300, -1e300, 5.0, math.pi, 80.0])
 PAIRS = np.array(np.meshgrid(VALUES, VALUES)).reshape(2, -1)
@@ -67,22 +54,12 @@ EXPRESSIONS = {
 }
 
 
-@ways
 @pytest.mark.parametrize("text", EXPRESSIONS)
-def test_an_expression_has_the_value_of_numpy(text, way):
-    function = way(text)
+def test_an_expression_has_the_value_of_numpy(text):
+    function = function_of_text(text)
     with np.errstate(all="ignore"):
         expected = EXPRESSIONS[text](*PAIRS)
     np.testing.assert_array_equal(function(Env(*PAIRS)), expected)
-
-
-@pytest.mark.parametrize("text", EXPRESSIONS)
-def test_both_ways_give_the_same_bits(text):
-    with np.errstate(all="ignore"):
-        first, second = (np.asarray(way(text)(Env(*PAIRS)), float) for way in (by_text, by_graph))
-    numbers = ~np.isnan(first)
-    np.testing.assert_array_equal(first, second)
-    np.testing.assert_array_equal(np.signbit(first)[numbers], np.signbit(second)[numbers])
 
 
 def calls():
@@ -91,10 +68,9 @@ def calls():
         yield f"{name}({', '.join(arguments)})"
 
 
-@ways
 @pytest.mark.parametrize("text", [*EXPRESSIONS, *calls()])
-def test_one_number_has_the_same_value_as_an_element(text, way):
-    function = way(text)
+def test_one_number_has_the_same_value_as_an_element(text):
+    function = function_of_text(text)
     together = function(Env(*PAIRS))
     alone = [float(function(Env(a, b))) for a, b in PAIRS.T.tolist()]
     same = np.asarray(together, float)
@@ -135,20 +111,18 @@ REFUSED = {
 }
 
 
-@ways
 @pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
-def test_what_is_not_in_the_grammar_is_refused(text, way):
+def test_what_is_not_in_the_grammar_is_refused(text):
     with pytest.raises(ConfigError, match=REFUSED[text]):
-        way(text)
+        function_of_text(text)
 
 
-@ways
 @pytest.mark.parametrize(
     ("text", "column"), [("a + bb", 5), ("  a + bb", 7), ("abs(a) * cc", 10), ("\u00e4 + a", 1)]
 )
-def test_an_error_tells_the_column(text, column, way):
+def test_an_error_tells_the_column(text, column):
     with pytest.raises(ConfigError, match=rf"column {column} of"):
-        way(text)
+        function_of_text(text)
 
 
 METRE = Unit((0, 1, 0, 0, 0, 0, 0, 0), display_units={"mm": (1000.0, 0.0)})

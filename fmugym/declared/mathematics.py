@@ -14,7 +14,6 @@ import numpy as np
 
 __all__ = [
     "FUNCTIONS",
-    "OPERATIONS",
     "Function",
     "chance",
     "chosen",
@@ -144,26 +143,6 @@ def noise(key: Any, count: Any, channel: int) -> Any:
     first = _fraction(_mixed(word + _STEP)) + _FRACTION  # the logarithm of 0 is not finite
     second = _fraction(_mixed(word + _STEP + _STEP))
     return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
-
-
-def _power(base: Any, exponent: Any) -> Any:
-    if isinstance(exponent, float) and exponent == 2.0:  # a product takes far less time
-        return square(base)
-    return np.float_power(base, exponent)
-
-
-OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
-    "divide": divide,
-    "remainder": remainder,
-    "power": _power,
-    "where": chosen,
-    "float64": float64,
-    "take": looked_up,
-    "interp": np.interp,
-    "noise": noise,
-    "chance": chance,
-}
-"""What the code of expressions calls for operators and for values that it looks up."""
 
 
 # What expressions call, with values of a task.
