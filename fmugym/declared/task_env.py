@@ -7,8 +7,8 @@ from types import MethodType
 from typing import Any, Final, Never
 
 from fmugym.declared.resolved_task import ResolvedTask
-from fmugym.declared.systems import describe, fmu_of
 from fmugym.declared.task import Task
+from fmugym.declared.task_fmu import describe, fmu_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
 from fmugym.task.alone import alone
