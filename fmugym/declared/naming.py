@@ -18,9 +18,9 @@ from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import clip, maximum
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.variables import Record, converted
 from fmugym.errors import unknown_name
-from fmugym.pool.spec import whole_number_of_steps
 from fmugym.vector.hooks.graph import Graph
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
@@ -251,11 +251,7 @@ class Naming:
     def _value_of_steps(self, name: str, moment: Moment) -> Value:
         """The random value now; after a step, that of the step."""
         steps = self._declared.steps[name]
-        count = whole_number_of_steps(steps.every, self._time_step)
-        if not count:
-            raise steps.entry.error(
-                f"{steps.every:g} s is no multiple of the time step of {self._time_step:g} s"
-            )
+        count = steps_in(steps.entry, steps.every, self._time_step)
         shift = round(self._ahead / self._time_step) - (moment in _OVER)
         passed = maximum(self.step_count + float(shift), 0.0)
         low, high = steps.limits
@@ -392,14 +388,8 @@ class Naming:
         Raises:
             ConfigError: If the delay is no multiple of the time step.
         """
-        delay = record.device.delay
-        count = whole_number_of_steps(delay, self._time_step) if delay else 0
-        if delay and (not count or count > _LONGEST_DELAY):
-            raise record.entry.child("delay").error(
-                f"{delay:g} s is no multiple of the step of {self._time_step:g} s, or more than "
-                f"{_LONGEST_DELAY} steps"
-            )
-        return count or 0
+        delay, entry = record.device.delay, record.entry.child("delay")
+        return steps_in(entry, delay, self._time_step, _LONGEST_DELAY) if delay else 0
 
     def _late(self, record: Record) -> Value:
         """What the agent chose some steps ago."""

@@ -15,8 +15,8 @@ from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.variables import Record
-from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = [
     "History",
@@ -109,7 +109,7 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
         ConfigError: If a name has no value before the step.
     """
     entry = declared.root.child("agent").child("history")
-    length = _count(entry.child("length"), time_step) if declared.remembered else 0
+    length = _kept_steps(declared, time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
     for name in declared.measured:
         record = _sensor_of(declared, name)
@@ -120,6 +120,12 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     kept = [_history(entry, naming, name, count) for name, count in of_variables.items()]
     late_ones = [record for record in declared.actions if record.device.delay]
     return [*kept, *(_queue(naming, record) for record in late_ones)]
+
+
+def _kept_steps(declared: Declarations, time_step: float) -> int:
+    """How many values of a name the agent sees that are of the past."""
+    entry = declared.root.child("agent").child("history").child("length")
+    return steps_in(entry, entry.value, time_step, _MOST_VALUES)
 
 
 def _queue(naming: Naming, record: Record) -> History:
@@ -268,7 +274,8 @@ def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
     for entry in _forecasts_in(declared):
         step = entry.value.get("step", time_step)
-        count = _count(entry.child("horizon"), step)
+        horizon = entry.child("horizon")
+        count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
         error = _error_of(entry.child("error").value)
         for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
             name = one.value
@@ -338,19 +345,9 @@ def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterat
     entry = declared.root.child("agent").child("history")
     for name in declared.remembered:
         limits = declared.limits_of(name)
-        for ago in range(1, 1 + _count(entry.child("length"), time_step)):
+        for ago in range(1, 1 + _kept_steps(declared, time_step)):
             value = past.measured(entry, name, ago)
             yield Seen(entry, name, value, *limits, f"[-{ago * time_step:g} s]")
-
-
-def _count(entry: Entry, step: float) -> int:
-    length = entry.value
-    count = whole_number_of_steps(length, step) if step > 0 else 0
-    if not count:
-        raise entry.error(f"{length:g} s is no multiple of the step of {step:g} s")
-    if count > _MOST_VALUES:
-        raise entry.error(f"{length:g} s are {count} steps of {step:g} s, at most {_MOST_VALUES}")
-    return count
 
 
 def normalized(seen: Seen, nominal: float | None) -> Seen:

@@ -40,11 +40,11 @@ from fmugym.declared.observing import (
 )
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
-from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.quantity import Quantities
 
 __all__ = ["ResolvedTask"]
@@ -124,16 +124,9 @@ class ResolvedTask:
 
     def _steps_of_warm_up(self) -> int:
         """The steps of a warm-up with moving inputs; 0 if there is none."""
-        table, step = self._declared.warm_up, self._time_step
-        if not (table.controllers or table.caches or self._declared.inputs):
-            return 0
-        count = whole_number_of_steps(table.period, step)
-        if count is None:
-            raise table.entry.error(
-                f"the warm-up must be a multiple of the time step of {step:g} s, got "
-                f"{table.period:g} s"
-            )
-        return count
+        table = self._declared.warm_up
+        moves = table.controllers or table.caches or self._declared.inputs
+        return steps_in(table.entry, table.period, self._time_step) if moves and table.period else 0
 
     def _make_warm_up(self) -> DeclaredWarmUp:
         maker = WarmUpMaker(self._declared, self._naming, self._time_step)
