@@ -174,8 +174,7 @@ class _Source:
             node = self._graph.nodes[number]
             letter = node.dtype.char
             if node.kind == "constant":
-                value = self._value(node)
-                self._texts[number] = constant(value, letter)
+                self._texts[number] = constant(node.number, letter)
                 continue
             if node.kind == "take":
                 yield from self._checked_place(node)
@@ -189,19 +188,8 @@ class _Source:
             yield f"    const {c_type(node.dtype)} t{number} = {bare(text)};"
 
     def _closure(self, numbers: Iterable[int]) -> set[int]:
-        found: set[int] = set()
-        waiting = list(numbers)
-        while waiting:
-            number = waiting.pop()
-            if number not in found and number not in self._texts:
-                found.add(number)
-                if number not in self._logic.loads:
-                    waiting.extend(self._graph.nodes[number].operands)
-        return found
-
-    def _value(self, node: Node) -> Any:
-        bits: Any = node.what
-        return np.frombuffer(bits, node.dtype)[0]
+        known = self._texts.keys() | self._logic.loads.keys()
+        return set(self._graph.needed(numbers, known)) - self._texts.keys()
 
     def _expression(self, number: int, node: Node) -> str:
         if number in self._logic.loads:

@@ -9,7 +9,7 @@ what the agent remembers.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -114,7 +114,7 @@ class Logic:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
         roots = [*self.features, *self.input_nodes, *updates]
-        return _closure(self.graph, roots, self.loads)
+        return frozenset(self.graph.needed(roots, self.loads))
 
 
 def logic_of(
@@ -257,7 +257,7 @@ class _ControllerTracer(Tracer):
             self._contents = Contents(env)
             found.append(self._call("_get_inputs", self._input_nodes))
         are_chosen = (
-            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in _closure(self._graph, [node]))
+            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in self._graph.needed([node]))
             for node in found[0]
         )
         return tuple(are_chosen), tuple(found[1])
@@ -328,7 +328,7 @@ class _Assembly:
         )
 
     def _closure(self, roots: Iterable[int]) -> frozenset[int]:
-        return _closure(self._graph, roots, self._external)
+        return frozenset(self._graph.needed(roots, self._external))
 
     def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
         return (self._graph.nodes[number] for number in sorted(needed))
@@ -471,15 +471,3 @@ class _Assembly:
 def _is_row(node: Node, kind: str) -> bool:
     what: Any = node.what
     return node.kind == "row" and what[0] == kind
-
-
-def _closure(graph: Graph, roots: Iterable[int], known: Container[int] = ()) -> frozenset[int]:
-    """Some nodes, and all that they are computed from, as far as they are not known."""
-    found: set[int] = set()
-    waiting = list(roots)
-    while waiting:
-        number = waiting.pop()
-        if number not in found:
-            found.add(number)
-            waiting.extend(() if number in known else graph.nodes[number].operands)
-    return frozenset(found)

@@ -159,8 +159,7 @@ class _Model:
         operands, what, nodes = [self._names[one] for one in node.operands], node.what, self._nodes
         match node.kind:
             case "constant":
-                bits: Any = what
-                return nodes.constant(np.frombuffer(bits, node.dtype)[0], node.dtype)
+                return nodes.constant(node.number, node.dtype)
             case "ufunc":
                 return computed(nodes, what, operands, self._graph.nodes[node.operands[0]].dtype)
             case "cast":
