@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,19 +73,11 @@ def _key_of(series: Any) -> Any:
 
 
 def _lookup_in(graph: Graph, root: int, key: Any) -> int:
-    for number in _below(graph, root):
+    for number in sorted(graph.closure([root])):
         node = graph.nodes[number]
         if node.kind == "interpolate" and node.what == key:
             return number
     raise ConfigError("data that do not change cannot be given from outside")
-
-
-def _below(graph: Graph, root: int) -> Iterator[int]:
-    waiting = [root]
-    while waiting:
-        number = waiting.pop()
-        yield number
-        waiting.extend(graph.nodes[number].operands)
 
 
 def _variable(name: str, series: Any, env: FMUEnv) -> Variable:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Container, Hashable, Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -87,6 +87,22 @@ class Graph:
             return None
         bits: Any = node.what
         return np.frombuffer(bits, node.dtype)[0]
+
+    def closure(self, roots: Iterable[int], known: Container[int] = ()) -> set[int]:
+        """The numbers of some nodes, and of all that they are computed from.
+
+        Args:
+            roots: The nodes.
+            known: Nodes that count, but not what they are computed from.
+        """
+        found: set[int] = set()
+        waiting = list(roots)
+        while waiting:
+            number = waiting.pop()
+            if number not in found:
+                found.add(number)
+                waiting.extend(() if number in known else self.nodes[number].operands)
+        return found
 
     def compute(
         self, kind: str, what: Any, cells: tuple[Cell, ...], dtype: np.dtype[Any], fold: Any
