@@ -12,7 +12,7 @@ import pytest
 from fmu_tools import HERE, edited_fmu, library_name
 from process_tools import run_python
 
-from fmugym import FMU, ConfigError, Task
+from fmugym import FMU, ConfigError, Task, extras
 from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.loader import ask
 from fmugym.repair import stand_in
@@ -83,8 +83,8 @@ STEPPED = "[0.30000001192092896, 1.0]"
 def compiler(request, monkeypatch):
     """Build with the system's compiler, and without one with that of a package."""
     if request.param == "ziglang":
-        monkeypatch.setattr(stand_in, "_PROGRAMS", ("no-such-compiler",))
-    elif not any(map(shutil.which, stand_in._PROGRAMS)):
+        monkeypatch.setattr(extras, "_COMPILERS", ("no-such-compiler",))
+    elif not any(map(shutil.which, extras._COMPILERS)):
         pytest.skip("there is no system compiler")
     return request.param
 
@@ -204,8 +204,8 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
 
 
 def test_without_a_compiler(fmu_path, tmp_path, monkeypatch):
-    monkeypatch.setattr(stand_in, "_PROGRAMS", ())
-    monkeypatch.setattr(stand_in.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "_COMPILERS", ())
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"needs a C compiler: install gcc .* or ziglang"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path)
 

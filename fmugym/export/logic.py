@@ -110,7 +110,7 @@ class Logic:
     time_step: float
 
     @property
-    def needed(self) -> frozenset[int]:
+    def needed(self) -> set[int]:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
         roots = [*self.features, *self.input_nodes, *updates]
@@ -299,10 +299,10 @@ class _Assembly:
     def logic(self) -> Logic:
         """Find all that the features and the inputs depend on, from sample to sample."""
         roots = [*self._traced.features, *(node for _, node in self._inputs)]
-        needed = self._closure(roots)
+        needed = set(self._graph.needed(roots, self._external))
         while True:
             found = [*roots, *self._next_values(needed)]
-            longer = self._closure(found)
+            longer = set(self._graph.needed(found, self._external))
             if longer == needed:
                 break
             needed = longer
@@ -326,9 +326,6 @@ class _Assembly:
             tuple(self._parameters),
             env.inside.interface.time_step,
         )
-
-    def _closure(self, roots: Iterable[int]) -> frozenset[int]:
-        return frozenset(self._graph.needed(roots, self._external))
 
     def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
         return (self._graph.nodes[number] for number in sorted(needed))
@@ -366,7 +363,7 @@ class _Assembly:
 
     # What is kept.
 
-    def _add_fields(self, needed: frozenset[int], places: list[int]) -> None:
+    def _add_fields(self, needed: set[int], places: list[int]) -> None:
         nodes = list(self._nodes(needed))
         if any(_is_row(node, "kept") for node in nodes):
             outputs = [self._output_node(place) for place in places]
