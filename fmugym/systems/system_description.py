@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Final
 
-import numpy as np
-
 from fmugym.archive.description import Capabilities, ModelDescription, Unit
+from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.systems.system_plan import Connector, End, SystemPlan
@@ -138,7 +137,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         start_time=plan.start_time,
         stop_time=plan.stop_time,
         tolerance=plan.tolerance,
-        step_size=_step_size(plan, parts),
+        step_size=plan.step_size,
         fixed_internal_step_size=None,
         capabilities=_capabilities(plan, parts),
         variables=variables,
@@ -158,15 +157,6 @@ def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[st
         for component, part in zip(plan.components, parts, strict=True)
         for state, derivative in part.derivatives.items()
     }
-
-
-def _step_size(plan: SystemPlan, parts: Sequence[ModelDescription]) -> float | None:
-    """The plan's; or else the smallest that fits the default of a component."""
-    if plan.step_size is not None:
-        return plan.step_size
-    pairs = zip(plan.components, parts, strict=True)
-    steps = [part.step_size * one.steps for one, part in pairs if part.step_size is not None]
-    return min(steps, default=None)
 
 
 def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:
@@ -257,8 +247,7 @@ def _usable(
     values = dict(starts)
     for variable in part.variables.values():
         is_number = variable.is_number and not (variable.ticking and variable.shape)
-        is_text = variable.kind == "string" and variable.is_scalar
-        if (is_number and _is_good_array(variable)) or is_text:
+        if (is_number and _is_good_array(variable)) or variable.is_text:
             yield _started(variable, values)
 
 
@@ -324,11 +313,9 @@ def _elements_behind(end: PartVariable) -> list[PartVariable]:
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:
     """Describe a connector as the variable behind its first end, in its own unit."""
-    own = first.variable
-    if connector.causality == "output":
-        limits = [first.gain * x + first.offset for x in (own.minimum, own.maximum)]
-    else:
-        limits = [(x - first.offset) / first.gain for x in (own.minimum, own.maximum)]
+    own, change = first.variable, Conversion(first.gain, first.offset)
+    convert = change if connector.causality == "output" else change.inverse
+    limits = [convert(x) for x in (own.minimum, own.maximum)]
     return replace(
         own,
         name=connector.name,
@@ -340,27 +327,13 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         unit=own.unit if connector.unit is None else connector.unit,
         minimum=min(limits),
         maximum=max(limits),
-        start=_start(connector, first),
-        nominal=_nominal(connector, first),
+        start=own.start if change == IDENTITY else _converted_start(own, convert),
+        nominal=None if own.nominal is None else own.nominal * abs(first.reading[0]),
         description=connector.description or own.description,
     )
 
 
-def _start(connector: Connector, first: PartVariable) -> str | None:
-    own = first.variable
-    if own.start is None or not own.is_number or (first.gain, first.offset) == (1.0, 0.0):
+def _converted_start(own: Variable, convert: Callable[[float], float]) -> str | None:
+    if own.start is None or not own.is_number:
         return own.start
-    numbers = np.array([element.start_number for element in own.elements])
-    if connector.causality == "output":
-        numbers = first.gain * numbers + first.offset
-    else:
-        numbers = (numbers - first.offset) / first.gain
-    return " ".join(map(repr, numbers.tolist()))
-
-
-def _nominal(connector: Connector, first: PartVariable) -> float | None:
-    nominal = first.variable.nominal
-    if nominal is None:
-        return None
-    factor = abs(first.gain)
-    return nominal * factor if connector.causality == "output" else nominal / factor
+    return " ".join(repr(convert(element.start_number)) for element in own.elements)

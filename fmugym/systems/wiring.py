@@ -45,8 +45,7 @@ class Port:
     @property
     def is_text(self) -> bool:
         """Whether it is a String that a component can be started with."""
-        variable = self.variable
-        return variable.kind == "string" and variable.is_scalar and variable.settable_at_start
+        return self.variable.is_text and self.variable.settable_at_start
 
 
 @dataclass

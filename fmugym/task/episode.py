@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.texts import number_of, text_of, texts_of
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
-from fmugym.task.starting import checked_value
 from fmugym.task.values import ParameterValues
 from fmugym.trial.trial_episodes import Starts
 
