@@ -30,6 +30,10 @@ class Conversion:
         """Convert a value of the other unit back."""
         return (value - self.offset) / self.factor
 
+    def after(self, first: Conversion) -> Conversion:
+        """The conversion that does another one first."""
+        return Conversion(self.factor * first.factor, self(first.offset))
+
 
 IDENTITY: Final = Conversion()
 

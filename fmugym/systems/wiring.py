@@ -254,9 +254,8 @@ def _require_source(source: Port, connection: Connection) -> None:
 
 
 def _end(connection: Connection, port: Port, conversion: Conversion) -> End:
-    gain = connection.gain * conversion.factor
-    offset = connection.gain * conversion.offset + connection.offset
-    return End(port.component.name, port.variable.name, gain, offset)
+    change = Conversion(connection.gain, connection.offset).after(conversion)
+    return End(port.component.name, port.variable.name, change.factor, change.offset)
 
 
 def _conversion(
