@@ -65,7 +65,7 @@ class LoadableFMU(ABC):
     @property
     def bundled(self) -> bool:
         """Whether it comes with the package."""
-        return all(part.bundled for part in self.parts) if self.parts else is_bundled(self.path)
+        return is_bundled(self.path)
 
     def libraries_in(self, folder: Path) -> list[tuple[LoadableFMU, Path]]:
         """The FMUs of a system, or this one, and their libraries in a folder like ``extract``'s."""

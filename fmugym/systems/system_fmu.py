@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +13,6 @@ from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
 from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.errors import ConfigError, FMULoadError
 from fmugym.systems.slots import Layout
 from fmugym.systems.system_description import SystemDescription, describe_system
@@ -131,33 +128,20 @@ class SystemFMU(FMU):
     def _pairs(self) -> Iterator[tuple[Component, FMU]]:
         return zip(self.plan.components, self._opened, strict=True)
 
-    def extract(self) -> Path:
-        """Extract each FMU into a folder of its own; see ``FMU.extract``.
-
-        Raises:
-            FMULoadError: If one of them cannot run here, or its archive is damaged.
-        """
-        if self._folder is not None:
-            return self._folder
+    def _check_library(self) -> None:
         if self._mixed:
             raise FMULoadError(self._mixed)
         for component, fmu in self._pairs():
             with _naming(component):
                 fmu._check_library()
-        folder = folder_name()
-        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
-        try:
-            make_folder(folder)
-            for number, (component, fmu) in enumerate(self._pairs()):
-                with _naming(component):
-                    own = folder / str(number)
-                    own.mkdir()
-                    fmu._extract_to(own)
-        except BaseException:
-            self.close()
-            raise
-        self._folder = folder
-        return folder
+
+    def _extract_to(self, folder: Path, only: str = "") -> None:
+        """Extract each FMU into a folder of its own."""
+        for number, (component, fmu) in enumerate(self._pairs()):
+            with _naming(component):
+                own = folder / str(number)
+                own.mkdir()
+                fmu._extract_to(own, only)
 
 
 def _opened(components: Iterable[Component]) -> Iterator[FMU]:
