@@ -34,7 +34,7 @@ from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.signals import ordinary
-from fmugym.task.generators import row_of, state_of
+from fmugym.task.saving import row_of, state_of
 from fmugym.task.snapshot import require_scope, scope_of
 
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
