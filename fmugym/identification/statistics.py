@@ -10,7 +10,7 @@ import numpy as np
 from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
-from fmugym.lazy import scipy_module
+from fmugym.extras import imported
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [
@@ -92,7 +92,7 @@ def confidence_intervals(
     level = check_number("level", level, positive=True)
     if level >= 1.0:
         raise ConfigError(f"level must be less than 1, not {level:g}")
-    factor = float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))
+    factor = float(imported("scipy.stats", "identification").t.ppf(0.5 + level / 2, freedom))
     return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in values.items()}
 
 

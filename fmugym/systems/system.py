@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any, Self
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
@@ -118,11 +118,11 @@ class FMUSystem(WiredSystem):
         """
         return draw(self, path)
 
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[Any, tuple[()]]:
         """A system pickles as the file that it came from, or as its arguments."""
         if self.file is not None:
-            return _read_again, (type(self), self.file, self.master)
-        return _again, (type(self), self.arguments())
+            return partial(type(self).read, self.file, master=self.master), ()
+        return partial(type(self), **self.arguments()), ()
 
     def arguments(self) -> dict[str, Any]:
         """The arguments that make this system once more, FMUs as their paths."""
@@ -144,11 +144,3 @@ class FMUSystem(WiredSystem):
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,
         }
-
-
-def _read_again(cls: type[FMUSystem], file: Path, master: str) -> FMUSystem:
-    return cls.read(file, master=master)
-
-
-def _again(cls: type[FMUSystem], arguments: dict[str, Any]) -> FMUSystem:
-    return cls(**arguments)
