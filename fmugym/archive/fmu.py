@@ -145,10 +145,15 @@ class FMU(LoadableFMU, KnownArguments):
             return source.as_fmu()
         return source.again() if isinstance(source, FMU) else cls(source)
 
-    def again(self) -> FMU:
-        """The same FMU once more, with a temporary folder of its own; it is not read again."""
+    def again(self, folder: Path | None = None) -> FMU:
+        """The same FMU once more, which is not read again.
+
+        Args:
+            folder: Where somebody has extracted it, who removes it, too; None for a temporary
+                folder of its own.
+        """
         other = copy.copy(self)
-        other._folder = other._remove_folder = None
+        other._folder, other._remove_folder = folder, None
         return other
 
     @property

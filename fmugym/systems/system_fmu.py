@@ -9,13 +9,12 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
-from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
 from fmugym.errors import ConfigError, FMULoadError
 from fmugym.systems.slots import Layout
-from fmugym.systems.system_description import SystemDescription, describe_system
+from fmugym.systems.system_description import describe_system
 from fmugym.systems.system_plan import Component, SystemPlan
 
 __all__ = ["SystemFMU"]
@@ -69,18 +68,13 @@ class SystemFMU(FMU):
     @property
     def bundled(self) -> bool:
         """Whether all FMUs come with the package."""
-        return all(is_bundled(component.path) for component in self.plan.components)
+        return all(fmu.bundled for fmu in self._opened)
 
     @property
     def parts(self) -> tuple[LoadableFMU, ...]:
         """The FMUs of the components, extracted."""
-        description, folder, in_wine = self.description, self.extract(), self.in_wine
-        assert isinstance(description, SystemDescription)
-        pairs = zip(self.plan.components, description.parts, strict=True)
-        return tuple(
-            ExtractedFMU(one.path, part, one.preload, folder / str(number), in_wine=in_wine)
-            for number, (one, part) in enumerate(pairs)
-        )
+        folder = self.extract()
+        return tuple(fmu.again(folder / str(n)) for n, fmu in enumerate(self._opened))
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:
