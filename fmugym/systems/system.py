@@ -130,17 +130,8 @@ class FMUSystem(WiredSystem):
             name: replace(one.given, fmu=one.fmu.path, interface=one.fmu.interface)
             for name, one in self.components.items()
         }
-        return {
+        return self._given | {
             "components": components,
-            "connections": self.connections,
-            "name": self.name,
-            "units": self.units,
-            "master": self.master,
-            "loops": self.loops,
-            "loop_tolerance": self.loop.tolerance,
-            "loop_iterations": self.loop.max_iterations,
-            **self.times,
-            "description": self.description,
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,
         }

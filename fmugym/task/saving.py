@@ -18,6 +18,7 @@ from fmugym.task.snapshot import Column, Columns
 __all__ = [
     "READ",
     "columns_of",
+    "generator_of",
     "place_columns",
     "read_columns",
     "require_saving",
@@ -128,13 +129,22 @@ def _place_stream(env: Constructed, columns: Columns, place: int) -> None:
         env._np_random, env._np_random_seed = None, None
         return
     state = stream if isinstance(stream, dict) else state_of([int(word) for word in stream])
+    seed = columns["seeds"][place]
+    env._np_random, env._np_random_seed = generator_of(state), -1 if seed is None else seed
+
+
+def generator_of(state: Any) -> np.random.Generator:
+    """A generator in a state, as its bit generator has told it.
+
+    Raises:
+        ConfigError: If numpy has no such bit generator.
+    """
     bits = getattr(np.random, state["bit_generator"], None)
     if bits is None:
-        raise ConfigError(f"the snapshot has a generator {state['bit_generator']!r}")
+        raise ConfigError(f"there is no random generator {state['bit_generator']!r}")
     generator = np.random.Generator(bits())
     generator.bit_generator.state = state
-    seed = columns["seeds"][place]
-    env._np_random, env._np_random_seed = generator, -1 if seed is None else seed
+    return generator
 
 
 def row_of(state: Any) -> list[int]:
