@@ -11,7 +11,7 @@ from typing import Final
 from fmugym.archive.description import Capabilities, ModelDescription, Unit
 from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError
 from fmugym.systems.system_plan import Connector, End, SystemPlan
 
 __all__ = ["PartVariable", "SystemDescription", "describe_system"]
@@ -186,7 +186,7 @@ def _units(plan: SystemPlan, parts: Iterable[ModelDescription]) -> dict[str, Uni
 def _variables(
     plan: SystemPlan, parts: Sequence[ModelDescription]
 ) -> tuple[dict[str, Variable], tuple[tuple[PartVariable, ...], ...]]:
-    numbers = _Numbers(plan)
+    numbers = {one.name: number for number, one in enumerate(plan.components)}
     driven = _driven(plan, parts, numbers)
     variables: dict[str, Variable] = {}
     ends: list[tuple[PartVariable, ...]] = []
@@ -210,19 +210,8 @@ def _variables(
     return variables, tuple(ends)
 
 
-class _Numbers(dict[str, int]):
-    """The numbers of components by name."""
-
-    def __init__(self, plan: SystemPlan) -> None:
-        super().__init__((one.name, number) for number, one in enumerate(plan.components))
-        self._plan = plan
-
-    def __missing__(self, name: str) -> int:
-        raise unknown_name(f"component of {self._plan.name}", name, self)
-
-
 def _driven(
-    plan: SystemPlan, parts: Sequence[ModelDescription], numbers: _Numbers
+    plan: SystemPlan, parts: Sequence[ModelDescription], numbers: Mapping[str, int]
 ) -> dict[str, set[str]]:
     """What links and connectors of the system set: it cannot be set by another name.
 

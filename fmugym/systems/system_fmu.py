@@ -12,8 +12,7 @@ from pathlib import Path
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
 from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.errors import ConfigError, FMULoadError
-from fmugym.systems.slots import Layout
+from fmugym.errors import FMULoadError
 from fmugym.systems.system_description import describe_system
 from fmugym.systems.system_plan import Component, SystemPlan
 
@@ -41,11 +40,8 @@ class SystemFMU(FMU):
         self, plan: SystemPlan, *, probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
     ) -> None:
         self.plan = plan
-        if not plan.components:
-            raise ConfigError(f"the system {plan.name!r} has no components")
         self._opened = tuple(_opened(plan.components))
         description = describe_system(plan, [fmu.description for fmu in self._opened])
-        Layout(description)  # which refuses names and roles that are wrong
         path = Path(plan.name) if plan.file is None else plan.file
         LoadableFMU.__init__(self, path, description, ())
         self.limits, self.interface = ArchiveLimits(), None
