@@ -170,15 +170,14 @@ def _facts(header: dict[str, Any]) -> dict[str, Any]:
     json.loads(header["options"])
     return {
         **{name: header[name] for name in FACTS},
-        **{name: _texts(header[name]) for name in ("scope", "surroundings")},
+        **{
+            name: {key: str(text) for key, text in header[name].items()}
+            for name in ("scope", "surroundings")
+        },
         "seed": None if seed is None else int(seed),
         "stream": stream,
         "drawn": {name: float(value) for name, value in header["drawn"].items()},
     }
-
-
-def _texts(texts: Mapping[str, Any]) -> dict[str, str]:
-    return {name: str(text) for name, text in texts.items()}
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):

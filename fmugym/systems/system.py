@@ -130,7 +130,8 @@ class FMUSystem(WiredSystem):
             name: replace(one.given, fmu=one.fmu.path, interface=one.fmu.interface)
             for name, one in self.components.items()
         }
-        return self._given | {
+        return {
+            **self._given,
             "components": components,
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,
