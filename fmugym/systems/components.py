@@ -78,11 +78,6 @@ class Component(KnownArguments):
     def __post_init__(self) -> None:
         check_fields(self)
 
-    @classmethod
-    def of(cls, value: Any) -> Component:
-        """Return a component as it is, or make one of an FMU."""
-        return value if isinstance(value, Component) else cls(value)
-
 
 class OpenComponent:
     """A component whose FMU has been read.
