@@ -8,9 +8,9 @@ import pytest
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
 from fmugym import FMU, Choice, ConfigError, Uniform
+from fmugym.archive.variable import checked_value
 from fmugym.config import EnvConfig
 from fmugym.task.interface import resolve
-from fmugym.task.starting import checked_value
 
 
 def resolved(path, **changes):

@@ -368,7 +368,7 @@ def simulate(torques):
 
 def test_scipy_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(ImportError, match="'identification'"):
+    with pytest.raises(fmugym.ConfigError, match="'identification'"):
         fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0))
 
 

@@ -11,7 +11,7 @@ from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool.form import form_of_draws
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.generators import state_of as generator_state_of
+from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector import streams as module
 from fmugym.vector.streams import EpisodeStreams

@@ -15,7 +15,7 @@ import fmugym
 from fmugym import Component, ConfigError, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
 from fmugym.linearization import linearize
-from fmugym.systems.placing import layout_of
+from fmugym.systems.placing import picture_of
 from fmugym.testing import check_fmu_env
 from fmugym.tools.cli import main
 
@@ -399,7 +399,7 @@ class TestPictures:
         return FMUSystem({"a": HOUSE, "b": HOUSE, "c": HOUSE}, links)
 
     def test_boxes_do_not_overlap(self):
-        boxes = list(layout_of(self.make()).boxes.values())
+        boxes = list(picture_of(self.make()).boxes.values())
         assert len(boxes) == 6
         for number, one in enumerate(boxes):
             for other in boxes[:number]:
@@ -408,19 +408,19 @@ class TestPictures:
                 assert beside or above, (one.title, other.title)
 
     def test_wires_lead_from_port_to_port(self):
-        layout = layout_of(self.make())
-        assert len(layout.wires) == 8
-        for wire in layout.wires:
+        picture = picture_of(self.make())
+        assert len(picture.wires) == 8
+        for wire in picture.wires:
             (source, name), (target, other) = wire.source, wire.target
-            assert wire.points[0] == layout.boxes[source].port(name, left=False)
-            assert wire.points[-1] == layout.boxes[target].port(other, left=True)
+            assert wire.points[0] == picture.boxes[source].port(name, left=False)
+            assert wire.points[-1] == picture.boxes[target].port(other, left=True)
 
     def test_loops_are_marked_and_wires_back_run_below(self):
-        layout = layout_of(self.make())
-        marked = {(w.source[0], w.target[0]) for w in layout.wires if w.in_loop}
+        picture = picture_of(self.make())
+        marked = {(w.source[0], w.target[0]) for w in picture.wires if w.in_loop}
         assert marked == {("a", "b"), ("b", "a")}
-        bottom = min(box.y - box.height for box in layout.boxes.values())
-        back = [wire for wire in layout.wires if wire.leads_back]
+        bottom = min(box.y - box.height for box in picture.boxes.values())
+        back = [wire for wire in picture.wires if wire.leads_back]
         assert back
         assert all(min(y for _, y in wire.points) < bottom for wire in back)
 

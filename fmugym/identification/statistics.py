@@ -11,7 +11,7 @@ import numpy as np
 from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
-from fmugym.lazy import scipy_module
+from fmugym.extras import imported
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [
@@ -106,7 +106,8 @@ class Estimate:
         if level >= 1.0:
             raise ConfigError(f"level must be less than 1, not {level:g}")
         freedom = self.degrees_of_freedom
-        return float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))
+        student = imported("scipy.stats", "identification").t
+        return float(student.ppf(0.5 + level / 2, freedom))
 
     def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return lower and upper end by name; they may exceed the bounds.

@@ -13,6 +13,7 @@ import numpy as np
 
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import checked_value
 from fmugym.checks import check_mapping
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE
@@ -25,7 +26,7 @@ from fmugym.lab.sensors import Sensors
 from fmugym.lab.videos import Recording
 from fmugym.pool import Pool, PoolSpec
 from fmugym.signals import ordinary
-from fmugym.task.starting import checked_value, start_variable
+from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Cell", "checked_parameters"]

@@ -9,13 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.variable import Variable, unlisted
+from fmugym.archive.variable import Variable, checked_value, unlisted
 from fmugym.checks import check_mapping
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
-from fmugym.task.starting import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.infos import copy_rows
