@@ -4,7 +4,6 @@ import json
 import pickle
 from contextlib import closing
 
-import gymnasium
 import numpy as np
 import pytest
 import ssp_tools
@@ -384,11 +383,6 @@ class TestCommandLine:
     def test_validation_of_an_archive(self, archive, capsys):
         assert main(["validate", str(archive)]) == 0
         assert "repetition" in capsys.readouterr().out
-
-    def test_make(self, task):
-        env = gymnasium.make("fmugym/FMU-v0", config=str(task()))
-        assert env.reset(seed=0)[0].shape == (2,)
-        env.close()
 
 
 class TestPictures:
