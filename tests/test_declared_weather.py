@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from test_declared_features import AT_REST, BASE
 
 import fmugym
@@ -363,8 +364,7 @@ class TestWeatherInModelica:
         table = self.write(tmp_path / "weather.mos", ends)
         return epw(tmp_path / "weather.epw", days_of(1999, count=2), columns), table
 
-    @pytest.mark.parametrize("interpolation", ["linear", "previous"])
-    @pytest.mark.parametrize("number", [7, 13, 14, 15, 22, 33])
+    @in_turn({"number": [7, 13, 14, 15, 22, 33], "interpolation": ["linear", "previous"]})
     def test_it_is_the_same_weather(self, both, number, interpolation):
         name, (weather, table) = FIELDS[number][0], both
         hours = np.linspace(0, 96, 4 * 97)[1:] - 0.01
