@@ -15,8 +15,8 @@ from combinations import in_turn
 from system_tools import (
     by_each_master,
     closing_pools,  # noqa: F401  # the fixture "make"
+    compiled,  # noqa: F401  # the fixture "fmus"
     linear,
-    linear_fmu,
     masses,
     parted_pendulum,
     play,
@@ -43,13 +43,6 @@ from fmugym.systems.system_plan import (
 )
 
 NO_START = ((), np.zeros((0, 1)))
-
-
-@pytest.fixture(scope="module", name="fmus")
-def compiled(tmp_path_factory):
-    """The FMU of linear equations by FMI version."""
-    folder = tmp_path_factory.mktemp("linear")
-    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
 
 
 # Correctness
