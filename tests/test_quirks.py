@@ -44,7 +44,6 @@ WAYS["process"] = {"isolation": "process"}
 CASES = [(version, quirk) for quirk in QUIRKS for version in quirk.versions]
 ONCE = [(quirk.versions[i % len(quirk.versions)], quirk) for i, quirk in enumerate(QUIRKS)]
 cases = pytest.mark.parametrize(("version", "quirk"), CASES, ids=str)
-each_once = pytest.mark.parametrize(("version", "quirk"), ONCE, ids=str)
 
 
 class QuirkEnv(fmugym.FMUEnv):
@@ -145,22 +144,20 @@ class TestEpisodes:
         env.reset(seed=5)
         assert_right(env, path)
 
-    @each_once
+    @in_turn({"version,quirk": ONCE})
     def test_with_the_same_start_values(self, make_fmu, version, quirk):
         """So that states are restored."""
         path = make_fmu(quirk.token, version)
         assert_right(QuirkEnv(path, gain=1.5, probe_timeout=quirk.probe_timeout), path)
 
-    @each_once
-    @pytest.mark.parametrize("way", ["one", "two"])
+    @in_turn({"version,quirk": ONCE, "way": ["one", "two"]})
     def test_vector(self, make_fmu, version, quirk, way):
         path = make_fmu(quirk.token, version)
         envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
         envs.reset(seed=3)
         assert_vector_right(envs, path)
 
-    @each_once
-    @pytest.mark.parametrize("way", ["default", "process"])
+    @in_turn({"version,quirk": ONCE, "way": ["default", "process"]})
     def test_vector_with_the_same_start_values(self, make_fmu, version, quirk, way):
         """Each environment has its own, in all episodes."""
         path, gains = make_fmu(quirk.token, version), [0.5, 1.0, 2.0]
