@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from vector_tools import require_same_alone
 
 import fmugym
@@ -266,11 +267,13 @@ COMBINATIONS += [("noise", actuators) for actuators in ACTUATORS if actuators]
 COMBINATIONS += [("drop-outs", "late"), ("rate", "lost")]
 
 
-@pytest.mark.parametrize(
-    ("mode", "parameters"), [("next_step", DRAWN), ("same_step", {})], ids=["drawn", "constant"]
+@in_turn(
+    {
+        "sensors,actuators": COMBINATIONS,
+        "hooks": ["compiled", "array", "per_env"],
+        "mode,parameters": {"drawn": ("next_step", DRAWN), "constant": ("same_step", {})},
+    }
 )
-@pytest.mark.parametrize(("sensors", "actuators"), COMBINATIONS)
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_many_environments_equal_single_ones(parameters, sensors, actuators, hooks, mode):
     history = {"of": ["angle", "tau"], "length": "0.1s"}
     declared = task(parameters, history, **SENSORS[sensors])

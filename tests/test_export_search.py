@@ -7,6 +7,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
 from test_export import HEATING, PRESENT, TASKS, Filtered
@@ -178,8 +179,7 @@ class TestInC(Agents):
 
 
 @pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
-@pytest.mark.parametrize("task", ["a controller", "a controller and a history"])
+@in_turn({"version": ["2.0", "3.0"], "task": ["a controller", "a controller and a history"]})
 def test_as_an_fmu(version, task, tmp_path):
     document, text, form = HEATERS[task]
     env = heater(document)

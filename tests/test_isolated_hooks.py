@@ -6,6 +6,8 @@ import signal
 import exchange_tools
 import numpy as np
 import pytest
+from combinations import in_turn
+from gymnasium.vector import AutoresetMode
 from process_tools import FaultyEnv, faulty_fmu, start_values
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
@@ -84,9 +86,11 @@ class TwoPendulums(fmugym.FMUEnv):
         return np.abs(self.state[0]) > 3.0
 
 
-@each_mode
-@pytest.mark.parametrize(
-    "cls", [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables]
+@in_turn(
+    {
+        "cls": [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables],
+        "mode": list(AutoresetMode),
+    }
 )
 def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""

@@ -3,11 +3,13 @@
 import json
 import struct
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zoo_tools
+from combinations import in_turn
 from process_tools import run_python
 from program_tools import DISCRETE, code, uniform_draws
 from test_native_pool import LOG, make, on_linux
@@ -438,10 +440,13 @@ def test_what_an_instantiation_changes_does_not_stay(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the zoo's faults are those of Linux")
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("substeps", [1, 2])
-@pytest.mark.parametrize("fault", ["round_up", "flush_denormals"])
-@pytest.mark.parametrize("version", [1, 2, 3])
+@in_turn(
+    {
+        "version,fault": list(product((1, 2, 3), ("round_up", "flush_denormals"))),
+        "substeps": [1, 2],
+        "threads": [1, 3],
+    }
+)
 def test_an_instance_that_changes_it_changes_no_other(tmp_path, version, fault, substeps, threads):
     """The sums of steps of 0.1 and of denormal numbers depend on it."""
     path = zoo_tools.zoo_fmu(tmp_path, version)

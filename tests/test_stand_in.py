@@ -9,6 +9,7 @@ import sys
 import tomllib
 
 import pytest
+from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name
 from process_tools import run_python
 
@@ -39,7 +40,7 @@ def old_library(folder, name, first, versioned=True):
     subprocess.run(command, cwd=folder, check=True)
 
 
-@pytest.fixture(scope="module", params=["libgfortran.so.3", "libgfortran.so.4", "unversioned"])
+@pytest.fixture(scope="module", params=["libgfortran.so.4"])
 def fmu_path(request, probe, tmp_path_factory):
     """The probe, with a library that needs an old libgfortran as it is loaded."""
     folder = tmp_path_factory.mktemp("old")
@@ -79,7 +80,7 @@ except fmugym.FMULoadError as error:
 STEPPED = "[0.30000001192092896, 1.0]"
 
 
-@pytest.fixture(params=["cc", "ziglang"])
+@pytest.fixture
 def compiler(request, monkeypatch):
     """Build with the system's compiler, and without one with that of a package."""
     if request.param == "ziglang":
@@ -89,6 +90,13 @@ def compiler(request, monkeypatch):
     return request.param
 
 
+@in_turn(
+    {
+        "fmu_path": ["libgfortran.so.3", "libgfortran.so.4", "unversioned"],
+        "compiler": ["cc", "ziglang"],
+    },
+    indirect=["fmu_path", "compiler"],
+)
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
