@@ -838,7 +838,11 @@ class TestAgent:
 
     @pytest.mark.parametrize(
         "change",
-        [{"weights": np.ones(2)}, {"scale": (np.ones(1), np.ones(1))}, {"weights": np.full(3, np.nan)}],
+        [
+            {"weights": np.ones(2)},
+            {"scale": (np.ones(1), np.ones(1))},
+            {"weights": np.full(3, np.nan)},
+        ],
         ids=str,
     )
     def test_arrays_of_another_size(self, change, tmp_path):

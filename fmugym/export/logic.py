@@ -114,7 +114,7 @@ class Logic:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
         roots = [*self.features, *self.input_nodes, *updates]
-        return frozenset(self.graph.needed(roots, self.loads))
+        return set(self.graph.needed(roots, self.loads))
 
 
 def logic_of(
