@@ -274,13 +274,13 @@ class TestOnTheLab:
         lab, torques = make_lab(), queue.Queue()
         env = CloudPendulumEnv(backend=Client(lab))
         env.reset()
-        command = lab.command
+        tell = lab.tell
 
-        def told(token, quantity, value):
-            command(token, quantity, value)
+        def told(token, command, quantity, value):
+            tell(token, command, quantity, value)
             torques.put(value)
 
-        monkeypatch.setattr(lab, "command", told)
+        monkeypatch.setattr(lab, "tell", told)
         env.step(np.full(1, 0.2, np.float32))
         for expected in (0.03, 0.0, 0.0, 0.0, 0.0, 0.0):
             assert torques.get(timeout=10) == pytest.approx(expected)

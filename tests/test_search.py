@@ -161,7 +161,7 @@ class TestCMA:
 
         class Independent(CMA):
             def _drawn(self):
-                return self._rng.standard_normal((self.population, self.mean.size))
+                return self._rng.standard_normal(self._shape)
 
         def reached(kind, seed):
             cma, noise = kind(np.zeros(24), 0.5, 24, np.random.default_rng(seed)), seed + 100
