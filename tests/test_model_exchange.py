@@ -363,7 +363,7 @@ class TestPools:
         ("robertson", [], ["y1", "y2", "y3"], "y1", "rosenbrock"),
         ("van_der_pol", [], ["x1", "x2"], "mu", "euler"),
     )
-    NAMED = {f"{case[0]}-{case[4]}": case for case in CASES}  # noqa: RUF012
+    NAMED = {f"{case[0]}-{case[4]}": case for case in CASES}  # noqa: RUF012  (nothing changes it)
     every_case = pytest.mark.parametrize("case", CASES, ids=NAMED)
 
     MANY = 70

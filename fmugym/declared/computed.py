@@ -156,6 +156,7 @@ class Value:
     __mul__, __rmul__ = _operator(np.multiply), _operator(np.multiply, True)
     __truediv__ = _operator(np.divide)
     __lt__, __gt__ = _operator(np.less), _operator(np.greater)
+    # Comparisons make nodes instead of bools, and so there is no hash.
     __eq__, __ne__ = _operator(np.equal), _operator(np.not_equal)  # type: ignore[assignment]
     __and__, __or__ = _operator(np.bitwise_and), _operator(np.bitwise_or)
     __xor__ = _operator(np.bitwise_xor)

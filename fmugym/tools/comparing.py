@@ -69,10 +69,10 @@ class Verdict:
         return text
 
     def _beside(self, name: str, other: str) -> str:
-        """One agent beside another one; per cent only if both totals have one sign."""
+        """One agent beside another one; per cent only of totals of one sign and one magnitude."""
         gain, half = self.gain(name, other)
         base, unit = self.total(other), ""
-        if base * self.total(name) > 0:
+        if base * self.total(name) > 0 and abs(gain) < 10 * abs(base):
             gain, half, unit = 100 * gain / abs(base), 100 * half / abs(base), " %"
         word = "better" if gain >= 0 else "worse"
         interval = ""
