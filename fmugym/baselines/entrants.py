@@ -51,7 +51,6 @@ class Entrant:
         cma: The search.
         make: Makes a controller for N environments from their numbers, shape (N, n).
         episodes: How many each candidate plays in a round.
-        quota: How many rounds it has in any case.
         rounds: How many it has had.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
@@ -65,7 +64,6 @@ class Entrant:
     cma: CMA
     make: Any
     episodes: int
-    quota: int = 0
     rounds: int = 0
     leader: FloatArray = field(default_factory=lambda: np.empty(0))
     lead: Merit = NO_MERIT
@@ -122,10 +120,9 @@ class Entrant:
         self.lead = NO_MERIT
 
     def offers(self) -> list[FloatArray]:
-        """The best numbers and the present mean, as far as they are there and differ."""
-        found = [self.best] if self.gained else []
-        is_new = self.rounds > 0 and not any(np.array_equal(self.cma.mean, one) for one in found)
-        return [*found, self.cma.mean] if is_new else found
+        """The best numbers and the present mean, as far as they are there."""
+        found = (self.best, self.gained), (self.cma.mean, self.rounds)
+        return [numbers for numbers, rounds in found if rounds]
 
 
 def _ranks(values: FloatArray) -> FloatArray:

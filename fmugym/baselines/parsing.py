@@ -92,7 +92,7 @@ class Search:
         """Make the controller with some numbers, which are rounded as in ``text``."""
         return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
 
-    def text(self, numbers: Mapping[str, float]) -> str:
+    def text(self, numbers: Mapping[str, Any]) -> str:
         """The controller with some numbers, as ``controller_of`` reads it."""
         found = self.numbers(numbers)
         given = {name: found.get(name, value) for name, value in self._in_order().items()}
