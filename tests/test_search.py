@@ -752,6 +752,48 @@ def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
     assert sum(found) >= 25
 
 
+class Noisy:
+    """Stands for an arena and for a search whose candidates are always as different."""
+
+    mean = np.zeros(1)
+
+    def __init__(self, noise):
+        self.noise, self.rng = noise, np.random.default_rng(0)
+
+    def ask(self):
+        return self.rng.normal(size=(400, 1))
+
+    def tell(self, order):
+        pass
+
+    def play(self, make, numbers, seeds, watch=None):
+        returns = numbers + self.rng.normal(0.0, self.noise, (400, len(seeds)))
+        return Outcome(returns, np.empty((*returns.shape, 0)), np.empty(0))
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [(0.0, 4), (np.sqrt(6), 4), (np.sqrt(15), 8), (1e9, 64)],
+    ids=["none", "correlations of 0.25", "correlations of 0.12", "noise only"],
+)
+def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
+    """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
+    field = Noisy(noise)
+    entrant = Entrant(field, None, 4)
+    for _ in range(60):
+        entrant.play(field, range(entrant.episodes), ())
+    assert entrant.episodes == expected
+
+
+def test_a_search_that_gains_nothing_ends():
+    search, field = Search((2, 1), [], []), Field(-1e-9)
+    while not search.is_over:
+        search.advance(field)
+        assert search.rounds < 2000
+    assert search.rounds > 100
+    assert search.winner(field) is search.baseline
+
+
 def names_of(search):
     found = [one for one in search._contenders if one.gained]
     return [search.baseline.name, *(one.make.agent(one.best).name for one in found)]
