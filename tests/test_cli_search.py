@@ -289,18 +289,18 @@ class TestOutput:
         module = SimpleNamespace(tqdm=partial(Bar, told)) if has_tqdm else None
         monkeypatch.setitem(sys.modules, "tqdm", module)
         monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
-        code, _, err = searched(capsys, task, tmp_path / "a", "--rounds", "25")
+        code, _, err = searched(capsys, task, tmp_path / "a", "--rounds", "35")
         assert code == 0
         lines = [line for line in err.splitlines() if line.startswith("round")]
         if told:
             assert len(lines) == 1
             rounds = [int(re.match(r"round (\d+)", text)[1]) for text in told]
-            assert rounds == sorted({*rounds, 1, 2, 25})
+            assert rounds == sorted({*rounds, 1, 2, 35})
         else:
-            assert 2 <= len(lines) <= 4
+            assert 3 <= len(lines) <= 5
         assert bool(told) == (is_terminal and has_tqdm)
         for text in (lines[-1], *told[-1:]):
-            assert re.fullmatch(r"round 25, best -[\d.]+, lazy -[\d.]+", text)
+            assert re.fullmatch(r"round 35, best -[\d.]+, lazy -[\d.]+", text)
 
     def test_json(self, task, tmp_path, capsys):
         code, out, _ = searched(capsys, task, tmp_path / "a", "--rounds", "32", "--json")

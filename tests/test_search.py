@@ -773,14 +773,14 @@ class Noisy:
 
 @pytest.mark.parametrize(
     ("noise", "expected"),
-    [(0.0, 4), (np.sqrt(6), 4), (np.sqrt(15), 8), (1e9, 64)],
-    ids=["none", "correlations of 0.25", "correlations of 0.12", "noise only"],
+    [(0.0, 4), (np.sqrt(8), 4), (np.sqrt(24), 8), (1e9, 64)],
+    ids=["none", "correlations of 0.2", "correlations of 0.08", "noise only"],
 )
 def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
     """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
     field = Noisy(noise)
     entrant = Entrant(field, None, 4)
-    for _ in range(60):
+    for _ in range(120):
         entrant.play(field, range(entrant.episodes), ())
     assert entrant.episodes == expected
 
@@ -1288,10 +1288,10 @@ class TestBudget:
             patch.setattr(searching, "monotonic", lambda: 0.0)
             limits = {"minutes": 0.05, "told": told}
             _, facts = searched(tmp_path / "a", rounds=None, **limits)
-        assert facts["rounds"] == 20
+        assert facts["rounds"] == 30
         assert facts["agent"] == facts["baseline"] in {"lazy", "tuned pi"}
         assert any("baseline only" in line and "--minutes 1" in line for line in told)
-        _, again = searched(tmp_path / "b", rounds=20)
+        _, again = searched(tmp_path / "b", rounds=30)
         assert content(tmp_path / "b") == content(tmp_path / "a")
         assert again["test"] == facts["test"]
         _, more = searched(tmp_path / "a", rounds=ROUNDS, resume=True)

@@ -44,7 +44,7 @@ _PART: Final = 5
 """The last validation has so many episodes for each agent, but in all no more than this part of the
 episodes of all rounds."""
 
-_TUNING: Final = 20
+_TUNING: Final = 30
 """Rounds for the numbers of each controller, and for a constant action."""
 
 _LEAST: Final = 10
@@ -197,7 +197,7 @@ class Search:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
         share = max(_LEAST, self.rounds // _SHARE)
         behind = [one for one in self._active if one.rounds < share]
-        return behind[0] if behind else min(leaders, key=lambda one: one.rounds)
+        return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
 
     def _let_go(self, leaders: Sequence[Entrant]) -> None:
         """Give a leader that gains nothing more episodes, and let it go if that is no use."""
@@ -219,6 +219,7 @@ class Search:
     def _play(self, entrant: Entrant, arena: Arena) -> None:
         entrant.play(arena, self._training(entrant.episodes), self._limits)
         self.rounds += 1
+        entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
             entrant.validate(arena, self._validation, self._limits)
             if entrant.merit > self.merit:
