@@ -1,6 +1,7 @@
 """What becomes of worker processes when they fork, or when the process that uses them ends."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,9 +18,11 @@ from process_tools import (
     linux_only,
     posix_only,
     processes_of_session,
+    processes_told_of,
     processes_with,
     wait_until,
 )
+from wine_tools import for_windows
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 from fmugym.archive.temporary import folder_name, make_folder
@@ -149,7 +152,13 @@ def kill_in(module, path, when, number):
     setattr(owner, name, call)
 
 kill_in(*sys.argv[2:5], int(sys.argv[5]))
-process_tools.FaultyEnv(sys.argv[1]).reset()
+env = process_tools.FaultyEnv(sys.argv[1])
+env.reset()
+env.step([1.0])
+os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+assert env.step([1.0])[3]
+env.reset()
+env.close()
 """
 """Ends when a function is called for the n-th time, or has been called."""
 
@@ -167,33 +176,43 @@ MOMENTS = {
     "end of it": (SUPERVISOR, "Supervisor.finish_opening", "after", 1),
     "before the first reset": (SUPERVISOR, "Supervisor.reply", "before", 1),
     "after the first reset": (SUPERVISOR, "Supervisor.reply", "after", 1),
+    "before a step": (SUPERVISOR, "Supervisor.step", "before", 1),
+    "step": (SUPERVISOR, "Supervisor.step", "after", 1),
+    "burial of a worker": (SUPERVISOR, "Supervisor.bury", "before", 1),
+    "start of its successor": (LAUNCHER, "_Guard.start", "after", 2),
+    "opening of its successor": (SUPERVISOR, "Supervisor.finish_opening", "before", 2),
+    "end of a worker": (SUPERVISOR, "Supervisor.begin_closing", "after", 1),
+    "removal of its files": ("shutil", "rmtree", "before", 1),
 }
 MOMENTS_OF_TRIAL = {
     **MOMENTS,
     "first episode": (SUPERVISOR, "Supervisor.reply", "before", 20),
-    "start of the second worker": (LAUNCHER, "_Guard.start", "after", 2),
     "rehearsal": ("fmugym.trial.rehearsal", "Rehearsal._worst_grade", "before", 1),
-    "end of a worker": (SUPERVISOR, "Supervisor.begin_closing", "after", 1),
-    "removal of its files": ("shutil", "rmtree", "before", 1),
     "verdict": ("os", "replace", "after", 1),
 }
+MOMENTS_IN_WINE = [
+    *("start of a worker", "a worker is there", "instantiation", "after the first reset"),
+    *("step", "start of its successor", "end of a worker"),
+]
 
 
-class TestKilledInTheConstructor:
+class TestKilled:
     """The parent is killed; what it has in memory has no name and goes with the processes."""
 
     @pytest.fixture(name="is_clean_after")
     def fixture_is_clean_after(self, faulty, temp_root, tmp_path):
-        def is_clean_after(moment, probe):
+        def is_clean_after(moment, probe, fmu=faulty):
+            cache = tmp_path / "cache"
             program = subprocess.Popen(
-                [sys.executable, "-c", KILLED, faulty, *map(str, moment)],
+                [sys.executable, "-c", KILLED, fmu, *map(str, moment)],
                 env=os.environ
                 | {"PYTHONPATH": str(HERE), "FMUGYM_PROBE": probe}
-                | {"FMUGYM_CACHE_DIR": str(tmp_path / "cache")},
+                | {"FMUGYM_CACHE_DIR": str(cache)},
                 start_new_session=True,
             )
             assert program.wait() == -signal.SIGKILL
             wait_until(lambda: not processes_of_session(program.pid))
+            wait_until(lambda: not processes_told_of(cache))
             sweep.cache_clear()
             sweep(temp_root)  # as the next process does that needs a folder
             assert list(temp_root.iterdir()) == []
@@ -209,6 +228,16 @@ class TestKilledInTheConstructor:
     @pytest.mark.parametrize("moment", MOMENTS_OF_TRIAL.values(), ids=MOMENTS_OF_TRIAL)
     def test_of_an_unknown_fmu(self, is_clean_after, moment):
         is_clean_after(moment, "on")
+
+    @linux_only
+    @pytest.mark.parametrize("moment", MOMENTS_IN_WINE)
+    def test_of_an_fmu_in_wine(self, is_clean_after, wine, faulty, tmp_path, moment):
+        """With a folder of Wine of its own, because others may keep Wine's server busy."""
+        made = wine.prefix.parent
+        leave_out = shutil.ignore_patterns("temporary", "*.lock")
+        shutil.copytree(made, tmp_path / "cache" / "wine", symlinks=True, ignore=leave_out)
+        (tmp_path / "cache" / "wine" / wine.prefix.name / "temporary").mkdir()
+        is_clean_after(MOMENTS[moment], "off", for_windows(faulty, tmp_path))
 
 
 class TestEndOfParent:
