@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from process_tools import (
     INTERRUPTIBLE,
+    FaultyEnv,
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
     fixture_opened,  # noqa: F401  # the fixture "opened"
     is_alive,
@@ -27,6 +28,8 @@ from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 from fmugym.archive.temporary import folder_name, make_folder
 from fmugym.caching import sweep
+from fmugym.pool.process.launcher import _guard
+from fmugym.pool.process.supervisor import Supervisor
 
 HERE = Path(__file__).parent
 
@@ -232,12 +235,30 @@ class TestKilled:
     @linux_only
     @pytest.mark.parametrize("moment", MOMENTS_IN_WINE)
     def test_of_an_fmu_in_wine(self, is_clean_after, wine, faulty, tmp_path, moment):
-        """With a folder of Wine of its own, because others may keep Wine's server busy."""
-        made = wine.prefix.parent
-        leave_out = shutil.ignore_patterns("temporary", "*.lock")
-        shutil.copytree(made, tmp_path / "cache" / "wine", symlinks=True, ignore=leave_out)
-        (tmp_path / "cache" / "wine" / wine.prefix.name / "temporary").mkdir()
+        copy_of_wine(wine, tmp_path / "cache")
         is_clean_after(MOMENTS[moment], "off", for_windows(faulty, tmp_path))
+
+
+@linux_only
+def test_an_interrupt_while_wine_starts(wine, faulty, tmp_path, monkeypatch):
+    _guard()  # which is told nothing of this folder
+    cache = copy_of_wine(wine, tmp_path / "cache")
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(cache))
+
+    def interrupted(supervisor, deadline):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Supervisor, "finish_opening", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        FaultyEnv(for_windows(faulty, tmp_path))
+    wait_until(lambda: not processes_told_of(cache))
+
+
+def copy_of_wine(wine, cache):
+    """A cache folder with a Wine of its own, because others may keep Wine's server busy."""
+    left_out = shutil.ignore_patterns("server-*", "*.lock")
+    shutil.copytree(wine.prefix.parent, cache / "wine", symlinks=True, ignore=left_out)
+    return cache
 
 
 class TestEndOfParent:
