@@ -2,6 +2,8 @@
 
 #include <math.h>
 
+#include "platform.h"
+
 #define EACH(Type, expression)                                                                     \
     {                                                                                              \
         const Type *x = first, *y = second;                                                        \
@@ -19,6 +21,43 @@
 #define OF_TWO(operation, function)                                                                \
     case operation:                                                                                \
         EACH(double, function(x[j], y[j]))
+
+/* What x * x is more than its rounded product, by Dekker's halves: exact, or not a number where x is
+ * too great for it. */
+static inline double rest_of_square(double x, double product) {
+    const double scaled = 0x1.0000002p27 * x, high = scaled - (scaled - x), low = x - high;
+    return ((high * high - product) + 2.0 * high * low) + low * low;
+}
+
+/* Whether a power function that is off by less than slack before it rounds returns the product. */
+static inline bool is_sure(double product, double rest, double slack) {
+    return (product + (rest + slack) == product) & (product + (rest - slack) == product);
+}
+
+/* Multiplies what is to be squared, and notes where a power may differ from that product. */
+WIDE static void square_most(const double *restrict x, const double *restrict y, size_t count,
+                             double *restrict r, uint8_t *restrict is_left) {
+    for (size_t j = 0; j < count; j++) {
+        const double product = x[j] * x[j], rest = rest_of_square(x[j], product);
+        const bool is_usual = (product > 0x1p-64) & (product < 0x1p64);
+        r[j] = product;
+        is_left[j] = !((y[j] == 2.0) & is_usual & is_sure(product, rest, 0x1p-57 * product));
+    }
+}
+
+/* Powers of the C library. Its squares are not always the rounded product, but nine of ten must be: its
+ * results are off by less than 0.53 units in the last place. In the usual range it is 0.514 for that
+ * of glibc, musl and Android, by the formula in its source. */
+static void operation_raise(const double *x, const double *y, size_t count, double *r) {
+    uint8_t is_left[PROGRAM_WIDTH];
+
+    square_most(x, y, count, r, is_left);
+    for (size_t j = 0; j < count; j++) {
+        if (is_left[j]) {
+            r[j] = pow(x[j], y[j]);
+        }
+    }
+}
 
 /* The remainder of numpy has the sign of the divisor. */
 static double remainder_of(double x, double y) {
@@ -83,11 +122,13 @@ void operation_call(uint16_t operation, const void *first, const void *second, s
         OF_ONE(CBRT, cbrt);
         OF_TWO(ARCTAN2, atan2);
         OF_TWO(HYPOT, hypot);
-        OF_TWO(POWER, pow);
         OF_TWO(FMOD, fmod);
         OF_TWO(COPYSIGN, copysign);
         OF_TWO(REMAINDER, remainder_of);
         OF_TWO(FLOOR_DIVIDE, floor_divide);
+    case POWER:
+        operation_raise(first, second, count, to);
+        break;
     case POWER_F:
         EACH(float, powf(x[j], y[j]));
     case REMAINDER_Q:

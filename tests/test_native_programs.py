@@ -224,6 +224,19 @@ def hard_numbers(count):
     return np.concatenate([mixed, rng.uniform(-8.0, 8.0, count), few])
 
 
+def test_squares_are_those_of_the_c_library():
+    """Most are products, but not all: the library rounds a few in the other direction."""
+    rng, count = np.random.default_rng(3), 100_000
+    near = [np.nextafter(rng.choice(2.0 ** np.arange(-9, 9), count), s) for s in (0.0, np.inf)]
+    x = np.concatenate([hard_numbers(count), *near, np.sqrt(rng.uniform(0.5, 2.0, count))])
+    found = results_of("power d", x, np.full_like(x, 2.0))
+    with np.errstate(all="ignore"):
+        expected = np.array([number**2 for number in x])  # each by the library's pow
+        products = x * x
+    np.testing.assert_array_equal(found, expected)
+    assert 0 < np.count_nonzero(found != products) < count / 100
+
+
 @pytest.mark.parametrize("ufunc", [np.remainder, np.floor_divide], ids=lambda u: u.__name__)
 def test_remainders_and_whole_quotients_are_those_of_numpy(ufunc):
     """Of all magnitudes and signs, and next to multiples of the divisor, where division rounds."""
