@@ -25,7 +25,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.licences import failed_reset
+from fmugym.pool.licences import require_started
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
@@ -55,6 +55,9 @@ _ARGUMENTS: Final = (
 )
 
 _WAYS: Final = ("auto", "compiled", "python")
+
+_FIRST: Final = np.zeros(1, np.int64)
+"""The index of the only instance."""
 
 _PLAYERS: Final = "fmugym.vector.one"
 """The module of players is imported late: it needs this one, and takes a while."""
@@ -225,8 +228,8 @@ class FMUEnv(Constructed):
     @staticmethod
     def _reset_pool(pool: Pool, plan: EpisodePlan, episode: Episode) -> None:
         pool.reset(plan.model_variables, episode.start_values)
-        if pool.statuses.item(0) > WARNING_CODE:
-            raise failed_reset(pool.failure(0))
+        if pool.statuses.item(0):
+            require_started(pool, _FIRST)
 
     def _begin_with_warm_up(
         self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
@@ -245,8 +248,7 @@ class FMUEnv(Constructed):
             read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in values.items()})
 
         rows, starts = rows_of_one(self).variables, episode.start_values
-        first = np.zeros(1, np.int64)
-        warm_ups.begin(pool, plan.model_variables, starts, rows, first, start, place)
+        warm_ups.begin(pool, plan.model_variables, starts, rows, _FIRST, start, place)
         read.inputs = tuple(self.inside.input_row.tolist())
         self._read_outputs()
 
@@ -278,7 +280,8 @@ class FMUEnv(Constructed):
             inside.player.begin(inside)
         read = inside.readings
         read.parameters = episode.parameters
-        read.variables.update(episode.variables)
+        if episode.variables:
+            read.variables.update(episode.variables)
         read.step_count = 0
         read.action = read.previous_action = inside.no_action
         given = episode.parameters.get
@@ -387,7 +390,7 @@ class FMUEnv(Constructed):
         if not self.inside.was_reset:
             raise SimulationError("save_state was called before the first reset")
         self.inside.keep()
-        bundle = pool.save_instances(np.zeros(1, np.int64))
+        bundle = pool.save_instances(_FIRST)
         return Snapshot(scope_of(self), columns_of(self), bundle)
 
     @alone
@@ -412,8 +415,7 @@ class FMUEnv(Constructed):
         require_saving(pool)
         self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails
-        first = np.zeros(1, np.int64)
-        if pool.restore_instances(snapshot.bundle, first, first)[0] > WARNING_CODE:
+        if pool.restore_instances(snapshot.bundle, _FIRST, _FIRST)[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         observation = first_observation(self)[0]

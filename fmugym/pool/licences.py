@@ -14,8 +14,15 @@ import numpy as np
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import Pool
+from fmugym.pool.bundle import IndexArray
 
-__all__ = ["LicenceWait", "failed_reset", "licence_errors", "require_licence", "speaks_of_licence"]
+__all__ = [
+    "LicenceWait",
+    "licence_errors",
+    "require_licence",
+    "require_started",
+    "speaks_of_licence",
+]
 
 R = TypeVar("R")
 
@@ -74,9 +81,21 @@ def require_licence(pool: Pool) -> None:
             raise LicenceError(failure)
 
 
-def failed_reset(failure: str) -> SimulationError:
-    """Make the error for a reset that failed: a ``LicenceError`` if the FMU speaks of a licence."""
-    return LicenceError(failure) if speaks_of_licence(failure) else SimulationError(failure)
+def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
+    """Refuse an instance whose reset or warm-up has failed.
+
+    Args:
+        pool: Has the instances.
+        indices: Those that were to start, shape (M,).
+        doing: What comes before the failure in the text of the error.
+
+    Raises:
+        SimulationError: If one has failed; a ``LicenceError`` if the FMU speaks of a licence.
+    """
+    for index in indices[pool.statuses[indices] > WARNING_CODE].tolist():
+        failure = f"{doing}{pool.failure(index)}"
+        error = LicenceError if speaks_of_licence(failure) else SimulationError
+        raise error(failure if pool.num_instances == 1 else f"environment {index}: {failure}")
 
 
 class LicenceWait:

@@ -104,7 +104,7 @@ def first_observation(env: Constructed) -> tuple[Any, dict[str, Any]]:
         observation = env._get_observation()
         if not inside.is_finite(observation):
             raise SimulationError(f"the first observation is not finite: {shown(observation)}")
-        return observation, info_of(env)
+        return observation, info_of(env) if inside.has_info else {}
     finally:
         inside.in_hooks = False
 

@@ -15,11 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.fmi.status import Status
 from fmugym.pool import Pool
 from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
-from fmugym.pool.licences import failed_reset
+from fmugym.pool.licences import require_started
 from fmugym.pool.state_files import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
@@ -31,7 +30,7 @@ __all__ = ["WarmUp", "WarmUps", "rows_of_one"]
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
 
-_WARNING: Final = int(Status.WARNING)  # which is compared in less time
+_FAILED: Final = "the warm-up failed: "
 
 _OF_LAST_AXIS: Final = ("values", "previous_state", "inputs", "action", "previous_action")
 
@@ -225,9 +224,8 @@ class WarmUps:
         size, ends = self._size_of_numbers, np.cumsum([len(pool.inputs), *self._sizes])
         inputs, *parts = np.split(np.frombuffer(warmed[:size]), ends[:-1])
         bundle, sources = Bundle((warmed[size:],)), np.zeros(len(indices), np.int64)
-        statuses = pool.restore_instances(bundle, sources, indices)
-        for index in indices[statuses[indices] > _WARNING].tolist():
-            raise failed_reset(self._located(pool, index))
+        pool.restore_instances(bundle, sources, indices)
+        require_started(pool, indices, _FAILED)
         pool.inputs[:, indices] = inputs[:, None]
         shapes = self._shapes.items()
         return {name: p.reshape(*n, 1) for (name, n), p in zip(shapes, parts, strict=True)}
@@ -281,14 +279,9 @@ class WarmUps:
         pool.inputs[:, indices] = given
         env.previous_state = env.state
         pool.step(None, skip)
-        for index in indices[pool.statuses[indices] > _WARNING].tolist():
-            raise failed_reset(self._located(pool, index))
+        require_started(pool, indices, _FAILED)
         env.inside.readings.values = outputs = pool.outputs[:, indices]
         env.state = outputs[: env.inside.output_count]
-
-    def _located(self, pool: Pool, index: int) -> str:
-        text = f"the warm-up failed: {pool.failure(index)}"
-        return text if pool.num_instances == 1 else f"environment {index}: {text}"
 
     def _keep(self, pool: Pool, rows: Mapping[str, Any], indices: IndexArray) -> None:
         """Keep the states of those for which none was known."""

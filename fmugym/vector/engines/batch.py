@@ -21,7 +21,7 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
-from fmugym.pool.licences import failed_reset
+from fmugym.pool.licences import require_started
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
@@ -321,7 +321,7 @@ class BatchEngine(Engine):
         observations, infos = result
         mask, self.has_moved = infos["_drawn"], True
         if troubled:
-            self._require_started(np.flatnonzero(mask), self._pool.statuses)
+            require_started(self._pool, np.flatnonzero(mask))
         return self._seen_at_start(observations, infos, mask, self._left)
 
     def _seen_at_start(
@@ -372,7 +372,7 @@ class BatchEngine(Engine):
     ) -> None:
         _, statuses = self._pool.reset(plan.model_variables, values, mask)
         if np.count_nonzero(statuses):
-            self._require_started(indices, statuses)
+            require_started(self._pool, indices)
 
     def _begin_with_warm_up(
         self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
@@ -403,11 +403,6 @@ class BatchEngine(Engine):
             row[indices] = (
                 self._parameters[name][indices] if name in plan.parameter_names else start
             )
-
-    def _require_started(self, indices: IndexArray, statuses: StatusArray) -> None:
-        for index in indices.tolist():
-            if statuses[index] > WARNING_CODE:
-                raise failed_reset(f"environment {index}: {self._pool.failure(index)}")
 
     def _place_episodes(
         self, drawn: FloatArray, indices: IndexArray, plan: EpisodePlan
@@ -782,7 +777,7 @@ class BatchEngine(Engine):
             wrong: Where rewards and observations are not finite.
         """
         if started is not None:
-            self._require_started(np.flatnonzero(started), self._pool.statuses)
+            require_started(self._pool, np.flatnonzero(started))
             self._require_finite_start(result.observations, started)
         self._require_possible_inputs(started)
         self.env.inside.in_hooks = True
