@@ -62,7 +62,7 @@ class AskingPool(SavingPool):
             lambda _: content,
             lambda reader, count: read_values(reader, (*shape, count)),
         )
-        return np.concatenate(parts, axis=-1)
+        return parts[0].copy() if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""

@@ -8,7 +8,6 @@ the worker.
 from __future__ import annotations
 
 import functools
-import math
 import struct
 from collections.abc import Callable, Sequence
 from enum import IntEnum
@@ -133,10 +132,11 @@ class Reader:
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
         """Read an array of this shape and type."""
-        data, wanted = self.block(), np.dtype(dtype)
-        if len(data) != wanted.itemsize * math.prod(shape):
-            raise DamagedError(f"an array of another shape than {shape}")
-        return np.frombuffer(data, wanted).reshape(shape)
+        data = self.block()
+        try:
+            return np.frombuffer(data, dtype).reshape(shape)
+        except ValueError:
+            raise DamagedError(f"an array of another shape than {shape}") from None
 
     def blocks(self, count: int) -> list[bytes]:
         """Read so many blocks."""
