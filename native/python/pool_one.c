@@ -16,6 +16,7 @@ typedef struct {
 /* The result of prepare_one. The turn is used inside of the pool only. */
 typedef struct {
     PyObject *playing; /* the capsule that prepare_play has made */
+    PyObject *parts;   /* the tuple that holds the following */
     PyObject *names, *observe, *inform, *judge, *complete, *guard;
     Watched *watched; /* their names are those of the tuple */
     size_t number_of_watched;
@@ -28,12 +29,7 @@ static void one_free(One *one) {
         release_turn(playing_of(one->playing), &one->turn);
     }
     Py_XDECREF(one->playing);
-    Py_XDECREF(one->names);
-    Py_XDECREF(one->observe);
-    Py_XDECREF(one->inform);
-    Py_XDECREF(one->judge);
-    Py_XDECREF(one->complete);
-    Py_XDECREF(one->guard);
+    Py_XDECREF(one->parts);
     free(one->watched);
     free(one->inputs);
     free(one);
@@ -61,24 +57,16 @@ static bool take_watched(One *one) {
     return !PyErr_Occurred();
 }
 
-static bool fill(PyPool *self, One *one, PyObject *args) {
+static bool fill(PyPool *self, One *one) {
     const Playing *playing = playing_of(one->playing);
     Py_buffer *b = one->turn.buffers;
     PyObject *seen, *rewards, *terminated, *truncated;
 
-    if (!PyArg_ParseTuple(args, "OOOOO!OOOOO!:prepare_one", &seen, &rewards, &terminated,
+    if (!PyArg_ParseTuple(one->parts, "OOOOO!OOOOO!:prepare_one", &seen, &rewards, &terminated,
                           &truncated, &PyTuple_Type, &one->names, &one->observe, &one->inform,
                           &one->judge, &one->complete, guard_type, &one->guard)) {
-        one->names = one->observe = one->inform = NULL; /* not ours yet */
-        one->judge = one->complete = one->guard = NULL;
         return false;
     }
-    Py_INCREF(one->names);
-    Py_INCREF(one->observe);
-    Py_INCREF(one->inform);
-    Py_INCREF(one->judge);
-    Py_INCREF(one->complete);
-    Py_INCREF(one->guard);
     if (self->pool.settings.count != 1) {
         PyErr_SetString(PyExc_ValueError, "the pool has more than one instance");
         return false;
@@ -108,7 +96,8 @@ PyObject *py_prepare_one(PyObject *object, PyObject *args) {
         return PyErr_Occurred() ? NULL : PyErr_NoMemory();
     }
     one->playing = Py_NewRef(self->playing);
-    if (fill(self, one, args)) {
+    one->parts = Py_NewRef(args);
+    if (fill(self, one)) {
         capsule = PyCapsule_New(one, ONE, one_dealloc);
     }
     if (capsule == NULL) {
