@@ -325,32 +325,34 @@ class FMUEnv(Constructed):
     def _step(self, action: Any) -> Result:
         """Let the pool do the whole step where it can, and note what a picture shows."""
         player = self.inside.player
-        result: Result | None = None if player is None else player.play(self, action)
-        if result is None:
-            self.inside.keep()
+        if player is None:
             result = self._step_in_python(action)
+        else:
+            result = player.play(self, action) or self._step_in_python(action)
         if self.render_mode is not None:
             note_for_picture(self, result[1])
         return result
 
     def _step_in_python(self, action: Any) -> Result:
-        if self.inside.ended:
+        inside = self.inside
+        inside.keep()
+        if inside.ended:
             self._check_before_step()
-        self.inside.in_hooks = True
+        inside.in_hooks = True
         try:
             take_action(self, action)
             try:
-                troubled = self.inside.step_pool()
-                self.inside.readings.step_count += 1
-                return judged(self, self.inside.pool.statuses.item(0) if troubled else 0)
+                troubled = inside.step_pool()
+                inside.readings.step_count += 1
+                return judged(self, inside.pool.statuses.item(0) if troubled else 0)
             except BaseException:  # the FMU has moved, so that the step cannot be tried again
-                self.inside.ended = True
+                inside.ended = True
                 raise
         except BaseException:  # a real system must not go on without its controller
-            self.inside.halt()
+            inside.halt()
             raise
         finally:
-            self.inside.in_hooks = False
+            inside.in_hooks = False
 
     def _check_before_step(self) -> None:
         self._open_pool("step")
