@@ -217,9 +217,10 @@ class EpisodePlan:
         drawn: dict[str, Any] = {}
         starts = self._starts
         for (index, name, _), value in zip(self._random_parameters, values, strict=False):
-            drawn[name] = parameters[name] = starts[index] = value
+            drawn[name] = starts[index] = value
         for name in self.strings & drawn.keys() if self.strings else ():
-            drawn[name] = parameters[name] = text_of(drawn[name])
+            drawn[name] = text_of(drawn[name])
+        parameters.update(drawn)
         for name, array in self._random_variables:
             own = next(values) if array is None else array.of_episode(values)
             drawn[name] = variables[name] = own
