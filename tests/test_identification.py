@@ -237,6 +237,27 @@ class TestOutputError:
         assert np.isfinite(fit.standard_errors["l"])
         with pytest.raises(fmugym.ConfigError, match="'m' has no distribution"):
             fit.distributions()
+        with pytest.raises(fmugym.ConfigError, match="'m' has no distribution: give it bounds"):
+            fit.rows(10)
+
+    def test_what_the_data_tell_only_together_is_drawn_together(self):
+        """Without friction a swing under gravity tells g / l, and neither of both."""
+        time, q, _ = swing(2.0)
+        q = q + np.random.default_rng(0).normal(0, 0.01, len(q))
+        fit = fit_parameters(
+            PENDULUM,
+            {"l": (0.12, 0.05, 0.2), "g": (9.0, 5.0, 20.0)},
+            [Trajectory(time, {"q": q})],
+            fixed={"b": 0.0, "c": 0.0, "q_0": 2.0},
+        )
+        (direction,) = fit.untold()
+        assert set(direction) == {"l", "g"}
+        assert direction["l"] * direction["g"] > 0
+        length, gravity = fit.rows(500, seed=1).T
+        assert np.std(gravity / length) / 98.1 < 0.02
+        assert np.std(gravity) > 1.5
+        assert (length.min() >= 0.05) & (length.max() <= 0.2)
+        assert np.array_equal(fit.rows(500, seed=1)[:, 0], length)
 
     def test_bounds_hold_and_truncate_the_distribution(self):
         options = {"initial_states": START, "fixed": {"c": 2e-3}}
@@ -270,17 +291,85 @@ class TestOutputError:
         low, high = led.rms_interval("q")
         assert low < led.rms("q") < high
 
-    def test_clustered_errors_are_larger_where_the_model_is_wrong(self):
+    def test_a_wrong_model_says_so_by_its_residuals(self):
         """The friction is Coulomb's, the model only knows the viscous one."""
-        windows = [w for t in noisy(4, 2.5, -2.0, end=3.0) for w in t.windows(0.5)]
         options = {"initial_states": START, "scales": {"q": 0.01, "q_dot": 0.1}}
-        plain, clustered = (
-            fit_parameters(PENDULUM, {"b": 1e-3}, windows, clustered=clustered, **options)
-            for clustered in (False, True)
+        swings = noisy(4, 2.5, -2.0, end=3.0)
+        wrong = fit_parameters(PENDULUM, {"l": 0.11, "b": 1e-3}, swings, **options)
+        right = fit_parameters(
+            PENDULUM, {"l": 0.11, "b": 1e-3, "c": (1e-3, 0.0, 0.01)}, swings, **options
         )
-        assert plain.values == clustered.values
-        assert clustered.standard_errors["b"] > 1.5 * plain.standard_errors["b"]
-        assert clustered.degrees_of_freedom == len(windows) - 1
+        assert wrong.correlations["q"].first > 0.8
+        assert not wrong.correlations["q"].is_noise
+        assert all(one.is_noise and abs(one.first) < 0.1 for one in right.correlations.values())
+        assert wrong.standard_errors["l"] > 3 * right.standard_errors["l"]
+        assert wrong.degrees_of_freedom < 0.1 * right.degrees_of_freedom
+
+    def test_errors_stay_honest_where_noise_is_correlated(self):
+        """Of 60 intervals of 95 %, independent residuals would let about half cover."""
+        count = 0
+        for seed in range(30):
+            (made,) = noisy(seed, 2.0, end=4.0, step=0.01)
+            rng, drift = np.random.default_rng(seed), np.zeros(len(made))
+            for k in range(1, len(drift)):
+                drift[k] = 0.95 * drift[k - 1] + rng.normal(0, 0.01)
+            logged = Trajectory(made.time, {"q": made.outputs["q"] + drift})
+            fit = fit_parameters(
+                PENDULUM,
+                {"l": 0.12, "b": 1e-3},
+                [logged],
+                fixed={"c": 2e-3, "q_0": 2.0},
+            )
+            assert not fit.correlations["q"].is_noise
+            intervals = fit.confidence_intervals(0.95)
+            count += sum(low <= TRUE[name] <= high for name, (low, high) in intervals.items())
+        assert count >= 52
+
+    def test_outputs_are_weighted_by_their_noise(self):
+        """With the angle as noisy as the velocity, which has ten times its range."""
+        made = noisy(3, 2.0, -1.0, 2.5)
+        fits = [
+            fit_parameters(PENDULUM, {"l": 0.12}, made, fixed={"b": 4e-4, "c": 2e-3}, **options)
+            for options in (
+                {"initial_states": START},
+                {"initial_states": START, "scales": {"q": 0.01, "q_dot": 0.1}},
+                {"initial_states": START, "scales": {"q": 1.0, "q_dot": 0.01}},
+            )
+        ]
+        own, right, wrong = (fit.values["l"] for fit in fits)
+        assert own == pytest.approx(right, rel=2e-5)
+        assert abs(own - wrong) > 5 * abs(own - right)
+
+    def test_a_wash_in_is_not_counted(self):
+        """The first half second of the log is of another pendulum."""
+        (made,) = noisy(1, 2.0)
+        odd = made.time < 0.5
+        logged = Trajectory(made.time, {"q": made.outputs["q"] + np.where(odd, 0.5, 0.0)})
+        options = {"fixed": {"b": 4e-4, "c": 2e-3, "q_0": 2.0}}
+        early, late = (
+            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=wash_in, **options)
+            for wash_in in (None, 0.5)
+        )
+        assert late.values["l"] == pytest.approx(0.1, rel=1e-3)
+        assert abs(early.values["l"] - 0.1) > 20 * abs(late.values["l"] - 0.1)
+        with pytest.raises(fmugym.ConfigError, match="no samples after a wash-in of 9 s"):
+            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=9, **options)
+
+    def test_candidates_find_what_one_start_misses(self):
+        """A length that is wrong by a half puts the swings out of phase."""
+        made = noisy(1, 2.0, end=5.0, step=0.01)
+        options = {"fixed": {"b": 4e-4, "c": 2e-3, "q_0": 2.0}}
+        one, many = (
+            fit_parameters(
+                PENDULUM, {"l": (0.05, 0.02, 0.5)}, made, candidates=candidates, **options
+            )
+            for candidates in (1, 40)
+        )
+        assert abs(one.values["l"] - 0.1) > 0.02
+        assert many.values["l"] == pytest.approx(0.1, rel=1e-3)
+        assert len(many.costs) == 3
+        with pytest.raises(fmugym.ConfigError, match="'l' needs a lowest and a highest value"):
+            fit_parameters(PENDULUM, {"l": 0.12}, made, candidates=5, **options)
 
     def test_plot(self, fit, tmp_path):
         figure = plot_comparison(fit.comparison, ["q"], {"q": "angle [rad]"})
@@ -295,7 +384,8 @@ class TestOutputError:
         [
             ({"parameters": {}}, "no parameter"),
             ({"parameters": {"bb": 1.0}}, "unknown variable of Pendulum 'bb'"),
-            ({"parameters": {"q": 1.0}}, "'q' is not a numeric parameter"),
+            ({"parameters": {"q": 1.0}}, "'q' cannot be set: it is a continuous output"),
+            ({"parameters": {"solver": 1.0}}, "'solver' is of type Enumeration: only Reals"),
             ({"parameters": {"b": (1.0, 0.5, 2.0, 3.0)}}, "low <= start <= high"),
             ({"parameters": {"b": -1.0}}, "low <= start <= high"),
             ({"fixed": {"b": 1e-4}}, "both fixed and to be fitted"),
@@ -303,7 +393,6 @@ class TestOutputError:
             ({"scales": {"p": 1.0}}, "unknown measured output 'p'"),
             ({"initial_states": {"q_0": "p"}}, "unknown measured output 'p'"),
             ({"trajectories": []}, "at least one trajectory"),
-            ({"clustered": True}, "more trajectories than parameters"),
             ({"time_step": 0.0}, "time_step"),
         ],
     )
@@ -409,7 +498,6 @@ class TestMeasured:
             fixed={"q_dot_max": 1e3, "P4": PUBLISHED_P4},  # a free fall tells ratios only
             scales={"q1": 0.01, "q2": 0.02, "q1_dot": 1.0, "q2_dot": 2.0},
             time_step=0.002,
-            clustered=True,
         )
         held = free_fall(2).between(0, 3).windows(0.2)
         for options in ({}, {"lead_in": 0.04}):

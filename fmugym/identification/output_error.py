@@ -3,6 +3,8 @@
 The method is maximum likelihood if the measured outputs have independent normal noise of the given
 relative sizes; see Ljung, "System Identification" (1999), chapter 7. To fit a chaotic plant, use
 many short trajectories with their own initial states (multiple shooting) instead of a long one.
+Residuals that are correlated make the standard errors larger; the model is then not exact, and no
+standard error tells what that does to the values.
 """
 
 from __future__ import annotations
@@ -21,10 +23,17 @@ from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Experiment, Limits, Problem
-from fmugym.identification.statistics import Estimate, normal_distributions
+from fmugym.identification.statistics import Correlation, Estimate, normal_distributions
 from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.pool.base import FloatArray
 
-__all__ = ["FitResult", "fit_parameters"]
+__all__ = ["FitResult", "fit_of", "fit_parameters"]
+
+GUESS = 12.0
+"""One over the variance of a uniform distribution, in units of its range."""
+
+MATTERS = 0.3
+"""Parts of a direction, which has the length 1, that are worth naming."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +41,20 @@ class FitResult(Estimate):
     """The result of ``fit_parameters``; the values are in the form of ``model_parameters``.
 
     Attributes:
+        information: The inverse of the covariance, which is 0 along directions of which the data
+            tell nothing, shape (k, k).
+        correlations: How the residuals depend on those before, by output.
+        costs: What each start of the optimization has come to, half the sum of the squared
+            residuals in units of their scales; the best is the first.
         bounds: Lower and upper bound of each value by name.
         comparison: The fitted trajectories and their simulation.
         converged: Whether the optimization converged within its limit of evaluations.
         message: Why the optimization ended.
     """
 
+    information: FloatArray
+    correlations: dict[str, Correlation]
+    costs: tuple[float, ...]
     bounds: dict[str, tuple[float, float]]
     comparison: Comparison
     converged: bool
@@ -54,6 +71,60 @@ class FitResult(Estimate):
             ConfigError: If the data do not determine a value.
         """
         return normal_distributions(self.values, self.standard_errors, self.bounds)
+
+    def untold(self) -> list[dict[str, float]]:
+        """Name what the data do not tell: combinations of parameters that are hardly determined.
+
+        Along such a direction the standard error is larger than that of a guess within the bounds.
+
+        Returns:
+            For each direction, how far each parameter goes along it as a part of its range, those
+            that matter by name; the least determined direction is the first.
+        """
+        widths = self._widths()
+        scales = np.where(np.isfinite(widths), widths, np.abs([*self.values.values()]))
+        told, directions = np.linalg.eigh(self.information * np.outer(scales, scales))
+        return [
+            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > MATTERS}
+            for amount, along in zip(told, directions.T, strict=True)
+            if amount < GUESS
+        ]
+
+    def rows(self, count: int, seed: int = 0) -> FloatArray:
+        """Draw values that fit the data together, from the normal distribution within the bounds.
+
+        What the data do not tell varies over the whole range.
+
+        Args:
+            count: How many.
+            seed: Of the draws.
+
+        Returns:
+            A row for each draw, in the order of ``values``, shape (count, k).
+
+        Raises:
+            ConfigError: If the data do not determine a value that has no bounds.
+        """
+        widths, center = self._widths(), np.array([*self.values.values()])
+        bounded = np.isfinite(widths)
+        for name, error, has_ends in zip(
+            self.values, self.standard_errors.values(), bounded, strict=True
+        ):
+            if not (has_ends or np.isfinite(error)):
+                raise ConfigError(f"{name!r} has no distribution: give it bounds")
+        scales = np.where(bounded, widths, np.sqrt(np.diag(self.covariance)))
+        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, GUESS, 0.0))
+        amounts, directions = np.linalg.eigh(told)
+        root = directions / np.sqrt(amounts)
+        low, high = np.array([*self.bounds.values()]).T
+        rng, kept = np.random.default_rng(seed), np.empty((0, len(center)))
+        while len(kept) < count:
+            drawn = center + rng.standard_normal((count, len(center))) @ root.T * scales
+            kept = np.vstack([kept, drawn[((low <= drawn) & (drawn <= high)).all(axis=1)]])
+        return kept[:count]
+
+    def _widths(self) -> FloatArray:
+        return np.array([high - low for low, high in self.bounds.values()])
 
     def rms(self, output: str) -> float:
         """Return the RMS of the residuals of the fit, in the unit of the output."""
@@ -125,7 +196,8 @@ def fit_parameters(
     fixed: Mapping[str, float | str] | None = None,
     scales: Mapping[str, float] | None = None,
     time_step: float | None = None,
-    clustered: bool = False,
+    wash_in: float | None = None,
+    candidates: int = 1,
     drop_repeats: bool = True,
     max_evaluations: int = 100,
     backend: str = "auto",
@@ -150,13 +222,13 @@ def fit_parameters(
             first samples give them.
         fixed: Values of other parameters by name.
         scales: Standard deviation of the noise of each output, in its unit. Only the ratios
-            matter. None for the standard deviation of each output.
+            matter. Without it, an output is weighted by the noise that its residuals show, at
+            first by its standard deviation.
         time_step: Communication step size in seconds; None for the median sampling interval.
-        clustered: Whether the residuals of a trajectory may be correlated, as they are if the
-            model is not exact. This needs more trajectories than parameters. Otherwise all
-            residuals count as independent, and correlation makes the standard errors too small.
-            See Cameron and Miller, "A Practitioner's Guide to Cluster-Robust Inference", Journal
-            of Human Resources 50 (2015).
+        wash_in: How many seconds of each trajectory are simulated but not counted, so that the
+            initial state is forgotten; 0 leaves out the first sample. None counts all.
+        candidates: How many points within the bounds, the start among them, are tried at once. The
+            fit begins at the three best ones.
         drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
         max_evaluations: Largest number of evaluations of the optimization.
         backend: See ``fmugym.pool.wishes.Wishes``.
@@ -181,26 +253,29 @@ def fit_parameters(
         time_step,
         check_flag("drop_repeats", drop_repeats),
         check_text("backend", backend),
+        None if wash_in is None else check_number("wash_in", wash_in, 0.0),
     )
-    clustered = check_flag("clustered", clustered)
     max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
     fit_states = check_flag("fit_initial_states", fit_initial_states)
+    candidates = check_integer("candidates", candidates, 1, 10**6)
     with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
-        return _result(experiment, problem, problem.solve(max_evaluations), clustered)
+        return fit_of(experiment, problem, max_evaluations, candidates)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
     return {} if value is None else check_mapping(what, value)
 
 
-def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: bool) -> FitResult:
-    """Collect the results of the optimization."""
-    covariance, freedom = problem.covariance(solution, clustered)
+def fit_of(
+    experiment: Experiment, problem: Problem, max_evaluations: int, candidates: int
+) -> FitResult:
+    """Solve a problem and collect the results."""
+    solution, costs = problem.solve(max_evaluations, candidates)
     return FitResult(
         values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
-        covariance=covariance,
+        **problem.uncertainty(solution)._asdict(),
+        costs=tuple(costs),
         bounds=problem.bounds,
-        degrees_of_freedom=freedom,
         comparison=problem.compare(solution.x),
         converged=solution.status > 0,
         message=solution.message,

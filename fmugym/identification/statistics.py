@@ -15,15 +15,24 @@ from fmugym.extras import imported
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [
+    "Correlation",
     "Estimate",
     "Inverse",
     "information_inverse",
+    "information_of",
+    "memory_of",
     "newey_west",
     "normal_distributions",
 ]
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
+
+FALSE_ALARM = 1e-3
+"""How often white noise counts as correlated."""
+
+MOST_LAGS = 20
+"""Of the autocorrelations that the test for white noise looks at."""
 
 
 class Inverse(NamedTuple):
@@ -51,6 +60,69 @@ def information_inverse(jacobian: FloatArray) -> Inverse:
     root = rows[kept] / values[kept, np.newaxis] / safe
     undetermined = (np.abs(rows[~kept]) > 1e-6).any(axis=0) | (lengths == 0)
     return Inverse(root.T @ root, undetermined)
+
+
+def information_of(jacobian: FloatArray, scores: FloatArray) -> FloatArray:
+    """Say how much the data tell of the parameters, along every direction; shape (k, k).
+
+    It is the inverse of the covariance of the estimate, and 0 along the directions of which the
+    data tell nothing.
+
+    Args:
+        jacobian: The derivatives of the residuals, shape (n, k).
+        scores: The covariance of J' r, shape (k, k).
+    """
+    lengths = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(lengths > 0, lengths, 1.0)
+    slopes = jacobian / safe
+    bread = slopes.T @ slopes
+    middle = np.linalg.pinv(scores / np.outer(safe, safe), RANK_TOLERANCE, hermitian=True)
+    return np.asarray(bread @ middle @ bread * np.outer(safe, safe))
+
+
+class Correlation(NamedTuple):
+    """How the residuals of an output depend on those before.
+
+    Attributes:
+        first: The correlation with the residual one sample before.
+        is_noise: Whether correlations up to the 20th sample before are no larger than those of
+            white noise, by the test of Ljung and Box, "On a measure of lack of fit in time series
+            models", Biometrika 65 (1978).
+    """
+
+    first: float
+    is_noise: bool
+
+    @classmethod
+    def of(cls, residuals: Sequence[FloatArray]) -> Correlation:
+        """Judge the residuals of an output, an array (n,) for each experiment."""
+        count = sum(map(len, residuals))
+        lags = range(1, 1 + min(MOST_LAGS, max(map(len, residuals)) - 1))
+        power = sum(float(one @ one) for one in residuals)
+        if not (lags and power):
+            return cls(0.0, True)
+        found = [sum(float(one[lag:] @ one[:-lag]) for one in residuals) / power for lag in lags]
+        statistic = (
+            count
+            * (count + 2)
+            * sum(one**2 / (count - lag) for one, lag in zip(found, lags, strict=True))
+        )
+        chi2 = imported("scipy.stats", "identification").chi2
+        return cls(found[0], bool(statistic <= chi2.ppf(1 - FALSE_ALARM, len(lags))))
+
+
+def memory_of(correlation: float, count: int) -> int:
+    """Choose the lags for ``newey_west``: those for a process of first order.
+
+    Andrews, "Heteroskedasticity and autocorrelation consistent covariance matrix estimation",
+    Econometrica 59 (1991).
+
+    Args:
+        correlation: Between neighbouring samples.
+        count: The number of samples.
+    """
+    slow = min(max(correlation, 0.0), 0.99)
+    return 1 + int(1.1447 * (4 * slow**2 / (1 - slow**2) ** 2 * count) ** (1 / 3))
 
 
 def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
