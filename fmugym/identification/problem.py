@@ -199,6 +199,7 @@ class Problem:
         Raises:
             ConfigError: If there are several candidates, and a parameter has no bounds.
         """
+        self._require_samples()
         self.compare(self.start, refit=False)  # fails early with the FMU's reason
         measured, found = self._states, []
         for start in self._starts(candidates):
@@ -213,6 +214,19 @@ class Problem:
             self._scales = np.where(self._given, self._scales, noise)
             solution = self._descend(solution.x, max_evaluations)
         return solution, costs
+
+    def _require_samples(self) -> None:
+        count = sum(int(one.sum()) for one in self._counted) * len(self._given)
+        wanted = len(self.start) + self._num_states
+        if count <= wanted:
+            raise ConfigError(
+                f"{count} measured values are too few for {wanted} values to fit: the log is too "
+                "short, or the wash-in too long"
+            )
+
+    @property
+    def _num_states(self) -> int:
+        return (len(self._rows) - len(self.start)) * len(self.trajectories)
 
     def _starts(self, candidates: int) -> list[FloatArray]:
         """The given start; or the best of it and of points that are spread within the bounds."""
@@ -287,8 +301,7 @@ class Problem:
         Residuals that are no white noise count as correlated (Newey and West).
         """
         inverse, undetermined = information_inverse(solution.jac)
-        num_states = (len(self._rows) - len(self.start)) * len(self.trajectories)
-        freedom = max(1, len(solution.fun) - len(self.start) - num_states)
+        freedom = max(1, len(solution.fun) - len(self.start) - self._num_states)
         correlations = self._correlations(solution)
         scores = solution.jac.T @ solution.jac * (solution.fun @ solution.fun) / freedom
         if not all(one.is_noise for one in correlations.values()):

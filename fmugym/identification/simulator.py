@@ -124,10 +124,10 @@ class Simulator:
         record[0] = outputs[:, :count]
         failed = self._note(active & (statuses > WARNING))
         ends = np.tile([grid.num_steps for grid in self._grids], size // len(self._grids))
-        for step, inputs in enumerate(self._logged):
+        everywhere = np.tile(self._logged, (1, 1, size // len(self._grids))) + offsets
+        for step, inputs in enumerate(everywhere):
             skip = ~active | failed | (ends <= step)
-            everywhere = np.tile(inputs, size // len(self._grids))
-            outputs, statuses = self._pool.step(everywhere + offsets, skip)
+            outputs, statuses = self._pool.step(inputs, skip)
             record[step + 1] = outputs[:, :count]
             failed |= self._note(~skip & (statuses > WARNING))
         record[:, :, failed[:count]] = np.nan
