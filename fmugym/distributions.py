@@ -281,7 +281,7 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
     "normal": Normal,
     "choice": Choice,
 }
-_OURS: Final = (*_KINDS.values(), Column)
+_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _LEAST_SHARE: Final = 0.01
 """Of the draws that must lie within limits, so that there are few redraws."""

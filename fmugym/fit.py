@@ -166,7 +166,7 @@ class _Plant:
             yield Trajectory(
                 part.times,
                 {v.name: columns.values(v, part) for v in measured},
-                {v.name: _held(columns.values(v, part), part) for v in spec.inputs},
+                {v.name: columns.held(v, part) for v in spec.inputs},
             )
 
     def wanted(
@@ -204,11 +204,6 @@ class _Plant:
         if variable.causality == "input":
             raise ConfigError(f"{name!r} cannot be fitted: it is an input, which the log gives")
         return variable, unit
-
-
-def _held(values: FloatArray, part: PlantLog) -> FloatArray:
-    """The values of an input that hold from each row on."""
-    return np.append(values[1:], values[-1]) if part.inputs_before else values
 
 
 def _require_steps(times: FloatArray, what: str) -> None:

@@ -287,17 +287,22 @@ class _Player:
 
 def declared_as(env: FMUEnv, alias: str) -> tuple[str, str | None]:
     """The name in the FMU of a variable of a task, and the unit that the task declares for it."""
-    task = getattr(env, "task", None)
-    document = task.document if isinstance(task, Task) else {}
-    declared = document.get("variables", {}).get(alias, {})
+    declared = _section(env, "variables").get(alias, {})
     return declared.get("name", alias), declared.get("unit")
+
+
+def _section(env: FMUEnv, key: str) -> Mapping[str, Any]:
+    """A section of the task file of an environment; empty if there is none."""
+    task = getattr(env, "task", None)
+    section: Mapping[str, Any] = task.document.get(key, {}) if isinstance(task, Task) else {}
+    return section
 
 
 class Columns:
     """The columns of a log as variables of an FMU, in the units of the FMU."""
 
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
-        self._columns = log.columns
+        self._columns, self._data = log.columns, _section(env, "data")
         self._variables = env.fmu.description.variables
         self._from: dict[str, tuple[str, float, float]] = {}
         for column in log.columns:
@@ -335,6 +340,16 @@ class Columns:
         """How far apart the values of a variable are; 1 if they are all the same."""
         column, factor, _ = self._from[variable.name]
         return float(np.ptp(self._columns[column]) * abs(factor)) or 1.0
+
+    def held(self, variable: Variable, part: PlantLog) -> FloatArray:
+        """The values of an input that hold from each row on, as ``values``.
+
+        Data of the task have those of the row's time in any log.
+        """
+        values, column = self.values(variable, part), self._from[variable.name][0]
+        if not part.inputs_before or column in self._data:
+            return values
+        return np.append(values[1:], values[-1])
 
     def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
         """The communication points of an episode, and the values of the variables there."""

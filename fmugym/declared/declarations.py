@@ -13,8 +13,8 @@ import numpy as np
 from fmugym.archive.description import ModelDescription
 from fmugym.declared.entries import Entry, gathered
 from fmugym.declared.expressions import CONSTANTS, Expression
-from fmugym.declared.format import DEVICE
 from fmugym.declared.fitted import read_fitted
+from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import Kpi, read_kpi
 from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.parts import (

@@ -250,7 +250,7 @@ class Problem:
             part = points[:, first : first + self._simulator.num_sets]
             values = np.concatenate([self._join(one, self._states) for one in part.T], axis=1)
             errors = [self._errors(s, w) for w, s in enumerate(self._simulator.simulate(values))]
-            costs.append(sum((e**2).sum(axis=1) for e in errors))  # type: ignore[arg-type]
+            costs.append(sum((e**2).sum(axis=1) for e in errors))
         found = np.concatenate(costs)
         return np.where(np.isfinite(found), found, np.inf)
 

@@ -31,6 +31,9 @@ RANK_TOLERANCE = 1e-9
 FALSE_ALARM = 1e-3
 """How often white noise counts as correlated."""
 
+ROUNDING = 1e-6
+"""Residuals below this, in units of their scale, are those of the arithmetic."""
+
 MOST_LAGS = 20
 """Of the autocorrelations that the test for white noise looks at."""
 
@@ -99,7 +102,7 @@ class Correlation(NamedTuple):
         count = sum(map(len, residuals))
         lags = range(1, 1 + min(MOST_LAGS, max(map(len, residuals)) - 1))
         power = sum(float(one @ one) for one in residuals)
-        if not (lags and power):
+        if not lags or power <= count * ROUNDING**2:
             return cls(0.0, True)
         found = [sum(float(one[lag:] @ one[:-lag]) for one in residuals) / power for lag in lags]
         statistic = (
@@ -164,6 +167,14 @@ class Estimate:
         """Standard errors by name; infinite for a value that the data do not determine."""
         errors = np.sqrt(np.diag(self.covariance)).tolist()
         return dict(zip(self.values, errors, strict=True))
+
+    @property
+    def correlation_matrix(self) -> FloatArray:
+        """Correlations of the values, in their order, shape (k, k); 0 for undetermined ones."""
+        errors = np.sqrt(np.diag(self.covariance))
+        known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
+        scaled = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
+        return np.asarray(scaled / np.outer(known, known))
 
     def factor(self, level: float) -> float:
         """Half the width of an interval in standard errors, by Student's t distribution.
