@@ -6,7 +6,6 @@ random, and white noise of the sensors. The 95 % interval of each parameter must
 """
 
 import argparse
-import os
 import sys
 from contextlib import closing
 from functools import partial
@@ -80,14 +79,13 @@ def main():
     for done, (true, log) in enumerate(houses(count), 1):
         fit = fitted(log, candidates=1)
         for name, (low, high) in fit.confidence_intervals().items():
-            covered[name] += low <= true[name] <= high
+            covered[name] += int(low <= true[name] <= high)
         noise += all(one.is_noise for one in fit.correlations.values())
         if done % 20 == 0 or done == count:
-            print(f"{done} logs: covered {covered}, noise {noise}", flush=True)
+            sys.stdout.write(f"{done} logs: covered {covered}, noise {noise}\n")
     is_right = all(LEAST <= found / count <= MOST for found in covered.values())
     return 0 if is_right and noise >= 0.97 * count else 1
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     sys.exit(main())

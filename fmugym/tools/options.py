@@ -96,7 +96,7 @@ EXAMPLES: Final = {
         "--output tuned.toml",
     ),
     "fit": (
-        "fmugym fit house.toml --log plant.csv --parameter UA --parameter H_ve=20..200 "
+        "fmugym fit task.toml --log plant.csv --parameter l=0.05..0.2 --parameter b --start q_0 "
         "--output fitted.toml",
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
