@@ -18,12 +18,20 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.fmu import FMU, StandsForFMU
-from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
-from fmugym.distributions import Normal
+from fmugym.checks import (
+    check_flag,
+    check_integer,
+    check_mapping,
+    check_number,
+    check_seed,
+    check_text,
+)
+from fmugym.distributions import Column
 from fmugym.errors import ConfigError
+from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Experiment, Limits, Problem
-from fmugym.identification.statistics import Correlation, Estimate, normal_distributions
+from fmugym.identification.statistics import Correlation
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray
 
@@ -37,13 +45,16 @@ MATTERS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult(Estimate):
+class FitResult:
     """The result of ``fit_parameters``; the values are in the form of ``model_parameters``.
 
     Attributes:
+        values: The values by name.
+        covariance: Covariance of the values, in their order, shape (k, k).
         information: The inverse of the covariance, which is 0 along directions of which the data
             tell nothing, shape (k, k).
         correlations: How the residuals depend on those before, by output.
+        degrees_of_freedom: Degrees of freedom of the confidence intervals.
         costs: What each start of the optimization has come to, half the sum of the squared
             residuals in units of their scales; the best is the first.
         bounds: Lower and upper bound of each value by name.
@@ -52,7 +63,10 @@ class FitResult(Estimate):
         message: Why the optimization ended.
     """
 
+    values: dict[str, float]
+    covariance: FloatArray
     information: FloatArray
+    degrees_of_freedom: int
     correlations: dict[str, Correlation]
     costs: tuple[float, ...]
     bounds: dict[str, tuple[float, float]]
@@ -62,15 +76,49 @@ class FitResult(Estimate):
     experiment: Experiment
     """The settings, which predictions need."""
 
-    def distributions(self) -> dict[str, Normal]:
-        """Return each value as a normal distribution, truncated at its bounds.
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name; infinite for a value that the data do not determine."""
+        errors = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.values, errors, strict=True))
 
-        The standard deviation is the standard error. Correlations between the values are lost.
+    @property
+    def correlation_matrix(self) -> FloatArray:
+        """Correlations of the values, in their order, shape (k, k); 0 for undetermined ones."""
+        errors = np.sqrt(np.diag(self.covariance))
+        known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
+        scaled = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
+        return np.asarray(scaled / np.outer(known, known))
+
+    def factor(self, level: float) -> float:
+        """Half the width of an interval in standard errors, by Student's t distribution.
+
+        Args:
+            level: Probability that an interval covers the true value, between 0 and 1.
 
         Raises:
-            ConfigError: If the data do not determine a value.
+            ConfigError: If the level is not between 0 and 1.
         """
-        return normal_distributions(self.values, self.standard_errors, self.bounds)
+        level = check_number("level", level, positive=True)
+        if level >= 1.0:
+            raise ConfigError(f"level must be less than 1, not {level:g}")
+        freedom = self.degrees_of_freedom
+        student = imported("scipy.stats", "identification").t
+        return float(student.ppf(0.5 + level / 2, freedom))
+
+    def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return lower and upper end by name; they may exceed the bounds.
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
+        factor, errors = self.factor(level), self.standard_errors
+        return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
+
+    def distributions(self, count: int = 1000, seed: int | None = 0) -> dict[str, Column]:
+        """Return the values as parameters of which each episode draws a row; see ``rows``."""
+        columns = zip(self.values, self.rows(count, seed).T.tolist(), strict=True)
+        return {name: Column(values, table="fit") for name, values in columns}
 
     def untold(self) -> list[dict[str, float]]:
         """Name what the data do not tell: combinations of parameters that are hardly determined.
@@ -90,7 +138,7 @@ class FitResult(Estimate):
             if amount < GUESS
         ]
 
-    def rows(self, count: int, seed: int = 0) -> FloatArray:
+    def rows(self, count: int, seed: int | None = 0) -> FloatArray:
         """Draw values that fit the data together, from the normal distribution within the bounds.
 
         What the data do not tell varies over the whole range.
@@ -103,8 +151,10 @@ class FitResult(Estimate):
             A row for each draw, in the order of ``values``, shape (count, k).
 
         Raises:
-            ConfigError: If the data do not determine a value that has no bounds.
+            ConfigError: If the data do not determine a value that has no bounds, or the count or
+                the seed is no such number.
         """
+        count, seed = check_integer("count", count, 1, 10**6), check_seed(seed)
         widths, center = self._widths(), np.array([*self.values.values()])
         bounded = np.isfinite(widths)
         for name, error, has_ends in zip(
