@@ -264,9 +264,16 @@ class TestFitted:
             fmugym.load(document)
 
     def test_no_such_file(self, document, tmp_path):
-        (tmp_path / "rows.npz").write_text("no zip")
-        with pytest.raises(ConfigError, match=r"fitted: .*no file that 'fmugym fit' has written"):
-            fmugym.load(document)
+        np.save(tmp_path / "rows.npy", np.ones((2, 1)))
+        array = (tmp_path / "rows.npy").read_bytes()
+        for write in (
+            lambda path: path.write_text("no zip"),
+            lambda path: np.savez(path, rows=np.ones((2, 1))),
+            lambda path: path.write_bytes(array),
+        ):
+            write(tmp_path / "rows.npz")
+            with pytest.raises(ConfigError, match="no file that 'fmugym fit' has written"):
+                fmugym.load(document)
         (tmp_path / "rows.npz").unlink()
         with pytest.raises(ConfigError, match=r"fitted: there is no file"):
             fmugym.load(document)

@@ -267,6 +267,17 @@ class TestOutputError:
         assert own == pytest.approx(right, rel=2e-5)
         assert abs(own - wrong) > 5 * abs(own - right)
 
+    def test_an_output_without_noise_makes_others_no_surer(self):
+        made = noisy(3, 2.0, -1.0)
+        exact = [
+            Trajectory(t.time, {**t.outputs, "tau_max": np.full(len(t), 0.15)}, t.inputs)
+            for t in made
+        ]
+        options = {"initial_states": START, "fixed": {"b": 4e-4, "c": 2e-3}}
+        plain = fit_parameters(PENDULUM, {"l": 0.12}, made, **options)
+        more = fit_parameters(PENDULUM, {"l": 0.12}, exact, **options)
+        assert more.standard_errors["l"] == pytest.approx(plain.standard_errors["l"], rel=0.01)
+
     def test_a_wash_in_is_not_counted(self):
         """The first half second of the log is of another pendulum."""
         (made,) = noisy(1, 2.0)

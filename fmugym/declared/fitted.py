@@ -32,10 +32,10 @@ def read_fitted(entry: Entry) -> dict[str, Column]:
         try:
             require_regular(path)
             with np.load(path, allow_pickle=False) as file:
-                names, rows = file["names"].tolist(), file["rows"]
+                names, rows = np.atleast_1d(file["names"]).tolist(), file["rows"]
         except FileNotFoundError:
             raise ConfigError(f"there is no file {shown(str(path))}") from None
-        except ordinary(OSError, ValueError, KeyError, EOFError, BadZipFile):
+        except ordinary(OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile):
             raise _not_fitted(path) from None
         is_table = rows.ndim == 2 and rows.dtype.kind == "f" and rows.shape[1] == len(names)
         if not (is_table and rows.size and np.isfinite(rows).all()):

@@ -23,6 +23,7 @@ from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.simulator import Simulator
 from fmugym.identification.statistics import (
+    ROUNDING,
     Correlation,
     information_inverse,
     information_of,
@@ -303,7 +304,10 @@ class Problem:
         inverse, undetermined = information_inverse(solution.jac)
         freedom = max(1, len(solution.fun) - len(self.start) - self._num_states)
         correlations = self._correlations(solution)
-        scores = solution.jac.T @ solution.jac * (solution.fun @ solution.fun) / freedom
+        noise = np.mean(self._series(solution.fun) ** 2, axis=0) * len(solution.fun) / freedom
+        deviations = np.sqrt(np.maximum(noise, ROUNDING**2))
+        weighed = solution.jac * np.tile(deviations, len(solution.fun) // len(noise))[:, np.newaxis]
+        scores = weighed.T @ weighed
         if not all(one.is_noise for one in correlations.values()):
             scores, freedom = self._correlated(solution, correlations)
         covariance = inverse @ scores @ inverse
