@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import values_tools
 from example_tools import run_example
 from fmu_tools import PlainEnv
 from scipy.integrate import solve_ivp
@@ -339,6 +340,12 @@ class TestOutputError:
             fit_parameters(
                 PENDULUM, **{"parameters": {"b": 1e-3}, "trajectories": noisy(0, 1.0), **arguments}
             )
+
+    def test_structural_parameters_are_refused(self, tmp_path):
+        path = values_tools.state_space_fmu(tmp_path / "S.fmu")
+        logged = Trajectory([0.0, 1.0, 2.0], {"y[1]": [0.0, 1.0, 0.0]})
+        with pytest.raises(fmugym.ConfigError, match="it is a structural parameter"):
+            fit_parameters(path, {"n": (1.0, 4.0)}, [logged])
 
     def test_what_the_fmu_refuses_is_told(self):
         fixed = {"v_c": -1.0}

@@ -59,7 +59,10 @@ LEAST_NOISE = 1e-6
 
 @dataclass(frozen=True)
 class Experiment:
-    """The common settings of a fit and its predictions; see ``fit_parameters``."""
+    """The common settings of a fit and its predictions; see ``fit_parameters``.
+
+    ``plant`` is how a task opens the FMU; None if there is no task.
+    """
 
     fmu: FMU
     initial_states: Mapping[str, str | float]
