@@ -29,8 +29,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
 from fmugym.identification.problem import Experiment, Problem
+from fmugym.identification.simulator import median_interval
 from fmugym.logs import Columns, PlantLog, declared_as
-from fmugym.pool.base import FloatArray
 from fmugym.pool.spec import is_start_time
 from fmugym.task.starting import start_variable
 
@@ -91,6 +91,7 @@ def fit_logs(
         trajectories = [one for log in logs for one in plant.trajectories(log)]
         if not trajectories:
             raise ConfigError("there is no log to fit to")
+        plant.require_steps(trajectories)
         wanted = dict(plant.wanted(name, ends) for name, ends in parameters.items())
         states = dict(plant.start(name, output) for name, output in (starts or {}).items())
         if wash_in is None:
@@ -154,20 +155,32 @@ class _Plant:
         if not measured:
             first = next((v.name for v in spec.outputs), "")
             raise unknown_name("column of the log", first, log.columns)
-        samplings = dict(zip((v.name for v in spec.outputs), spec.samplings, strict=False))
         for number, part in enumerate(log.parts()):
             if len(part.times) < 2:
                 raise ConfigError(
                     f"episode {number} of the log is shorter than a step: it has only one row"
                 )
-            sampled = [v for v in measured if samplings.get(v.name, "last") != "last"]
-            if sampled:
-                _require_steps(part.times, f"{samplings[sampled[0].name]} of {sampled[0].name}")
             yield Trajectory(
                 part.times,
                 {v.name: columns.values(v, part) for v in measured},
                 {v.name: columns.held(v, part) for v in spec.inputs},
             )
+
+    def require_steps(self, trajectories: Sequence[Trajectory]) -> None:
+        """Refuse rows that are no steps apart, if a measured value is that of a whole step."""
+        spec, step = self.env.inside.spec, median_interval(trajectories)
+        known = dict(zip((v.name for v in spec.outputs), spec.samplings, strict=False))
+        whole = [(n, known.get(n, "last")) for n in trajectories[0].outputs]
+        sampled = [f"{how} of {name}" for name, how in whole if how != "last"]
+        for one in trajectories if sampled else ():
+            steps = np.diff(one.time) / step
+            off = np.abs(steps - np.round(steps)) > _OFF
+            if off.any() or np.round(np.median(steps)) != 1:
+                raise ConfigError(
+                    f"the log at {one.time[np.argmax(off)]:g} s: the {sampled[0]} needs rows that "
+                    f"are {step:g} s apart, in all logs, or multiples of that where rows are left "
+                    "out"
+                )
 
     def wanted(
         self, name: str, ends: tuple[float, float] | None
@@ -204,15 +217,3 @@ class _Plant:
         if variable.causality == "input":
             raise ConfigError(f"{name!r} cannot be fitted: it is an input, which the log gives")
         return variable, unit
-
-
-def _require_steps(times: FloatArray, what: str) -> None:
-    """Refuse rows that are no whole steps apart."""
-    step = float(np.median(np.diff(times)))
-    steps = (times - times[0]) / step
-    off = np.abs(steps - np.round(steps)) > _OFF
-    if off.any():
-        raise ConfigError(
-            f"the log at {times[off][0]:g} s: the {what} needs rows that are {step:g} s apart, or "
-            "multiples of that"
-        )

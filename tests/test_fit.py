@@ -171,6 +171,11 @@ class TestPendulum:
         code, _, err = cli("fit", task, "--log", odd, *NAMES)
         assert code == 1
         assert "the mean of q needs rows that are 0.02 s apart" in err
+        fine = write_log(tmp_path / "fine.csv")
+        slow = write_log(tmp_path / "slow.csv", edit=lambda rows: rows[::3])
+        code, _, err = cli("fit", task, "--log", fine, "--log", slow, *NAMES)
+        assert code == 1
+        assert "the log at 0 s: the mean of q needs rows that are 0.02 s apart" in err
 
 
 class TestHouse:

@@ -20,7 +20,7 @@ from fmugym.task.opening import PoolOpening
 from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
-__all__ = ["Simulator"]
+__all__ = ["Simulator", "median_interval"]
 
 logger = logging.getLogger(__name__)
 

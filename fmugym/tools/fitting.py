@@ -153,7 +153,11 @@ def _facts(fit: FitResult) -> dict[str, Any]:
     errors, intervals = fit.standard_errors, fit.confidence_intervals()
     return {
         "parameters": {
-            name: {"value": value, "standard_error": errors[name], "interval": intervals[name]}
+            name: {
+                "value": value,
+                "standard_error": _number(errors[name]),
+                "interval": [*map(_number, intervals[name])],
+            }
             for name, value in fit.values.items()
         },
         "correlations": fit.correlation_matrix.tolist(),
@@ -171,6 +175,11 @@ def _facts(fit: FitResult) -> dict[str, Any]:
         "costs": fit.costs,
         "converged": fit.converged,
     }
+
+
+def _number(value: float) -> float | None:
+    """What JSON has instead of an infinite number is null."""
+    return value if math.isfinite(value) else None
 
 
 def _table(fit: FitResult) -> list[str]:
