@@ -30,6 +30,7 @@ from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
     "Choice",
+    "Column",
     "Distribution",
     "LogUniform",
     "Normal",
@@ -37,9 +38,11 @@ __all__ = [
     "Uniform",
     "as_distribution",
     "draw",
+    "draw_all",
     "is_distribution",
     "recipe_of",
     "support_of",
+    "together",
     "truncated",
 ]
 
@@ -217,6 +220,19 @@ class Choice(KnownArguments):
 
 
 @dataclass(frozen=True)
+class Column(Choice):
+    """A column of a table of which each episode draws one row, for all of the table's columns.
+
+    By itself it is a ``Choice``.
+
+    Attributes:
+        table: Tells which columns belong together.
+    """
+
+    table: str = ""
+
+
+@dataclass(frozen=True)
 class Truncated:
     """A distribution of any kind, redrawn until the value lies in ``[low, high]``.
 
@@ -265,7 +281,7 @@ _KINDS: Final[Mapping[str, type[Any]]] = {
     "normal": Normal,
     "choice": Choice,
 }
-_OURS: Final = tuple(_KINDS.values())
+_OURS: Final[tuple[type[Any], ...]] = (*_KINDS.values(), Column)
 _LARGEST: Final = float(np.finfo(np.float64).max)
 _LEAST_SHARE: Final = 0.01
 """Of the draws that must lie within limits, so that there are few redraws."""
@@ -362,6 +378,46 @@ def draw(value: Any, rng: np.random.Generator) -> Any:
     if isinstance(drawn, str):
         return drawn
     return check_number(f"what {shown(value)} draws", drawn, may_be_boolean=True)
+
+
+def draw_all(distributions: Iterable[Any], rng: np.random.Generator) -> list[Any]:
+    """Draw from distributions in turn; the first column of a table draws the row of the others.
+
+    Raises:
+        ConfigError: As ``draw``.
+    """
+    places: dict[str, int] = {}
+    values = []
+    for one in distributions:
+        if type(one) is not Column:
+            values.append(draw(one, rng))
+            continue
+        if one.table not in places:
+            places[one.table] = int(rng.choice(len(one.values)))
+        values.append(one.values[places[one.table]])
+    return values
+
+
+def together(distributions: Sequence[Any], recipes: Sequence[Recipe]) -> list[Recipe] | None:
+    """Let recipes draw as ``draw_all`` does.
+
+    Args:
+        distributions: What is drawn from.
+        recipes: Of each by itself.
+
+    Returns:
+        The recipes; None if columns of a table do not stand side by side.
+    """
+    found, tables, before = list(recipes), set[str](), ""
+    for place, one in enumerate(distributions):
+        table = one.table if type(one) is Column else ""
+        if table and table == before:
+            found[place] = found[place]._replace(kind="same_row")
+        elif table in tables:
+            return None
+        tables |= {table} - {""}
+        before = table
+    return found
 
 
 def recipe_of(distribution: Any, convert: Callable[[Any], float]) -> Recipe | None:

@@ -39,7 +39,7 @@ from fmugym.series.store import TEXT
 from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
-__all__ = ["PlantLog", "play_log"]
+__all__ = ["Columns", "PlantLog", "declared_as", "play_log"]
 
 _HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*$")
 _INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
@@ -257,7 +257,9 @@ class _Player:
         if inner.inside.warm_up_steps:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
-        self._columns = _Columns(inner, log, columns)
+        self._columns = Columns(inner, log, columns)
+        for variable in inner.inside.spec.outputs:
+            self._columns.require(variable)
         self._actions = _Actions(inner, self._columns, tolerance)
 
     def play(self, seed: int) -> list[Recording]:
@@ -283,36 +285,71 @@ class _Player:
         return recording
 
 
-class _Columns:
+def declared_as(env: FMUEnv, alias: str) -> tuple[str, str | None]:
+    """The name in the FMU of a variable of a task, and the unit that the task declares for it."""
+    declared = _section(env, "variables").get(alias, {})
+    return declared.get("name", alias), declared.get("unit")
+
+
+def _section(env: FMUEnv, key: str) -> Mapping[str, Any]:
+    """A section of the task file of an environment; empty if there is none."""
+    task = getattr(env, "task", None)
+    section: Mapping[str, Any] = task.document.get(key, {}) if isinstance(task, Task) else {}
+    return section
+
+
+class Columns:
     """The columns of a log as variables of an FMU, in the units of the FMU."""
 
     def __init__(self, env: FMUEnv, log: PlantLog, columns: Mapping[str, str]) -> None:
-        self._columns = log.columns
+        self._columns, self._data = log.columns, _section(env, "data")
         self._variables = env.fmu.description.variables
         self._from: dict[str, tuple[str, float, float]] = {}
-        task = getattr(env, "task", None)
-        document = task.document if isinstance(task, Task) else {}
         for column in log.columns:
-            alias, unit = columns.get(column, column), log.units.get(column)
-            declared = document.get("variables", {}).get(alias, {})
-            name = declared.get("name", alias)
+            name, unit = declared_as(env, columns.get(column, column))
             if name in self._variables:
-                own = self._variables[name].unit
-                units = env.fmu.description.units
-                to_log = conversion_between(own, unit or declared.get("unit"), units)
+                own, units = self._variables[name].unit, env.fmu.description.units
+                try:
+                    to_log = conversion_between(own, log.units.get(column) or unit, units)
+                except ConfigError as error:
+                    raise ConfigError(f"column {column!r} of the log: {error}") from None
                 self._from[name] = column, 1.0 / to_log.factor, -to_log.offset / to_log.factor
-        for variable in env.inside.spec.outputs:
-            self.require(variable)
+
+    def has(self, variable: Variable) -> bool:
+        """Whether the log has a column for this variable."""
+        return variable.name in self._from
 
     def require(self, variable: Variable) -> None:
         """Refuse a log without a column for this variable."""
-        if variable.name not in self._from:
+        if not self.has(variable):
             raise unknown_name("column of the log", variable.name, self._columns)
+
+    def values(self, variable: Variable, part: PlantLog) -> FloatArray:
+        """The values of a variable in the rows of an episode, which must be finite."""
+        column, factor, offset = self._from[variable.name]
+        values = part.columns[column] * factor + offset
+        wrong = ~np.isfinite(values)
+        if wrong.any():
+            raise ConfigError(
+                f"the log at {part.times[wrong][0]:g} s: expected a number in column {column!r}, "
+                f"got {part.columns[column][wrong][0]}; leave such rows out"
+            )
+        return values
 
     def range_of(self, variable: Variable) -> float:
         """How far apart the values of a variable are; 1 if they are all the same."""
         column, factor, _ = self._from[variable.name]
         return float(np.ptp(self._columns[column]) * abs(factor)) or 1.0
+
+    def held(self, variable: Variable, part: PlantLog) -> FloatArray:
+        """The values of an input that hold from each row on, as ``values``.
+
+        Data of the task have those of the row's time in any log.
+        """
+        values, column = self.values(variable, part), self._from[variable.name][0]
+        if not part.inputs_before or column in self._data:
+            return values
+        return np.append(values[1:], values[-1])
 
     def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
         """The communication points of an episode, and the values of the variables there."""
@@ -340,7 +377,7 @@ class _Columns:
 class _Actions:
     """Finds the action that makes an environment write given inputs."""
 
-    def __init__(self, env: FMUEnv, columns: _Columns, tolerance: float) -> None:
+    def __init__(self, env: FMUEnv, columns: Columns, tolerance: float) -> None:
         self._env, self._tolerance = env, tolerance
         self._space: Any = env.action_space
         self._candidates = _candidates(self._space)

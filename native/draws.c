@@ -15,6 +15,7 @@ static bool has_enough_numbers(const Draw *draw) {
 
     switch (draw->kind) {
     case KIND_CHOICE:
+    case KIND_SAME_ROW:
         return draw->count >= fewest && draw->count < UINT32_MAX;
     case KIND_WEIGHTED:
         return draw->count >= fewest && draw->count % 2 == 0;
@@ -36,9 +37,19 @@ static bool is_sound(const Draws *draws, const Draw *draw, int64_t end) {
            (draw->kind != KIND_NORMAL || is_normal(draws, draws->numbers + draw->first));
 }
 
+/* Only a choice of as many values, or what follows one, tells the place of a value. */
+static bool has_place(const Draws *draws, size_t i) {
+    const Draw *draw = &draws->draws[i];
+
+    return draw->kind != KIND_SAME_ROW ||
+           (i > 0 && draw[-1].count == draw->count &&
+            (draw[-1].kind == KIND_CHOICE || draw[-1].kind == KIND_SAME_ROW));
+}
+
 bool draws_are_sound(const Draws *draws, size_t number_of_numbers) {
     for (size_t i = 0; i < draws->count; i++) {
-        if (!is_sound(draws, &draws->draws[i], (int64_t)number_of_numbers)) {
+        if (!is_sound(draws, &draws->draws[i], (int64_t)number_of_numbers) ||
+            !has_place(draws, i)) {
             return false;
         }
     }
@@ -116,7 +127,8 @@ static double weighted(Stream *stream, const double *cumulated, size_t count) {
     return cumulated[count + low];
 }
 
-static double take(const Draws *draws, const Draw *draw, Stream *stream) {
+/* The place of a choice stays for the draws that take the same row. */
+static double take(const Draws *draws, const Draw *draw, Stream *stream, size_t *place) {
     const double *numbers = draws->numbers + draw->first;
 
     switch (draw->kind) {
@@ -127,14 +139,19 @@ static double take(const Draws *draws, const Draw *draw, Stream *stream) {
     case KIND_NORMAL:
         return normal(draws, stream, numbers);
     case KIND_CHOICE:
-        return numbers[bounded(stream, (uint32_t)draw->count)];
+        *place = bounded(stream, (uint32_t)draw->count);
+        return numbers[*place];
+    case KIND_SAME_ROW:
+        return numbers[*place];
     default:
         return weighted(stream, numbers, (size_t)draw->count / 2);
     }
 }
 
 void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride) {
+    size_t place = 0;
+
     for (size_t i = 0; i < draws->count; i++) {
-        values[i * stride] = take(draws, &draws->draws[i], stream);
+        values[i * stride] = take(draws, &draws->draws[i], stream, &place);
     }
 }

@@ -14,6 +14,8 @@
     X(LOG_UNIFORM, "log_uniform", 2) /* the same of the logarithm */                               \
     X(NORMAL, "normal", 4)           /* mean, standard deviation, limits */                        \
     X(CHOICE, "choice", 1)           /* the values, at least one */                                \
+    X(SAME_ROW, "same_row", 1)       /* as many values, of which that at the place of the choice   \
+                                        or same_row before is taken */                             \
     X(WEIGHTED, "weighted", 2)       /* as many cumulated probabilities, then the values */
 
 #define ENUMERATE(kind, name, numbers) KIND_##kind,

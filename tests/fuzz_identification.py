@@ -15,7 +15,7 @@ from fuzz_driver import Case, main
 from odd_values import odd, spoil
 
 from fmugym import bundled_fmu
-from fmugym.identification import Trajectory, fit_parameters, fit_swing, plot_comparison
+from fmugym.identification import Trajectory, fit_parameters, plot_comparison
 
 TIME = np.arange(0.0, 0.4, 0.02)
 SWING = {"q": np.cos(9.9 * TIME), "q_dot": -9.9 * np.sin(9.9 * TIME)}
@@ -28,7 +28,8 @@ FIT = {
     "fixed": {"g": 9.81},
     "scales": {"q": 1.0},
     "time_step": 0.02,
-    "clustered": False,
+    "wash_in": 0.1,
+    "candidates": 1,
     "drop_repeats": True,
     "max_evaluations": 2,
     "backend": "auto",
@@ -39,11 +40,6 @@ INSIDE = ("parameters", "initial_states", "fixed", "scales")
 @functools.cache
 def fitted():
     return fit_parameters(**FIT)
-
-
-@functools.cache
-def swung():
-    return fit_swing(0.02, **SWING)
 
 
 def fit(rng):
@@ -64,21 +60,15 @@ def trajectory(rng):
     return lambda: Trajectory(**spoiled)
 
 
-def swing(rng):
-    arguments = {"time": 0.02, **SWING, "coulomb": True, "v_c": 0.05, "g": 9.81}
-    spoiled = spoil(rng, arguments | {"correlation_time": 0.1})
-    return lambda: fit_swing(**spoiled)
-
-
 def method(rng):
     """Call a method of a result or of a trajectory with one odd argument."""
     made, value = FIT["trajectories"][0], odd(rng)
     calls = (
         *(made.select, made.windows, lambda x: made.between(x, 1.0), fitted().confidence_intervals),
-        *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, swung().distributions),
+        *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, fitted().rows),
         *(lambda x: fitted().predict([made], lead_in=x), fitted().comparison.residuals),
-        *(lambda x: fitted().predict([made], refit_initial_states=x), swung().parameters),
-        *(swung().confidence_intervals, lambda x: fitted().comparison.rms_interval("q", x)),
+        *(lambda x: fitted().predict([made], refit_initial_states=x), fitted().distributions),
+        *(lambda x: fitted().comparison.rms_interval("q", x),),
         *(lambda x: fitted().comparison.rms_interval("q", seed=x), plot_comparison),
         *(lambda x: plot_comparison(fitted().comparison, x),),
         *(lambda x: plot_comparison(fitted().comparison, labels=x),),
@@ -87,7 +77,7 @@ def method(rng):
     return lambda: call(value)
 
 
-KINDS = (fit, trajectory, swing, method, method)
+KINDS = (fit, trajectory, method, method)
 
 
 @contextlib.contextmanager

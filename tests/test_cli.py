@@ -493,7 +493,7 @@ class TestCommand:
         logger = logging.getLogger("fmugym")
         before = logger.handlers[:], logger.level
         for name, parser in _parser()[1].items():
-            given = ["a", "b", "--output", "c", "--task", "d", option]
+            given = ["a", "b", "--output", "c", "--task", "d", "--log", "e", option]
             arguments, _ = parser.parse_known_args(given)
             with speaking(arguments):
                 for text, level in enumerate((logging.INFO, logging.WARNING, logging.ERROR)):

@@ -15,7 +15,7 @@ from fmugym.tools.cli import main
 
 ROOT = Path(__file__).parent.parent
 PAGE = (ROOT / "docs" / "command-line.md").read_text()
-PAGES = ("command-line.md", "training.md", "baselines.md", "foreign-fmus.md")
+PAGES = ("command-line.md", "training.md", "baselines.md", "foreign-fmus.md", "fit.md")
 BLOCKS = [
     block
     for page in PAGES

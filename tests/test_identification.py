@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import values_tools
 from example_tools import run_example
 from fmu_tools import PlainEnv
 from scipy.integrate import solve_ivp
 
 import fmugym
-from fmugym.identification import Trajectory, fit_parameters, fit_swing, plot_comparison
+from fmugym.identification import Trajectory, fit_parameters, plot_comparison
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
 DOUBLE_PENDULUM = fmugym.bundled_fmu("DoublePendulum")
@@ -67,79 +68,6 @@ def fitted(**options):
 @pytest.fixture(scope="module", name="fit")
 def fixture_fit():
     return fitted()
-
-
-class TestSwing:
-    def test_without_coulomb_friction_both_parameters_are_found(self):
-        fit = fit_swing(0.002, *np.array([swing(q_0)[1:] for q_0 in (2.5, -1.0)]).swapaxes(0, 1))
-        inertia = TRUE["m"] * TRUE["l"] ** 2
-        assert fit.values["p1"] == pytest.approx(TRUE["b"] / inertia, rel=1e-3)
-        assert fit.values["p2"] == pytest.approx(9.81 / TRUE["l"], rel=1e-3)
-        assert fit.parameters(0.06) == pytest.approx({"m": 0.06, "l": 0.1, "b": 4e-4}, rel=2e-3)
-
-    def test_coulomb_friction_goes_into_p1_and_out_again_with_its_own_column(self):
-        time, q, q_dot = zip(*(swing(q_0, c=2e-3) for q_0 in (2.5, -1.0, 1.7)), strict=True)
-        plain = fit_swing(list(time), list(q), list(q_dot))
-        cured = fit_swing(list(time), list(q), list(q_dot), coulomb=True)
-        true = TRUE["b"] / (TRUE["m"] * TRUE["l"] ** 2)
-        assert plain.values["p1"] > 1.4 * true
-        assert cured.values["p1"] == pytest.approx(true, rel=0.01)
-        assert cured.parameters(0.06)["c"] == pytest.approx(2e-3, rel=0.01)
-        assert plain.l == pytest.approx(0.1, rel=0.01)
-        assert cured.rms < 0.2 * plain.rms
-
-    def test_central_differences_shorten_p2_by_what_is_documented(self):
-        length = fit_swing(0.02, *swing(0.1, step=0.02)[1:]).l
-        assert length / 0.1 - 1 == pytest.approx(98.1 * 0.02**2 / 6, rel=0.05)
-
-    def test_intervals_cover_the_true_values(self):
-        """In about 19 of 20 cases; the errors of Newey and West are rather too large."""
-        true = {"p1": TRUE["b"] / 6e-4, "p2": 98.1, "p3": 2e-3 / 6e-4, "l": 0.1}
-        clean = [swing(q_0, 2e-3, 3.0) for q_0 in (2.2, -1.2, 1.0)]
-        covered, widths = [], []
-        for seed in range(30):
-            rng = np.random.default_rng(seed)
-            velocities = [v + rng.normal(0, 0.04, len(v)) for _, _, v in clean]
-            angles = [q for _, q, _ in clean]
-            fit = fit_swing(clean[0][0], angles, velocities, coulomb=True)
-            intervals = fit.confidence_intervals()
-            covered += [low <= true[n] <= high for n, (low, high) in intervals.items()]
-            widths.append(intervals["l"][1] - intervals["l"][0])
-        assert np.mean(covered) >= 0.9
-        assert np.mean(widths) < 0.004
-
-    def test_stale_samples_are_left_out(self):
-        _, q, q_dot = swing(2.0, step=0.004)
-        twice = fit_swing(0.002, np.repeat(q, 2), np.repeat(q_dot, 2))
-        assert twice.values == pytest.approx(fit_swing(0.004, q, q_dot).values, rel=1e-9)
-
-    def test_distributions_are_those_of_redrawn_noise(self):
-        clean = [swing(q_0, 2e-3, 3.0, 0.01) for q_0 in (2.2, -1.2, 1.0)]
-        angles, found = [q for _, q, _ in clean], []
-        for seed in range(40):
-            rng = np.random.default_rng(seed)
-            velocities = [v + rng.normal(0, 0.04, len(v)) for _, _, v in clean]
-            fit = fit_swing(0.01, angles, velocities, coulomb=True)
-            found.append(list(fit.parameters(0.06).values()))
-        given = fit.distributions(0.06)
-        assert given["m"] == 0.06
-        for name, spread in zip(["l", "b", "c"], np.std(found, axis=0)[1:], strict=True):
-            assert 0.8 < given[name].std / spread < 4, name
-            assert given[name].mean == pytest.approx(fit.parameters(0.06)[name])
-
-    @pytest.mark.parametrize(
-        ("arguments", "match"),
-        [
-            ((0.01, np.zeros(50), np.zeros(50)), "is there motion"),
-            ((0.01, np.zeros(50), np.zeros(49)), r"shape \(50,\)"),
-            ((0.01, [0.0, 1.0], [1.0, 0.0]), "three samples"),
-            ((0.01, np.arange(5.0), np.full(5, np.nan)), "finite"),
-            ((np.array([0.0, 2.0, 1.0, 3.0]), np.arange(4.0), np.arange(4.0)), "increase"),
-        ],
-    )
-    def test_mistakes(self, arguments, match):
-        with pytest.raises(fmugym.ConfigError, match=match):
-            fit_swing(*arguments)
 
 
 class TestOutputError:
@@ -237,13 +165,34 @@ class TestOutputError:
         assert np.isfinite(fit.standard_errors["l"])
         with pytest.raises(fmugym.ConfigError, match="'m' has no distribution"):
             fit.distributions()
+        with pytest.raises(fmugym.ConfigError, match="'m' has no distribution: give it bounds"):
+            fit.rows(10)
+
+    def test_what_the_data_tell_only_together_is_drawn_together(self):
+        """Without friction a swing under gravity tells g / l, and neither of both."""
+        time, q, _ = swing(2.0)
+        q = q + np.random.default_rng(0).normal(0, 0.01, len(q))
+        fit = fit_parameters(
+            PENDULUM,
+            {"l": (0.12, 0.05, 0.2), "g": (9.0, 5.0, 20.0)},
+            [Trajectory(time, {"q": q})],
+            fixed={"b": 0.0, "c": 0.0, "q_0": 2.0},
+        )
+        (direction,) = fit.untold()
+        assert set(direction) == {"l", "g"}
+        assert direction["l"] * direction["g"] > 0
+        length, gravity = fit.rows(500, seed=1).T
+        assert np.std(gravity / length) / 98.1 < 0.02
+        assert np.std(gravity) > 1.5
+        assert (length.min() >= 0.05) & (length.max() <= 0.2)
+        assert np.array_equal(fit.rows(500, seed=1)[:, 0], length)
 
     def test_bounds_hold_and_truncate_the_distribution(self):
         options = {"initial_states": START, "fixed": {"c": 2e-3}}
         fit = fit_parameters(PENDULUM, {"l": (0.11, 0.2)}, noisy(1, 2.0), **options)
         assert fit.values["l"] == pytest.approx(0.11)
-        found = fit.distributions()["l"]
-        assert (found.low, found.high) == (0.11, 0.2)
+        found = fit.distributions(50)["l"].values
+        assert 0.11 <= min(found) < max(found) <= 0.2
 
     def test_the_result_goes_into_an_environment(self, fit):
         config = {"model_input_names": "tau", "model_output_names": "q", "time_step": 0.02}
@@ -270,17 +219,96 @@ class TestOutputError:
         low, high = led.rms_interval("q")
         assert low < led.rms("q") < high
 
-    def test_clustered_errors_are_larger_where_the_model_is_wrong(self):
+    def test_a_wrong_model_says_so_by_its_residuals(self):
         """The friction is Coulomb's, the model only knows the viscous one."""
-        windows = [w for t in noisy(4, 2.5, -2.0, end=3.0) for w in t.windows(0.5)]
         options = {"initial_states": START, "scales": {"q": 0.01, "q_dot": 0.1}}
-        plain, clustered = (
-            fit_parameters(PENDULUM, {"b": 1e-3}, windows, clustered=clustered, **options)
-            for clustered in (False, True)
+        swings = noisy(4, 2.5, -2.0, end=3.0)
+        wrong = fit_parameters(PENDULUM, {"l": 0.11, "b": 1e-3}, swings, **options)
+        right = fit_parameters(
+            PENDULUM, {"l": 0.11, "b": 1e-3, "c": (1e-3, 0.0, 0.01)}, swings, **options
         )
-        assert plain.values == clustered.values
-        assert clustered.standard_errors["b"] > 1.5 * plain.standard_errors["b"]
-        assert clustered.degrees_of_freedom == len(windows) - 1
+        assert wrong.correlations["q"].first > 0.8
+        assert not wrong.correlations["q"].is_noise
+        assert all(one.is_noise and abs(one.first) < 0.1 for one in right.correlations.values())
+        assert wrong.standard_errors["l"] > 3 * right.standard_errors["l"]
+        assert wrong.degrees_of_freedom < 0.1 * right.degrees_of_freedom
+
+    def test_errors_stay_honest_where_noise_is_correlated(self):
+        """Of 60 intervals of 95 %, independent residuals would let about half cover."""
+        count = 0
+        for seed in range(30):
+            (made,) = noisy(seed, 2.0, end=4.0, step=0.01)
+            rng, drift = np.random.default_rng(seed), np.zeros(len(made))
+            for k in range(1, len(drift)):
+                drift[k] = 0.95 * drift[k - 1] + rng.normal(0, 0.01)
+            logged = Trajectory(made.time, {"q": made.outputs["q"] + drift})
+            fit = fit_parameters(
+                PENDULUM,
+                {"l": 0.12, "b": 1e-3},
+                [logged],
+                fixed={"c": 2e-3, "q_0": 2.0},
+            )
+            assert not fit.correlations["q"].is_noise
+            intervals = fit.confidence_intervals(0.95)
+            count += sum(low <= TRUE[name] <= high for name, (low, high) in intervals.items())
+        assert count >= 52
+
+    def test_outputs_are_weighted_by_their_noise(self):
+        """With the angle as noisy as the velocity, which has ten times its range."""
+        made = noisy(3, 2.0, -1.0, 2.5)
+        fits = [
+            fit_parameters(PENDULUM, {"l": 0.12}, made, fixed={"b": 4e-4, "c": 2e-3}, **options)
+            for options in (
+                {"initial_states": START},
+                {"initial_states": START, "scales": {"q": 0.01, "q_dot": 0.1}},
+                {"initial_states": START, "scales": {"q": 1.0, "q_dot": 0.01}},
+            )
+        ]
+        own, right, wrong = (fit.values["l"] for fit in fits)
+        assert own == pytest.approx(right, rel=2e-5)
+        assert abs(own - wrong) > 5 * abs(own - right)
+
+    def test_an_output_without_noise_makes_others_no_surer(self):
+        made = noisy(3, 2.0, -1.0)
+        exact = [
+            Trajectory(t.time, {**t.outputs, "tau_max": np.full(len(t), 0.15)}, t.inputs)
+            for t in made
+        ]
+        options = {"initial_states": START, "fixed": {"b": 4e-4, "c": 2e-3}}
+        plain = fit_parameters(PENDULUM, {"l": 0.12}, made, **options)
+        more = fit_parameters(PENDULUM, {"l": 0.12}, exact, **options)
+        assert more.standard_errors["l"] == pytest.approx(plain.standard_errors["l"], rel=0.01)
+
+    def test_a_wash_in_is_not_counted(self):
+        """The first half second of the log is of another pendulum."""
+        (made,) = noisy(1, 2.0)
+        odd = made.time < 0.5
+        logged = Trajectory(made.time, {"q": made.outputs["q"] + np.where(odd, 0.5, 0.0)})
+        options = {"fixed": {"b": 4e-4, "c": 2e-3, "q_0": 2.0}}
+        early, late = (
+            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=wash_in, **options)
+            for wash_in in (None, 0.5)
+        )
+        assert late.values["l"] == pytest.approx(0.1, rel=1e-3)
+        assert abs(early.values["l"] - 0.1) > 20 * abs(late.values["l"] - 0.1)
+        with pytest.raises(fmugym.ConfigError, match="no samples after a wash-in of 9 s"):
+            fit_parameters(PENDULUM, {"l": 0.12}, [logged], wash_in=9, **options)
+
+    def test_candidates_find_what_one_start_misses(self):
+        """A length that is wrong by a half puts the swings out of phase."""
+        made = noisy(1, 2.0, end=5.0, step=0.01)
+        options = {"fixed": {"b": 4e-4, "c": 2e-3, "q_0": 2.0}}
+        one, many = (
+            fit_parameters(
+                PENDULUM, {"l": (0.05, 0.02, 0.5)}, made, candidates=candidates, **options
+            )
+            for candidates in (1, 40)
+        )
+        assert abs(one.values["l"] - 0.1) > 0.02
+        assert many.values["l"] == pytest.approx(0.1, rel=1e-3)
+        assert len(many.costs) == 3
+        with pytest.raises(fmugym.ConfigError, match="'l' needs a lowest and a highest value"):
+            fit_parameters(PENDULUM, {"l": 0.12}, made, candidates=5, **options)
 
     def test_plot(self, fit, tmp_path):
         figure = plot_comparison(fit.comparison, ["q"], {"q": "angle [rad]"})
@@ -295,7 +323,8 @@ class TestOutputError:
         [
             ({"parameters": {}}, "no parameter"),
             ({"parameters": {"bb": 1.0}}, "unknown variable of Pendulum 'bb'"),
-            ({"parameters": {"q": 1.0}}, "'q' is not a numeric parameter"),
+            ({"parameters": {"q": 1.0}}, "'q' cannot be set: it is a continuous output"),
+            ({"parameters": {"solver": 1.0}}, "'solver' is of type Enumeration: only Reals"),
             ({"parameters": {"b": (1.0, 0.5, 2.0, 3.0)}}, "low <= start <= high"),
             ({"parameters": {"b": -1.0}}, "low <= start <= high"),
             ({"fixed": {"b": 1e-4}}, "both fixed and to be fitted"),
@@ -303,7 +332,6 @@ class TestOutputError:
             ({"scales": {"p": 1.0}}, "unknown measured output 'p'"),
             ({"initial_states": {"q_0": "p"}}, "unknown measured output 'p'"),
             ({"trajectories": []}, "at least one trajectory"),
-            ({"clustered": True}, "more trajectories than parameters"),
             ({"time_step": 0.0}, "time_step"),
         ],
     )
@@ -312,6 +340,12 @@ class TestOutputError:
             fit_parameters(
                 PENDULUM, **{"parameters": {"b": 1e-3}, "trajectories": noisy(0, 1.0), **arguments}
             )
+
+    def test_structural_parameters_are_refused(self, tmp_path):
+        path = values_tools.state_space_fmu(tmp_path / "S.fmu")
+        logged = Trajectory([0.0, 1.0, 2.0], {"y[1]": [0.0, 1.0, 0.0]})
+        with pytest.raises(fmugym.ConfigError, match="it is a structural parameter"):
+            fit_parameters(path, {"n": (1.0, 4.0)}, [logged])
 
     def test_what_the_fmu_refuses_is_told(self):
         fixed = {"v_c": -1.0}
@@ -409,7 +443,6 @@ class TestMeasured:
             fixed={"q_dot_max": 1e3, "P4": PUBLISHED_P4},  # a free fall tells ratios only
             scales={"q1": 0.01, "q2": 0.02, "q1_dot": 1.0, "q2_dot": 2.0},
             time_step=0.002,
-            clustered=True,
         )
         held = free_fall(2).between(0, 3).windows(0.2)
         for options in ({}, {"lead_in": 0.04}):
@@ -427,5 +460,5 @@ def free_fall(index):
 
 def test_example(tmp_path):
     printed = run_example("identify_pendulum.py", folder=tmp_path)
-    assert "least squares, with Coulomb friction" in printed
+    assert "with Coulomb friction: autocorrelation" in printed
     assert [path.name for path in tmp_path.iterdir()] == ["identified_pendulum.png"]

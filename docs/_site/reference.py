@@ -40,6 +40,7 @@ MODULES: Final = {
     "PettingZoo": "fmugym.pettingzoo",
     "RLlib": "fmugym.rllib",
     "Plant logs": "fmugym.logs",
+    "Fits to plant logs": "fmugym.fit",
     "Minari": "fmugym.minari",
     "Export": "fmugym.export",
     "Checks of an environment": "fmugym.testing",

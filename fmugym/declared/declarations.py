@@ -13,6 +13,7 @@ import numpy as np
 from fmugym.archive.description import ModelDescription
 from fmugym.declared.entries import Entry, gathered
 from fmugym.declared.expressions import CONSTANTS, Expression
+from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
 from fmugym.declared.kpis import Kpi, read_kpi
 from fmugym.declared.mathematics import FUNCTIONS
@@ -27,7 +28,7 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import Series, read_data
 from fmugym.declared.setpoints import Deviation, SetPoints, Steps
-from fmugym.declared.variables import Record, Records, start_value
+from fmugym.declared.variables import Record, Records, fitted_value, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
@@ -102,7 +103,7 @@ class Declarations:
         declared.derived = _read(root, "expressions", read_derived)
         declared.series = _read(root, "data", read_data)
         declared._read_setpoints()
-        declared.parameters = _read(root, "parameters", declared._parameter)
+        declared.parameters = declared._with_fitted(_read(root, "parameters", declared._parameter))
         declared.actions = declared._read_actions()
         declared.inputs = dict(declared._read_inputs())
         observed = declared._listed("observations")
@@ -278,6 +279,20 @@ class Declarations:
             if texts.count(text) > 1:
                 raise entry.error(f"{text!r} is named twice")
         return names
+
+    def _with_fitted(
+        self, parameters: dict[str, tuple[Record, Any]]
+    ) -> dict[str, tuple[Record, Any]]:
+        """Parameters, and after them what a fit has found, which takes their place."""
+        entry = self.root.child("fitted")
+        if entry.value is None:
+            return parameters
+        aliases = {record.fmu_name: alias for alias, (record, _) in parameters.items()}
+        fitted: dict[str, tuple[Record, Any]] = {}
+        for name, column in read_fitted(entry).items():
+            record = self.records.find(entry, aliases.get(name, name), "variable")
+            fitted[record.alias] = record, fitted_value(record, entry, column)
+        return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
     def _parameter(self, entry: Entry) -> tuple[Record, Any]:
         record = self.records.find(entry, entry.name, "variable")

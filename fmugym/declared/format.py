@@ -663,6 +663,11 @@ TASK: Final = Table(
             "Start values and parameters: numbers, [distributions](config.md#distributions), items "
             "of an Enumeration, texts.",
         ),
+        "fitted": Key(
+            PATH,
+            "[What a fit to logs has found](fit.md): a file of `fmugym fit`, of which each episode "
+            "draws a row. Its parameters take the place of those in `parameters`.",
+        ),
         "data": Key(
             Entries(DATA),
             "[Columns](task-file.md#data-and-set-points) of CSV and Parquet files, of "

@@ -296,10 +296,7 @@ def start_value(record: Record, entry: Entry) -> Any:
     Raises:
         ConfigError: If the variable cannot be set, or the value does not fit it.
     """
-    name, variable = record.fmu_name, record.variable
-    if variable is None or not variable.settable_at_start:
-        what = "" if variable is None else f": it is a {variable.variability} {variable.causality}"
-        raise entry.error(f"{name!r} cannot be set at the start of an episode{what}")
+    variable = _settable(record, entry)
     if variable.shape:
         return _array_start(variable, entry, record.own_range)
     value, is_text = entry.value, bool(variable.items) or variable.kind == "string"
@@ -310,6 +307,25 @@ def start_value(record: Record, entry: Entry) -> Any:
         if variable.kind == "string":
             return value
         return within(variable, checked(variable, value), record.own_range)
+
+
+def fitted_value(record: Record, entry: Entry, value: Any) -> Any:
+    """A distribution of a parameter that is in the unit of the FMU already.
+
+    Raises:
+        ConfigError: As ``start_value``.
+    """
+    variable = _settable(record, entry)
+    with entry.placing():
+        return within(variable, checked(variable, value), record.own_range)
+
+
+def _settable(record: Record, entry: Entry) -> Variable:
+    name, variable = record.fmu_name, record.variable
+    if variable is None or not variable.settable_at_start:
+        what = "" if variable is None else f": it is a {variable.variability} {variable.causality}"
+        raise entry.error(f"{name!r} cannot be set at the start of an episode{what}")
+    return variable
 
 
 def _array_start(variable: Variable, entry: Entry, limits: tuple[float, float] | None) -> Any:

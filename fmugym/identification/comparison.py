@@ -54,6 +54,11 @@ class Comparison:
         """Return the root mean square of the residuals, in the unit of the output."""
         return float(np.sqrt(np.mean(np.concatenate(self.residuals(output)) ** 2)))
 
+    def explained(self, output: str) -> float:
+        """Return which part of the variance of the measured values the simulation explains."""
+        measured = np.concatenate([one.outputs[output] for one in self.trajectories])
+        return 1.0 - self.rms(output) ** 2 / (float(np.var(measured)) or 1.0)
+
     def rms_interval(self, output: str, level: float = 0.95, seed: int = 0) -> tuple[float, float]:
         """Estimate how much the RMS depends on the choice of trajectories.
 

@@ -3,6 +3,8 @@
 The method is maximum likelihood if the measured outputs have independent normal noise of the given
 relative sizes; see Ljung, "System Identification" (1999), chapter 7. To fit a chaotic plant, use
 many short trajectories with their own initial states (multiple shooting) instead of a long one.
+Residuals that are correlated make the standard errors larger; the model is then not exact, and no
+standard error tells what that does to the values.
 """
 
 from __future__ import annotations
@@ -16,28 +18,57 @@ from typing import Any
 import numpy as np
 
 from fmugym.archive.fmu import FMU, StandsForFMU
-from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
-from fmugym.distributions import Normal
+from fmugym.checks import (
+    check_flag,
+    check_integer,
+    check_mapping,
+    check_number,
+    check_seed,
+    check_text,
+)
+from fmugym.distributions import Column
 from fmugym.errors import ConfigError
+from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Experiment, Limits, Problem
-from fmugym.identification.statistics import Estimate, normal_distributions
+from fmugym.identification.statistics import Correlation
 from fmugym.identification.trajectory import Trajectory, common_names
+from fmugym.pool.base import FloatArray
 
-__all__ = ["FitResult", "fit_parameters"]
+__all__ = ["FitResult", "fit_of", "fit_parameters"]
+
+GUESS = 12.0
+"""One over the variance of a uniform distribution, in units of its range."""
+
+MATTERS = 0.3
+"""Parts of a direction, which has the length 1, that are worth naming."""
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult(Estimate):
+class FitResult:
     """The result of ``fit_parameters``; the values are in the form of ``model_parameters``.
 
     Attributes:
+        values: The values by name.
+        covariance: Covariance of the values, in their order, shape (k, k).
+        information: The inverse of the covariance, which is 0 along directions of which the data
+            tell nothing, shape (k, k).
+        correlations: How the residuals depend on those before, by output.
+        degrees_of_freedom: Degrees of freedom of the confidence intervals.
+        costs: What each start of the optimization has come to, half the sum of the squared
+            residuals in units of their scales; the best is the first.
         bounds: Lower and upper bound of each value by name.
         comparison: The fitted trajectories and their simulation.
         converged: Whether the optimization converged within its limit of evaluations.
         message: Why the optimization ended.
     """
 
+    values: dict[str, float]
+    covariance: FloatArray
+    information: FloatArray
+    degrees_of_freedom: int
+    correlations: dict[str, Correlation]
+    costs: tuple[float, ...]
     bounds: dict[str, tuple[float, float]]
     comparison: Comparison
     converged: bool
@@ -45,15 +76,105 @@ class FitResult(Estimate):
     experiment: Experiment
     """The settings, which predictions need."""
 
-    def distributions(self) -> dict[str, Normal]:
-        """Return each value as a normal distribution, truncated at its bounds.
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name; infinite for a value that the data do not determine."""
+        errors = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.values, errors, strict=True))
 
-        The standard deviation is the standard error. Correlations between the values are lost.
+    @property
+    def correlation_matrix(self) -> FloatArray:
+        """Correlations of the values, in their order, shape (k, k); 0 for undetermined ones."""
+        errors = np.sqrt(np.diag(self.covariance))
+        known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
+        scaled = np.where(np.isfinite(self.covariance), self.covariance, 0.0)
+        return np.asarray(scaled / np.outer(known, known))
+
+    def factor(self, level: float) -> float:
+        """Half the width of an interval in standard errors, by Student's t distribution.
+
+        Args:
+            level: Probability that an interval covers the true value, between 0 and 1.
 
         Raises:
-            ConfigError: If the data do not determine a value.
+            ConfigError: If the level is not between 0 and 1.
         """
-        return normal_distributions(self.values, self.standard_errors, self.bounds)
+        level = check_number("level", level, positive=True)
+        if level >= 1.0:
+            raise ConfigError(f"level must be less than 1, not {level:g}")
+        freedom = self.degrees_of_freedom
+        student = imported("scipy.stats", "identification").t
+        return float(student.ppf(0.5 + level / 2, freedom))
+
+    def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return lower and upper end by name; they may exceed the bounds.
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
+        factor, errors = self.factor(level), self.standard_errors
+        return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
+
+    def distributions(self, count: int = 1000, seed: int | None = 0) -> dict[str, Column]:
+        """Return the values as parameters of which each episode draws a row; see ``rows``."""
+        columns = zip(self.values, self.rows(count, seed).T.tolist(), strict=True)
+        return {name: Column(values, table="fit") for name, values in columns}
+
+    def untold(self) -> list[dict[str, float]]:
+        """Name what the data do not tell: combinations of parameters that are hardly determined.
+
+        Along such a direction the standard error is larger than that of a guess within the bounds.
+
+        Returns:
+            For each direction, how far each parameter goes along it as a part of its range, those
+            that matter by name; the least determined direction is the first.
+        """
+        widths = self._widths()
+        scales = np.where(np.isfinite(widths), widths, np.abs([*self.values.values()]))
+        told, directions = np.linalg.eigh(self.information * np.outer(scales, scales))
+        return [
+            {n: float(x) for n, x in zip(self.values, along, strict=True) if abs(x) > MATTERS}
+            for amount, along in zip(told, directions.T, strict=True)
+            if amount < GUESS
+        ]
+
+    def rows(self, count: int, seed: int | None = 0) -> FloatArray:
+        """Draw values that fit the data together, from the normal distribution within the bounds.
+
+        What the data do not tell varies over the whole range.
+
+        Args:
+            count: How many.
+            seed: Of the draws.
+
+        Returns:
+            A row for each draw, in the order of ``values``, shape (count, k).
+
+        Raises:
+            ConfigError: If the data do not determine a value that has no bounds, or the count or
+                the seed is no such number.
+        """
+        count, seed = check_integer("count", count, 1, 10**6), check_seed(seed)
+        widths, center = self._widths(), np.array([*self.values.values()])
+        bounded = np.isfinite(widths)
+        for name, error, has_ends in zip(
+            self.values, self.standard_errors.values(), bounded, strict=True
+        ):
+            if not (has_ends or np.isfinite(error)):
+                raise ConfigError(f"{name!r} has no distribution: give it bounds")
+        scales = np.where(bounded, widths, np.sqrt(np.diag(self.covariance)))
+        told = self.information * np.outer(scales, scales) + np.diag(np.where(bounded, GUESS, 0.0))
+        amounts, directions = np.linalg.eigh(told)
+        root = directions / np.sqrt(amounts)
+        low, high = np.array([*self.bounds.values()]).T
+        rng, kept = np.random.default_rng(seed), np.empty((0, len(center)))
+        while len(kept) < count:
+            drawn = center + rng.standard_normal((count, len(center))) @ root.T * scales
+            kept = np.vstack([kept, drawn[((low <= drawn) & (drawn <= high)).all(axis=1)]])
+        return kept[:count]
+
+    def _widths(self) -> FloatArray:
+        return np.array([high - low for low, high in self.bounds.values()])
 
     def rms(self, output: str) -> float:
         """Return the RMS of the residuals of the fit, in the unit of the output."""
@@ -125,7 +246,8 @@ def fit_parameters(
     fixed: Mapping[str, float | str] | None = None,
     scales: Mapping[str, float] | None = None,
     time_step: float | None = None,
-    clustered: bool = False,
+    wash_in: float | None = None,
+    candidates: int = 1,
     drop_repeats: bool = True,
     max_evaluations: int = 100,
     backend: str = "auto",
@@ -150,13 +272,13 @@ def fit_parameters(
             first samples give them.
         fixed: Values of other parameters by name.
         scales: Standard deviation of the noise of each output, in its unit. Only the ratios
-            matter. None for the standard deviation of each output.
+            matter. Without it, an output is weighted by the noise that its residuals show, at
+            first by its standard deviation.
         time_step: Communication step size in seconds; None for the median sampling interval.
-        clustered: Whether the residuals of a trajectory may be correlated, as they are if the
-            model is not exact. This needs more trajectories than parameters. Otherwise all
-            residuals count as independent, and correlation makes the standard errors too small.
-            See Cameron and Miller, "A Practitioner's Guide to Cluster-Robust Inference", Journal
-            of Human Resources 50 (2015).
+        wash_in: How many seconds of each trajectory are simulated but not counted, so that the
+            initial state is forgotten; 0 leaves out the first sample. None counts all.
+        candidates: How many points within the bounds, the start among them, are tried at once. The
+            fit begins at the three best ones.
         drop_repeats: Whether to drop stale samples first; see ``Trajectory.without_repeats``.
         max_evaluations: Largest number of evaluations of the optimization.
         backend: See ``fmugym.pool.wishes.Wishes``.
@@ -181,26 +303,29 @@ def fit_parameters(
         time_step,
         check_flag("drop_repeats", drop_repeats),
         check_text("backend", backend),
+        None if wash_in is None else check_number("wash_in", wash_in, 0.0),
     )
-    clustered = check_flag("clustered", clustered)
     max_evaluations = check_integer("max_evaluations", max_evaluations, 1, 10**9)
     fit_states = check_flag("fit_initial_states", fit_initial_states)
+    candidates = check_integer("candidates", candidates, 1, 10**6)
     with closing(Problem(experiment, wanted, trajectories, fit_states)) as problem:
-        return _result(experiment, problem, problem.solve(max_evaluations), clustered)
+        return fit_of(experiment, problem, max_evaluations, candidates)
 
 
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
     return {} if value is None else check_mapping(what, value)
 
 
-def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: bool) -> FitResult:
-    """Collect the results of the optimization."""
-    covariance, freedom = problem.covariance(solution, clustered)
+def fit_of(
+    experiment: Experiment, problem: Problem, max_evaluations: int, candidates: int
+) -> FitResult:
+    """Solve a problem and collect the results."""
+    solution, costs = problem.solve(max_evaluations, candidates)
     return FitResult(
         values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
-        covariance=covariance,
+        **problem.uncertainty(solution)._asdict(),
+        costs=tuple(costs),
         bounds=problem.bounds,
-        degrees_of_freedom=freedom,
         comparison=problem.compare(solution.x),
         converged=solution.status > 0,
         message=solution.message,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,11 +22,19 @@ from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.simulator import Simulator
-from fmugym.identification.statistics import information_inverse
+from fmugym.identification.statistics import (
+    ROUNDING,
+    Correlation,
+    information_inverse,
+    information_of,
+    memory_of,
+    newey_west,
+)
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.pool.base import FloatArray
+from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.task.opening import PoolOpening
 
-__all__ = ["Experiment", "Limits", "Problem"]
+__all__ = ["Experiment", "Limits", "Problem", "Uncertainty"]
 
 Limits = float | tuple[float, float] | tuple[float, float, float]
 
@@ -39,10 +47,22 @@ FAILED = 1e3
 MAX_ITERATIONS = 50
 """Largest number of iterations in the fit of the initial states."""
 
+DESCENTS = 3
+"""Of the candidates, as many of the best ones are starts of an optimization."""
+
+REWEIGHTINGS = 2
+"""How often outputs are weighted anew, by the noise that the residuals show."""
+
+LEAST_NOISE = 1e-6
+"""Of an output, as a part of its standard deviation."""
+
 
 @dataclass(frozen=True)
 class Experiment:
-    """The common settings of a fit and its predictions; see ``fit_parameters``."""
+    """The common settings of a fit and its predictions; see ``fit_parameters``.
+
+    ``plant`` is how a task opens the FMU; None if there is no task.
+    """
 
     fmu: FMU
     initial_states: Mapping[str, str | float]
@@ -51,11 +71,22 @@ class Experiment:
     time_step: float | None
     drop_repeats: bool
     backend: str
+    wash_in: float | None = None
+    plant: PoolOpening | None = None
 
     def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
         """Check the trajectories, and drop stale samples if requested."""
         common_names(trajectories)
         return tuple(t.without_repeats() if self.drop_repeats else t for t in trajectories)
+
+
+class Uncertainty(NamedTuple):
+    """How sure parameters are; see ``FitResult``."""
+
+    covariance: FloatArray
+    information: FloatArray
+    degrees_of_freedom: int
+    correlations: dict[str, Correlation]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +152,7 @@ class Problem:
         self.trajectories = experiment.clean(trajectories)
         self._state_names = list(experiment.initial_states)
         self._states = _measured_states(experiment.initial_states, self.trajectories)
+        self._counted = [_counted(t, experiment.wash_in) for t in self.trajectories]
         names = [*parameters, *self._state_names]
         self._rows = range(len(names) if fit_states else len(parameters))
         self._simulator = Simulator(
@@ -131,10 +163,13 @@ class Problem:
             1 + len(self._rows),
             experiment.time_step,
             experiment.backend,
+            experiment.plant,
         )
         try:
             self._set_limits([self._simulator.description.variable(n) for n in names], parameters)
-            self._scales = _scales(experiment.scales, self.trajectories, self._simulator.outputs)
+            outputs = self._simulator.outputs
+            self._scales = _scales(experiment.scales, self.trajectories, outputs)
+            self._given = [name in experiment.scales for name in outputs]
         except BaseException:
             self.close()
             raise
@@ -155,13 +190,80 @@ class Problem:
         """Free the simulator."""
         self._simulator.close()
 
-    def solve(self, max_evaluations: int) -> Any:
-        """Minimize the residuals, and return SciPy's result."""
+    def solve(self, max_evaluations: int, candidates: int = 1) -> tuple[Any, list[float]]:
+        """Minimize the residuals from several starts.
+
+        Args:
+            max_evaluations: For each start.
+            candidates: Points within the bounds, of which the best ones are starts.
+
+        Returns:
+            SciPy's result, and the costs that the starts have come to, the best first.
+
+        Raises:
+            ConfigError: If there are several candidates, and a parameter has no bounds.
+        """
+        self._require_samples()
         self.compare(self.start, refit=False)  # fails early with the FMU's reason
+        measured, found = self._states, []
+        for start in self._starts(candidates):
+            self._states = measured
+            found.append((self._descend(start, max_evaluations), self._states))
+        found.sort(key=lambda one: one[0].cost)
+        solution, self._states = found[0]
+        spread, costs = self._scales, [float(one.cost) for one, _ in found]
+        for _ in range(0 if all(self._given) or len(self._given) == 1 else REWEIGHTINGS):
+            noise = np.sqrt(np.mean(self._series(solution.fun) ** 2, axis=0)) * self._scales
+            noise = np.maximum(noise, LEAST_NOISE * spread)
+            self._scales = np.where(self._given, self._scales, noise)
+            solution = self._descend(solution.x, max_evaluations)
+        return solution, costs
+
+    def _require_samples(self) -> None:
+        count = sum(int(one.sum()) for one in self._counted) * len(self._given)
+        wanted = len(self.start) + self._num_states
+        if count <= wanted:
+            raise ConfigError(
+                f"{count} measured values are too few for {wanted} values to fit: the log is too "
+                "short, or the wash-in too long"
+            )
+
+    @property
+    def _num_states(self) -> int:
+        return (len(self._rows) - len(self.start)) * len(self.trajectories)
+
+    def _starts(self, candidates: int) -> list[FloatArray]:
+        """The given start; or the best of it and of points that are spread within the bounds."""
+        if candidates == 1:
+            return [self.start]
+        count = len(self.start)
+        low, high = self._low[:count, np.newaxis], self._high[:count, np.newaxis]
+        for name, ends in self.bounds.items():
+            if not np.isfinite(ends).all():
+                raise ConfigError(f"{name!r} needs a lowest and a highest value, got {ends}")
+        rng = np.random.default_rng(0)
+        strata = rng.permuted(np.tile(np.arange(candidates), (count, 1)), axis=1)
+        points = low + (high - low) * (strata + rng.random(strata.shape)) / candidates
+        points[:, 0] = self.start
+        return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
+
+    def _costs(self, points: FloatArray) -> FloatArray:
+        """The sums of squares at some points, shape (k, n), with the measured initial states."""
+        costs: list[FloatArray] = []
+        for first in range(0, points.shape[1], self._simulator.num_sets):
+            part = points[:, first : first + self._simulator.num_sets]
+            values = np.concatenate([self._join(one, self._states) for one in part.T], axis=1)
+            errors = [self._errors(s, w) for w, s in enumerate(self._simulator.simulate(values))]
+            costs.append(sum((e**2).sum(axis=1) for e in errors))
+        found = np.concatenate(costs)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def _descend(self, start: FloatArray, max_evaluations: int) -> Any:
+        """Minimize the residuals from a start."""
         count = len(self.start)
         return imported("scipy.optimize", "identification").least_squares(
             self._residuals,
-            self.start,
+            start,
             jac=self._jacobian,
             bounds=(self._low[:count], self._high[:count]),
             x_scale="jac",
@@ -197,33 +299,49 @@ class Problem:
             tuple(dict(zip(self._state_names, s, strict=True)) for s in values.T.tolist()),
         )
 
-    def covariance(self, solution: Any, clustered: bool) -> tuple[FloatArray, int]:
-        """Estimate the covariance of the parameters; returns it with its degrees of freedom."""
+    def uncertainty(self, solution: Any) -> Uncertainty:
+        """Say how sure the parameters are.
+
+        Residuals that are no white noise count as correlated (Newey and West).
+        """
         inverse, undetermined = information_inverse(solution.jac)
-        num_states = (len(self._rows) - len(self.start)) * len(self.trajectories)
-        freedom = max(1, len(solution.fun) - len(self.start) - num_states)
-        covariance = inverse * (solution.fun @ solution.fun) / freedom
-        if clustered:
-            freedom = self._require_clusters()
-            scores = np.stack([jacobian.T @ r for jacobian, r in self._by_trajectory(solution)])
-            factor = len(self.trajectories) / freedom
-            covariance = inverse @ scores.T @ scores @ inverse * factor
+        freedom = max(1, len(solution.fun) - len(self.start) - self._num_states)
+        correlations = self._correlations(solution)
+        noise = np.mean(self._series(solution.fun) ** 2, axis=0) * len(solution.fun) / freedom
+        deviations = np.sqrt(np.maximum(noise, ROUNDING**2))
+        weighed = solution.jac * np.tile(deviations, len(solution.fun) // len(noise))[:, np.newaxis]
+        scores = weighed.T @ weighed
+        if not all(one.is_noise for one in correlations.values()):
+            scores, freedom = self._correlated(solution, correlations)
+        covariance = inverse @ scores @ inverse
         unknown = np.flatnonzero(undetermined)
         covariance[unknown, unknown] = np.inf
-        return covariance, freedom
+        information = information_of(solution.jac, scores)
+        return Uncertainty(covariance, information, freedom, correlations)
 
-    def _require_clusters(self) -> int:
-        freedom = len(self.trajectories) - len(self.start)
-        if freedom < 1:
-            raise ConfigError(
-                "clustered standard errors need more trajectories than parameters: "
-                f"{len(self.trajectories)} trajectories, {len(self.start)} parameters"
-            )
-        return freedom
+    def _correlations(self, solution: Any) -> dict[str, Correlation]:
+        parts = self._by_trajectory(self._series(solution.fun))
+        names = enumerate(self._simulator.outputs)
+        return {name: Correlation.of([one[:, k] for one in parts]) for k, name in names}
 
-    def _by_trajectory(self, solution: Any) -> list[tuple[FloatArray, FloatArray]]:
-        ends = np.cumsum([len(t) * len(self._simulator.outputs) for t in self.trajectories])[:-1]
-        return list(zip(np.split(solution.jac, ends), np.split(solution.fun, ends), strict=True))
+    def _correlated(
+        self, solution: Any, correlations: Mapping[str, Correlation]
+    ) -> tuple[FloatArray, int]:
+        """The covariance of J' r of residuals that depend on those before, and its freedom."""
+        products = solution.jac * solution.fun[:, np.newaxis]
+        sums = products.reshape(-1, len(correlations), len(self.start)).sum(axis=1)
+        lags = memory_of(max(one.first for one in correlations.values()), len(sums))
+        parts = self._by_trajectory(sums)
+        blocks = sum(max(1, len(part) // (lags + 1)) for part in parts)
+        factor = blocks / max(1, blocks - len(self.start))
+        return newey_west(parts, lags) * factor, max(1, blocks - len(self.start))
+
+    def _series(self, residuals: FloatArray) -> FloatArray:
+        """The residuals of all trajectories, a column for each output."""
+        return residuals.reshape(-1, len(self._given))
+
+    def _by_trajectory(self, rows: FloatArray) -> list[FloatArray]:
+        return np.split(rows, np.cumsum([one.sum() for one in self._counted])[:-1])
 
     def _residuals(self, parameters: FloatArray) -> FloatArray:
         """Return what SciPy minimizes: the residuals at the best initial states."""
@@ -281,7 +399,7 @@ class Problem:
         """Return one trajectory's scaled residuals, shape (sets, n * outputs)."""
         outputs = self.trajectories[index].outputs
         measured = np.stack([outputs[name] for name in self._simulator.outputs], axis=1)
-        scaled: FloatArray = (simulated - measured) / self._scales
+        scaled: FloatArray = ((simulated - measured) / self._scales)[:, self._counted[index]]
         return scaled.reshape(len(scaled), -1)
 
 
@@ -336,6 +454,17 @@ def _start_between(variable: Variable, low: float, high: float) -> float:
     if low <= variable.start_number <= high:
         return variable.start_number
     return (low + high) / 2
+
+
+def _counted(trajectory: Trajectory, wash_in: float | None) -> MaskArray:
+    """Which samples of a trajectory count: those after the wash-in."""
+    since = trajectory.time - trajectory.time[0]
+    counted = since > (-1.0 if wash_in is None else wash_in)
+    if not counted.any():
+        raise ConfigError(
+            f"a log of {since[-1]:g} s has no samples after a wash-in of {wash_in:g} s"
+        )
+    return np.asarray(counted)
 
 
 def _measured_states(

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
+from fmugym.archive.texts import number_of
 from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
+from fmugym.task.opening import PoolOpening
+from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
-__all__ = ["Simulator"]
+__all__ = ["Simulator", "median_interval"]
 
 logger = logging.getLogger(__name__)
 
@@ -41,9 +45,12 @@ class Simulator:
         num_sets: Largest number of sets.
         time_step: In seconds; None for the trajectories' median sampling interval.
         backend: See ``fmugym.pool.wishes.Wishes``.
+        plant: How an environment opens the FMU, if one does. Its communication steps, samplings
+            and start time hold then.
 
     Attributes:
         description: The FMU's model description.
+        num_sets: As given.
         outputs: The names of the outputs, in the order of the results.
         failure: The reason of the last failed simulation.
     """
@@ -57,11 +64,12 @@ class Simulator:
         num_sets: int,
         time_step: float | None = None,
         backend: str = "auto",
+        plant: PoolOpening | None = None,
     ) -> None:
         if time_step is not None:
             time_step = check_number("time_step", time_step, positive=True)
         fmu = FMU.of(fmu)
-        self.failure = ""
+        self.failure, self.num_sets = "", num_sets
         self.description = fmu.description
         self.outputs, logged = common_names(trajectories)
         step = time_step or median_interval(trajectories)
@@ -71,11 +79,15 @@ class Simulator:
         offsets = [v.name for v in self._free if v.causality == "input"]
         self._inputs = list(dict.fromkeys([*logged, *offsets]))
         self._logged = self._logged_inputs(trajectories)
-        constants = [_settable(fmu, name, {}) for name in fixed]
+        constants = [start_variable(fmu.description, name, fixed[name]) for name in fixed]
         self._variables = tuple([self._free[k] for k in self._start_rows] + constants)
-        self._constants = [checked_value(v, fixed[v.name]) for v in constants]
+        self._constants = [_constant(v, fixed[v.name]) for v in constants]
         spec = PoolSpec(_inputs(fmu, self._inputs), _outputs(fmu, self.outputs), step)
-        self._pool = make_pool(fmu, spec, num_sets * len(trajectories), logger, backend=backend)
+        count = num_sets * len(trajectories)
+        if plant is None:
+            self._pool = make_pool(fmu, spec, count, logger, backend=backend)
+        else:
+            self._pool = replace(plant, fmu=fmu, spec=_as_in(plant.spec, spec)).open(count)
 
     def close(self) -> None:
         """Free all instances."""
@@ -112,10 +124,10 @@ class Simulator:
         record[0] = outputs[:, :count]
         failed = self._note(active & (statuses > WARNING))
         ends = np.tile([grid.num_steps for grid in self._grids], size // len(self._grids))
-        for step, inputs in enumerate(self._logged):
+        everywhere = np.tile(self._logged, (1, 1, size // len(self._grids))) + offsets
+        for step, inputs in enumerate(everywhere):
             skip = ~active | failed | (ends <= step)
-            everywhere = np.tile(inputs, size // len(self._grids))
-            outputs, statuses = self._pool.step(everywhere + offsets, skip)
+            outputs, statuses = self._pool.step(inputs, skip)
             record[step + 1] = outputs[:, :count]
             failed |= self._note(~skip & (statuses > WARNING))
         record[:, :, failed[:count]] = np.nan
@@ -205,13 +217,37 @@ def median_interval(trajectories: Sequence[Trajectory]) -> float:
     return round(float(np.median(intervals)), 9) or float(np.median(intervals))
 
 
+def _as_in(given: PoolSpec, spec: PoolSpec) -> PoolSpec:
+    """The inputs, outputs and steps of a spec; the rest as an environment has it."""
+    known = dict(zip((v.name for v in given.outputs), given.samplings, strict=False))
+    return replace(
+        given,
+        inputs=spec.inputs,
+        outputs=spec.outputs,
+        time_step=spec.time_step,
+        substeps=max(1, round(spec.time_step * given.substeps / given.time_step)),
+        samplings=tuple(known.get(v.name, "last") for v in spec.outputs),
+        input_limits=(),
+        num_observed=0,
+        warm_up_steps=0,
+        records=False,
+    )
+
+
 def _settable(fmu: FMU, name: str, fixed: Mapping[str, float | str]) -> Variable:
-    variable = fmu.variable(name)
-    if not (variable.numeric and variable.settable_at_start):
-        raise ConfigError(f"{name!r} is not a numeric parameter, start value or input of the FMU")
+    variable = start_variable(fmu.description, name, 0.0)
+    if variable.kind != "real":
+        raise ConfigError(f"{name!r} is of type {variable.type}: only Reals can be fitted")
     if name in fixed:
         raise ConfigError(f"{name!r} is both fixed and to be fitted")
     return variable
+
+
+def _constant(variable: Variable, value: float | str) -> float:
+    """The value of a fixed parameter as a number; that of a String stands for its text."""
+    if variable.kind == "string" and isinstance(value, str):
+        return number_of(value)
+    return checked_value(variable, value)
 
 
 def _inputs(fmu: FMU, names: Sequence[str]) -> tuple[Variable, ...]:

@@ -1,29 +1,35 @@
-"""Covariances of estimates and their confidence intervals."""
+"""Information, covariances, and what residuals tell."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fmugym.checks import check_number
-from fmugym.distributions import Normal
-from fmugym.errors import ConfigError
 from fmugym.extras import imported
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [
-    "Estimate",
+    "Correlation",
     "Inverse",
     "information_inverse",
+    "information_of",
+    "memory_of",
     "newey_west",
-    "normal_distributions",
 ]
 
 RANK_TOLERANCE = 1e-9
 """Singular values below this fraction of the largest one count as zero."""
+
+FALSE_ALARM = 1e-3
+"""How often white noise counts as correlated."""
+
+ROUNDING = 1e-6
+"""Residuals below this, in units of their scale, are those of the arithmetic."""
+
+MOST_LAGS = 20
+"""Of the autocorrelations that the test for white noise looks at."""
 
 
 class Inverse(NamedTuple):
@@ -53,6 +59,69 @@ def information_inverse(jacobian: FloatArray) -> Inverse:
     return Inverse(root.T @ root, undetermined)
 
 
+def information_of(jacobian: FloatArray, scores: FloatArray) -> FloatArray:
+    """Say how much the data tell of the parameters, along every direction; shape (k, k).
+
+    It is the inverse of the covariance of the estimate, and 0 along the directions of which the
+    data tell nothing.
+
+    Args:
+        jacobian: The derivatives of the residuals, shape (n, k).
+        scores: The covariance of J' r, shape (k, k).
+    """
+    lengths = np.linalg.norm(jacobian, axis=0)
+    safe = np.where(lengths > 0, lengths, 1.0)
+    slopes = jacobian / safe
+    bread = slopes.T @ slopes
+    middle = np.linalg.pinv(scores / np.outer(safe, safe), RANK_TOLERANCE, hermitian=True)
+    return np.asarray(bread @ middle @ bread * np.outer(safe, safe))
+
+
+class Correlation(NamedTuple):
+    """How the residuals of an output depend on those before.
+
+    Attributes:
+        first: The correlation with the residual one sample before.
+        is_noise: Whether correlations up to the 20th sample before are no larger than those of
+            white noise, by the test of Ljung and Box, "On a measure of lack of fit in time series
+            models", Biometrika 65 (1978).
+    """
+
+    first: float
+    is_noise: bool
+
+    @classmethod
+    def of(cls, residuals: Sequence[FloatArray]) -> Correlation:
+        """Judge the residuals of an output, an array (n,) for each experiment."""
+        count = sum(map(len, residuals))
+        lags = range(1, 1 + min(MOST_LAGS, max(map(len, residuals)) - 1))
+        power = sum(float(one @ one) for one in residuals)
+        if not lags or power <= count * ROUNDING**2:
+            return cls(0.0, True)
+        found = [sum(float(one[lag:] @ one[:-lag]) for one in residuals) / power for lag in lags]
+        statistic = (
+            count
+            * (count + 2)
+            * sum(one**2 / (count - lag) for one, lag in zip(found, lags, strict=True))
+        )
+        chi2 = imported("scipy.stats", "identification").chi2
+        return cls(found[0], bool(statistic <= chi2.ppf(1 - FALSE_ALARM, len(lags))))
+
+
+def memory_of(correlation: float, count: int) -> int:
+    """Choose the lags for ``newey_west``: those for a process of first order.
+
+    Andrews, "Heteroskedasticity and autocorrelation consistent covariance matrix estimation",
+    Econometrica 59 (1991).
+
+    Args:
+        correlation: Between neighbouring samples.
+        count: The number of samples.
+    """
+    slow = min(max(correlation, 0.0), 0.99)
+    return 1 + int(1.1447 * (4 * slow**2 / (1 - slow**2) ** 2 * count) ** (1 / 3))
+
+
 def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
     """Sum the scores' autocovariances with Bartlett's weights.
 
@@ -71,65 +140,3 @@ def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
         crossed = sum(score[lag:].T @ score[:-lag] for score in scores if len(score) > lag)
         total = total + (1 - lag / (lags + 1)) * (crossed + np.transpose(crossed))
     return np.asarray(total)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Estimated values and their uncertainty.
-
-    Attributes:
-        values: The values by name.
-        covariance: Covariance of the values, in their order, shape (k, k).
-        degrees_of_freedom: Degrees of freedom of the confidence intervals.
-    """
-
-    values: dict[str, float]
-    covariance: FloatArray
-    degrees_of_freedom: int
-
-    @property
-    def standard_errors(self) -> dict[str, float]:
-        """Standard errors by name; infinite for a value that the data do not determine."""
-        errors = np.sqrt(np.diag(self.covariance)).tolist()
-        return dict(zip(self.values, errors, strict=True))
-
-    def factor(self, level: float) -> float:
-        """Half the width of an interval in standard errors, by Student's t distribution.
-
-        Args:
-            level: Probability that an interval covers the true value, between 0 and 1.
-
-        Raises:
-            ConfigError: If the level is not between 0 and 1.
-        """
-        level = check_number("level", level, positive=True)
-        if level >= 1.0:
-            raise ConfigError(f"level must be less than 1, not {level:g}")
-        freedom = self.degrees_of_freedom
-        student = imported("scipy.stats", "identification").t
-        return float(student.ppf(0.5 + level / 2, freedom))
-
-    def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return lower and upper end by name; they may exceed the bounds.
-
-        Raises:
-            ConfigError: If the level is not between 0 and 1.
-        """
-        factor, errors = self.factor(level), self.standard_errors
-        return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
-
-
-def normal_distributions(
-    values: Mapping[str, float],
-    errors: Mapping[str, float],
-    bounds: Mapping[str, tuple[float, float]],
-) -> dict[str, Normal]:
-    """Return a truncated normal distribution for each estimate.
-
-    Raises:
-        ConfigError: If the data do not determine an estimate.
-    """
-    for name, error in errors.items():
-        if not np.isfinite(error):
-            raise ConfigError(f"{name!r} has no distribution: the data do not determine it")
-    return {name: Normal(v, errors[name], *bounds[name]) for name, v in values.items()}

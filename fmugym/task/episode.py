@@ -13,7 +13,14 @@ import numpy as np
 from fmugym.archive.texts import number_of, text_of, texts_of
 from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
-from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
+from fmugym.distributions import (
+    Recipe,
+    Uniform,
+    draw_all,
+    is_distribution,
+    recipe_of,
+    together,
+)
 from fmugym.pool.base import FloatArray
 from fmugym.task.values import ParameterValues
 from fmugym.trial.trial_episodes import Starts
@@ -165,7 +172,7 @@ class EpisodePlan:
             else:
                 recipes.append(_recipe_of(one, variable))
         known = [recipe for recipe in recipes if recipe is not None]
-        return known if len(known) == len(recipes) else None
+        return together(self._distributions, known) if len(known) == len(recipes) else None
 
     def shown(self, values: FloatArray) -> dict[str, Any]:
         """The same as ``named``, but Strings are texts: arrays of objects."""
@@ -239,7 +246,7 @@ class EpisodePlan:
             ConfigError: If a drawn value does not fit its variable's type.
         """
         if len(self._limits) < len(self._distributions):
-            values = [draw(distribution, rng) for distribution in self._distributions]
+            values = draw_all(self._distributions, rng)
         else:
             fractions = rng.random(len(self._limits)).tolist()
             pairs = zip(self._limits, fractions, strict=True)

@@ -17,6 +17,9 @@
     fmugym evaluate TASK [WHO ...] [--scenario NAME ...] [EPISODES] [--plot scores.png]
     fmugym tune TASK CONTROLLER [--scenario NAME] [--rounds N] [--candidates N] [EPISODES]
         [--output tuned.toml] [--name NAME]
+    fmugym fit TASK --log plant.csv ... --parameter NAME[=LOW..HIGH] ... [--start NAME[=OUTPUT] ...]
+        [--column COLUMN=VARIABLE ...] [--wash-in TIME] [--candidates N] [--output fitted.toml]
+        [--plot fit.png]
     fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
         [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]
@@ -81,6 +84,7 @@ from fmugym.errors import FMUGymError, unknown_name
 from fmugym.signals import ordinary
 from fmugym.tools.ending import exit_code
 from fmugym.tools.exporting import add_export
+from fmugym.tools.fitting import add_fit
 from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
@@ -99,7 +103,7 @@ __all__ = ["main"]
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
-    *(add_export, add_bench, add_demo),
+    *(add_fit, add_export, add_bench, add_demo),
 )
 
 

@@ -19,7 +19,7 @@ from fmugym.recording import Recorder, Recording
 from fmugym.tools.options import MINARI, only_player, say, say_json
 from fmugym.tools.targets import maker_of
 
-__all__ = ["add_of_datasets", "dataset_of", "make_dataset", "show_dataset"]
+__all__ = ["add_of_datasets", "dataset_of", "make_dataset", "renaming", "show_dataset"]
 
 _OPTIONS: Final = ("log", "column", "tolerance", "author", "description")
 
@@ -93,7 +93,7 @@ def show_dataset(arguments: argparse.Namespace, name: str) -> None:
 
 
 def _logged(arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]) -> list[Recording]:
-    columns = dict(map(_renaming, arguments.column or []))
+    columns = dict(map(renaming, arguments.column or []))
     tolerance = 1e-3 if arguments.tolerance is None else arguments.tolerance
     found: list[Recording] = []
     for path in arguments.log:
@@ -105,7 +105,12 @@ def _logged(arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]) -> l
     return found
 
 
-def _renaming(text: str) -> tuple[str, str]:
+def renaming(text: str) -> tuple[str, str]:
+    """Split ``COLUMN=VARIABLE``.
+
+    Raises:
+        ConfigError: If it is something else.
+    """
     column, separator, variable = text.rpartition("=")
     if not separator:
         raise ConfigError(f"expected COLUMN=VARIABLE, got {shown(text)}")

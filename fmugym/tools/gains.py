@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from fmugym.baselines import Tuning, tune
 from fmugym.baselines.parsing import Search, search_of
-from fmugym.declared.writing import as_toml
 from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.tools.options import (
@@ -22,10 +19,11 @@ from fmugym.tools.options import (
     add_task,
     check_numbers,
     note,
-    require_folder,
+    require_new_task,
     say,
     say_json,
     tell,
+    write_extension,
 )
 from fmugym.tools.targets import maker_of
 
@@ -61,7 +59,8 @@ def _tune(arguments: argparse.Namespace) -> None:
     search = search_of(arguments.controller)
     output: Path | None = arguments.output
     if output is not None:
-        _require_new(output, arguments.name)
+        _require_name(arguments.name)
+        require_new_task(output)
     found: list[Tuning] = []
     try:
         _search(search, arguments, found)
@@ -103,7 +102,7 @@ def _search(search: Search, arguments: argparse.Namespace, found: list[Tuning]) 
 def _show(search: Search, best: Tuning, arguments: argparse.Namespace) -> None:
     text, output = search.text(best.parameters), arguments.output
     if output is not None:
-        _write(output, arguments.task, {arguments.name: text})
+        write_extension(output, arguments.task, {"controllers": {arguments.name: text}})
     for name in search.at_an_end(best.parameters):
         note(f"the best {name} is at an end of its range; a wider one may have a better one")
     if not arguments.json:
@@ -114,27 +113,6 @@ def _show(search: Search, best: Tuning, arguments: argparse.Namespace) -> None:
     say_json({"task": arguments.task, "output": output, **facts, **reward})
 
 
-def _require_new(path: Path, name: str) -> None:
-    """Refuse a file before anything is played for it.
-
-    Raises:
-        ConfigError: If it is no TOML file, or the name is none of a controller.
-        FileExistsError: If it exists.
-    """
-    if path.suffix.lower() != ".toml":
-        raise ConfigError(f"a task file ends with .toml, got {shown(str(path))}")
+def _require_name(name: str) -> None:
     if not name.isidentifier() or not name.isascii():
         raise ConfigError(f"a controller has a name such as 'tuned', got {shown(name)}")
-    require_folder(path)
-    if path.exists():
-        raise FileExistsError(f"{path} exists; name a new file")
-
-
-def _write(path: Path, target: str, controllers: Mapping[str, str]) -> None:
-    """Write a task file that extends the one that was tuned for; others have the table only."""
-    document: dict[str, Any] = {"controllers": dict(controllers)}
-    if Path(target).is_file():
-        base = os.path.relpath(Path(target).absolute(), path.absolute().parent)
-        document = {"extends": Path(base).as_posix(), **document}
-    with path.open("x", encoding="utf-8", newline="\n") as file:
-        file.write(as_toml(document))

@@ -9,13 +9,14 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_seed
+from fmugym.declared.writing import as_toml
 from fmugym.episodes.progress_bars import quiet
 from fmugym.episodes.simulation import Player, action_of, policy_of
 from fmugym.errors import ConfigError, plain, shown
@@ -40,11 +41,13 @@ __all__ = [
     "output_of",
     "players_of",
     "require_folder",
+    "require_new_task",
     "say",
     "say_json",
     "shown_in_any_case",
     "speaking",
     "tell",
+    "write_extension",
     "write_text",
 ]
 
@@ -91,6 +94,10 @@ EXAMPLES: Final = {
     "tune": (
         'fmugym tune task.toml "pid of=q setpoint=1 kp=0.01..1 td=0..1" --rounds 3 --steps 100 '
         "--output tuned.toml",
+    ),
+    "fit": (
+        "fmugym fit task.toml --log plant.csv --parameter l=0.05..0.2 --parameter b --start q_0 "
+        "--output fitted.toml",
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
@@ -326,8 +333,9 @@ def _outputs_of(arguments: argparse.Namespace) -> Iterator[Path]:
             if not isinstance(path, Path):
                 continue
             yield path
-            if path.suffix == ".c":
-                yield path.with_suffix(".h")
+            beside = {".c": ".h"} | ({".toml": ".npz"} if arguments.command == "fit" else {})
+            if path.suffix in beside:
+                yield path.with_suffix(beside[path.suffix])
 
 
 def say_json(facts: dict[str, Any]) -> None:
@@ -354,6 +362,30 @@ def require_folder(path: Path) -> None:
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: there is no folder {shown(str(path.parent))}; make it first")
+
+
+def require_new_task(path: Path) -> None:
+    """Refuse a task file before anything is played for it.
+
+    Raises:
+        ConfigError: If it is no TOML file, or its folder does not exist.
+        FileExistsError: If it exists.
+    """
+    if path.suffix.lower() != ".toml":
+        raise ConfigError(f"a task file ends with .toml, got {shown(str(path))}")
+    require_folder(path)
+    if path.exists():
+        raise FileExistsError(f"{path} exists; name a new file")
+
+
+def write_extension(path: Path, target: str, more: Mapping[str, Any]) -> None:
+    """Write a task file that extends the given one by some keys; others have only these."""
+    document: dict[str, Any] = dict(more)
+    if Path(target).is_file():
+        base = os.path.relpath(Path(target).absolute(), path.absolute().parent)
+        document = {"extends": Path(base).as_posix(), **document}
+    with path.open("x", encoding="utf-8", newline="\n") as file:
+        file.write(as_toml(document))
 
 
 def _for_any_file(text: str) -> str:
