@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,7 @@ from fmugym.series.store import TEXT
 from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
-__all__ = ["PlantLog", "play_log"]
+__all__ = ["Actions", "PlantLog", "play_log"]
 
 _HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*$")
 _INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
@@ -258,7 +258,7 @@ class _Player:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
         self._columns = _Columns(inner, log, columns)
-        self._actions = _Actions(inner, self._columns, tolerance)
+        self._actions = Actions(inner, self._columns, tolerance)
 
     def play(self, seed: int) -> list[Recording]:
         episodes: list[Recording] = []
@@ -337,11 +337,27 @@ class _Columns:
         return values[after - 1]
 
 
-class _Actions:
-    """Finds the action that makes an environment write given inputs."""
+class Inputs(Protocol):
+    """Inputs that were written."""
 
-    def __init__(self, env: FMUEnv, columns: _Columns, tolerance: float) -> None:
-        self._env, self._tolerance = env, tolerance
+    def require(self, variable: Variable) -> None:
+        """Refuse an input of which nothing is known."""
+
+    def range_of(self, variable: Variable) -> float:
+        """How far apart its values are."""
+
+
+class Actions:
+    """Finds the action that makes an environment write given inputs.
+
+    Args:
+        env: The environment. Its hook ``_get_inputs`` is called as it is now.
+        columns: The inputs.
+        tolerance: How far an input may be from the given one, as a part of its range.
+    """
+
+    def __init__(self, env: FMUEnv, columns: Inputs, tolerance: float) -> None:
+        self._env, self._tolerance, self._get_inputs = env, tolerance, env._get_inputs
         self._space: Any = env.action_space
         self._candidates = _candidates(self._space)
         self._columns = columns
@@ -354,7 +370,7 @@ class _Actions:
         Raises:
             ConfigError: If a column is missing, or no action makes these inputs.
         """
-        tried = [self._inputs(action) for action in self._candidates]
+        tried = [self.inputs(action) for action in self._candidates]
         self._find_written(np.array(tried))
         wanted = np.array(
             [row[self._env.inside.spec.inputs[place].name] for place in self._written]
@@ -363,12 +379,12 @@ class _Actions:
         self._require_near(action, wanted, time)
         return action
 
-    def _inputs(self, action: Any) -> FloatArray:
-        """What the environment would write for an action."""
+    def inputs(self, action: Any) -> FloatArray:
+        """What the environment would write for an action, one number for each input."""
         env, before = self._env, self._env.action
         env.action = action
         try:
-            return flat_inputs(env._get_inputs(), env.inside.spec.inputs, shown)
+            return flat_inputs(self._get_inputs(), env.inside.spec.inputs, shown)
         finally:
             env.action = before
 
@@ -395,7 +411,7 @@ class _Actions:
         return flat.reshape(self._space.shape).astype(self._space.dtype)
 
     def _require_near(self, action: Any, wanted: FloatArray, time: float) -> None:
-        made = self._inputs(action)[self._written]
+        made = self.inputs(action)[self._written]
         off = np.abs(made - wanted) > self._tolerance * self._scales
         if off.any():
             place = int(np.flatnonzero(off)[0])
