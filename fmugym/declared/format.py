@@ -573,12 +573,18 @@ _ADDRESSES: Final = {
         option("holding", "input", "coil", "discrete"), "Modbus: where that register is.", "holding"
     ),
     "type": Key(
-        option(*(f"{kind}{bits}" for kind in ("int", "uint") for bits in (16, 32, 64)), "float32", "float64"),
+        option(
+            *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (16, 32, 64)),
+            "float32",
+            "float64",
+        ),
         "Modbus: how registers make a number; bits make 0 or 1.",
         "float32",
     ),
     "word_order": Key(
-        option("big", "little"), "Modbus: whether the first register is the most significant.", "big"
+        option("big", "little"),
+        "Modbus: whether the first register is the most significant.",
+        "big",
     ),
     "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", None, "that of the plant"),
     "scale": Key(NUMBER, "What the plant's number is multiplied by.", 1.0),
@@ -612,9 +618,7 @@ LIVE: Final = Table(
 PLANT: Final = Table(
     {
         "protocol": Key(option("modbus", "opcua"), "Modbus TCP or OPC UA.", REQUIRED),
-        "address": Key(
-            TEXT, 'Such as `"10.0.0.5:502"`, or `"opc.tcp://10.0.0.5:4840"`.', REQUIRED
-        ),
+        "address": Key(TEXT, 'Such as `"10.0.0.5:502"`, or `"opc.tcp://10.0.0.5:4840"`.', REQUIRED),
         "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", 1),
         "tags": Key(
             Entries(TAG),
@@ -627,9 +631,7 @@ PLANT: Final = Table(
             None,
             "the local time of this machine",
         ),
-        "poll": Key(
-            POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"
-        ),
+        "poll": Key(POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"),
         "stale_after": Key(
             POSITIVE_TIME,
             "A good value that was received longer ago than this is stale: the last one holds.",
@@ -669,9 +671,7 @@ PLANT: Final = Table(
         ),
     },
     what="key of [plant]",
-    elsewhere=dict.fromkeys(
-        ("user", "password"), ": no task file has secrets; see 'credentials'"
-    ),
+    elsewhere=dict.fromkeys(("user", "password"), ": no task file has secrets; see 'credentials'"),
 )
 
 

@@ -14,8 +14,11 @@ from fmugym.plant.tags import Plant, Tag
 __all__ = ["ModbusClient", "serve_modbus"]
 
 _FORMATS: Final = {
-    **{f"{sign}int{bits}": letter for sign, letters in (("", "hiq"), ("u", "HIQ"))
-       for bits, letter in zip((16, 32, 64), letters, strict=True)},
+    **{
+        f"{sign}int{bits}": letter
+        for sign, letters in (("", "hiq"), ("u", "HIQ"))
+        for bits, letter in zip((16, 32, 64), letters, strict=True)
+    },
     "float32": "f",
     "float64": "d",
 }

@@ -27,7 +27,6 @@ class Answer(NamedTuple):
     Attributes:
         numbers: In the unit of the task.
         fault: What is wrong with them; "" if they are good.
-        is_mistake: Whether that is no fault of the plant, but of the task: a wrong type.
     """
 
     numbers: tuple[float, ...]
@@ -92,6 +91,8 @@ class Poller:
                 self._note(f"it does not answer within {self._timeout:g} s")
             finally:
                 await self._client.close()
+            if (task := asyncio.current_task()) is not None and task.cancelling():
+                return  # a library has made another error of that
             await asyncio.sleep(self._interval / self._speed)
 
     async def _converse(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from types import TracebackType
 from typing import Any, Final, Self
@@ -55,9 +55,7 @@ class _Twin:
         seed: Of the episode.
     """
 
-    def __init__(
-        self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int
-    ) -> None:
+    def __init__(self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int) -> None:
         self._env, self._plant, self._policy, self._clock = env, plant, policy, clock
         assert env.inside.quantities is not None
         self._quantities = env.inside.quantities()
@@ -72,7 +70,7 @@ class _Twin:
     def _shapes(self) -> tuple[Any, Any]:
         """Which quantities are those of the step, and which move on straight lines."""
         variables, late, straight = in_fmu(self._env), [], []
-        samplings = self._env.inside.spec.samplings
+        samplings = self._env.config.samplings
         for one in self._quantities.all:
             variable, _ = variables.get(one.name, (None, None))
             is_sampled = variable is not None and variable.name in samplings

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 import gymnasium
 import numpy as np
 
-from fmugym.archive.variable import Variable
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv
 from fmugym.declared.format import DEVICE
-from fmugym.errors import shown
-from fmugym.logs import Actions
 from fmugym.plant.feed import Feed, local_time
 from fmugym.plant.modbus import ModbusClient
+from fmugym.plant.predicting import Predictions
 from fmugym.plant.reading import Poller
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import Plant, in_fmu, read_plant
+from fmugym.plant.written import Written, lacking_tag
 from fmugym.pool.backend.clocks import Clock, RealClock
-from fmugym.pool.base import FloatArray
-from fmugym.task.actions import flat_inputs
 from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
-
-logger = logging.getLogger(__name__)
 
 _OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient}
@@ -57,17 +53,23 @@ def _watched(task: Task, feed: Feed) -> Task:
     agent = dict(document.get("agent", {}))
     if "forecast" in agent:
         given = agent["forecast"]
-        several = given if isinstance(given, list) else [given]
-        agent["forecast"] = [{k: v for k, v in one.items() if k != "error"} for one in several]
+        agent["forecast"] = [
+            {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
+        ]
     if "history" in agent:
-        document["warm_up"] = {"period": agent["history"]["length"], "cache": True}
+        held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+        document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**document, "agent": agent, "start_time": _PresentTime(feed)})
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else [value]
 
 
 class _Watching(WarmUp):
     """Fills histories: the steps before the first observation, with what acts in the plant."""
 
-    def __init__(self, declared: WarmUp, feed: Feed, written: _Written) -> None:
+    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
         self.steps, self.writes = declared.steps, declared.writes
         self._declared, self._feed, self._written = declared, feed, written
 
@@ -86,60 +88,6 @@ class _Watching(WarmUp):
         self._declared.update(env)
 
 
-class _Written:
-    """What acts in a plant, in the place of what an environment would write.
-
-    Args:
-        env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant.
-        feed: Has what acts.
-    """
-
-    def __init__(self, env: TaskEnv, feed: Feed, plant: Plant) -> None:
-        self._feed, self._inputs = feed, env.inside.spec.inputs
-        places = {variable.name: place for place, variable in enumerate(self._inputs)}
-        self._tags = [
-            (places[variable.name], alias, conversion)
-            for alias, (variable, conversion) in in_fmu(env).items()
-            if variable.name in places and alias in plant.tags
-        ]
-        self.actions = Actions(env, self, math.inf)
-        self._own = env._get_inputs
-        env._get_inputs = self._get_inputs  # type: ignore[method-assign]
-        self.names = [alias for _, alias, _ in self._tags]
-
-    def _get_inputs(self) -> FloatArray:
-        return self.over(flat_inputs(self._own(), self._inputs, shown))
-
-    def over(self, values: FloatArray) -> FloatArray:
-        """The inputs with what acts in the plant, in the FMU's units."""
-        for place, alias, conversion in self._tags:
-            values[place] = conversion.inverse(self._feed.values[alias][0])
-        return values
-
-    def action(self) -> Any:
-        """The action that comes nearest to what acts in the plant."""
-        values = self.over(np.zeros(len(self._inputs)))
-        row = dict(zip([one.name for one in self._inputs], values.tolist(), strict=True))
-        return self.actions.of(row, self._feed.time)
-
-    def proposed(self, action: Any) -> dict[str, float]:
-        """What an action would write, in the task's units."""
-        values = self.actions.inputs(action)
-        return {alias: float(conversion(values[place])) for place, alias, conversion in self._tags}
-
-    # For ``Actions``.
-
-    def require(self, variable: Variable) -> None:
-        """Refuse an input that no tag tells: what acts would be unknown."""
-        if variable.name not in {self._inputs[place].name for place, *_ in self._tags}:
-            raise _lacks_tag(variable.name)
-
-    def range_of(self, variable: Variable) -> float:
-        """How far apart its values are, if that is known."""
-        width = variable.maximum - variable.minimum
-        return width if math.isfinite(width) and width > 0 else 1.0
-
-
 class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A task in the shadow of a plant.
 
@@ -149,15 +97,27 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
     plant. Infos have
 
     * ``"proposed"``: what the action would have written, by variable;
+    * ``"predicted"``: what a copy of the FMU foretold a step ago, by variable;
     * ``"missing"``: the variables that have no value any longer; the last ones go on;
     * ``"fault"``: what is wrong, also while last values hold.
 
     An episode ends (``truncated``) if the plant's time jumps.
+
+    Attributes:
+        errors: Returns the errors of all predictions until now.
     """
 
-    def __init__(self, env: TaskEnv, feed: Feed, poller: Poller, written: _Written) -> None:
+    def __init__(
+        self, env: TaskEnv, feed: Feed, written: Written, copies: Predictions, owned: ExitStack
+    ) -> None:
         super().__init__(env)
-        self._feed, self._poller, self._written = feed, poller, written
+        self._feed, self._written, self._owned = feed, written, owned
+        self._copies, self.errors = copies, copies.errors
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether a value is missing, so that an agent holds its last action."""
+        return bool(self._feed.missing)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -170,34 +130,32 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self._feed.begin()
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation, info | self._told(dict.fromkeys(self._written.names, math.nan))
+        self._copies.begin()
+        unknown = dict.fromkeys(self._written.names, math.nan)
+        predicted = dict.fromkeys(self._copies.names, math.nan)
+        return observation, info | self._told(unknown, predicted)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Wait for the next tick; see the class."""
         proposed = self._written.proposed(action)
         self._feed.advance()
         observation, reward, terminated, truncated, info = self.env.step(self._written.action())
-        has_jumped = self._feed.jump != 0.0
-        return observation, reward, terminated, truncated or has_jumped, info | self._told(proposed)
+        truncated = truncated or self._feed.jump != 0.0
+        info |= self._told(proposed, self._copies.follow())
+        return observation, reward, terminated, truncated, info
 
-    def _told(self, proposed: dict[str, float]) -> dict[str, Any]:
+    def _told(self, proposed: dict[str, float], predicted: dict[str, float]) -> dict[str, Any]:
         feed = self._feed
         faults = [f"{name}: {why}" for name, why in feed.faults.items()]
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        found: dict[str, Any] = {"proposed": proposed, "missing": feed.missing}
-        return found | ({"fault": "; ".join(faults)} if faults else {})
+        told: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
+        told["missing"] = feed.missing
+        return told | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:
         """End the connection."""
-        self._poller.stop()
-        super().close()
-
-
-def _lacks_tag(name: str) -> Any:
-    from fmugym.errors import ConfigError
-
-    return ConfigError(f"[plant] has no tag for {name!r}, which the task needs")
+        self._owned.close()
 
 
 def connect(
@@ -205,6 +163,7 @@ def connect(
     address: str | None = None,
     *,
     physical: bool = False,
+    ahead: float = 0.0,
     clock: Clock | None = None,
 ) -> Shadow:
     """Connect to the plant of a task.
@@ -214,6 +173,7 @@ def connect(
         address: In the place of that of the task.
         physical: Whether observations and actions are in the units of the task, as controllers
             need them.
+        ahead: How far ahead copies of the FMU predict, in seconds; 0 for no copies.
         clock: A monotonic clock; ``RealClock(speed)`` for a plant that ``fmugym serve`` runs
             faster.
 
@@ -225,38 +185,48 @@ def connect(
             ``plant`` is missing.
     """
     task, clock = Task.of(config), clock or RealClock()
-    start = local_time()
-    is_real = getattr(clock, "speed", 1.0) == 1.0
-    feed = Feed(clock, local_time if is_real else lambda: start + clock.time())
+    feed = Feed(clock, _wall(clock))
     watched = _watched(task, feed)
-    env = environment(
-        watched.physical() if check_flag("physical", physical) else watched, backend=feed
-    )
-    try:
+    own = watched.physical() if check_flag("physical", physical) else watched
+    with ExitStack() as stack:
+        env = environment(own, backend=feed)
+        stack.callback(env.close)
         plant = read_plant(env)
-        written = _Written(env, feed, plant)
-        outputs = _outputs(env, plant)
-        warm_ups = env.inside.warm_ups
+        written = Written(env, feed, plant)
+        read, samplings = _reading(env, feed, plant)
+        _watch_warm_up(env, feed, written)
+        make_copy = partial(environment, _without_warm_up(watched).physical())
+        copies = Predictions(make_copy, feed, plant, int(ahead / plant.step + 1e-9))
+        stack.callback(copies.close)
         client = _CLIENTS[plant["protocol"]](plant, address or plant["address"])
         poller = Poller(client, clock, plant.poll, plant["timeout"])
-    except BaseException:
-        env.close()
-        raise
-
-    def read() -> dict[str, float]:
-        return {
-            name: conversion.inverse(feed.values[alias][0])
-            for name, (alias, conversion) in outputs.items()
-        }
-
-    samplings = {alias: env.inside.spec.samplings.get(n, "last") for n, (alias, _) in outputs.items()}
-    feed.open(plant, poller, samplings | dict.fromkeys(written.names, "median"), read)
-    del warm_ups
-    return Shadow(env, feed, poller, written)
+        stack.callback(poller.stop)
+        feed.open(plant, poller, samplings | dict.fromkeys(written.names, "median"), read)
+        return Shadow(env, feed, written, copies, stack.pop_all())
 
 
-def _outputs(env: TaskEnv, plant: Plant) -> dict[str, Any]:
-    """The tags of all that the task reads, by the FMU's names, with conversions to the task."""
+def _wall(clock: Clock) -> Callable[[], float]:
+    """The time of this place; if a clock runs faster, it began with that."""
+    if getattr(clock, "speed", 1.0) == 1.0:
+        return local_time
+    start = local_time() - clock.time()
+    return lambda: start + clock.time()
+
+
+def _without_warm_up(task: Task) -> Task:
+    return replace(task, document={k: v for k, v in task.document.items() if k != "warm_up"})
+
+
+def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
+    if env.inside.warm_ups is not None:
+        watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
+        env.inside.warm_ups = WarmUps(env, watching)
+
+
+def _reading(
+    env: TaskEnv, feed: Feed, plant: Plant
+) -> tuple[Callable[[], Mapping[str, float]], dict[str, str]]:
+    """What reads all that the task reads, in the FMU's units, and how tags are sampled."""
     outputs = {one.name for one in env.inside.spec.outputs}
     found = {
         variable.name: (alias, conversion)
@@ -264,5 +234,10 @@ def _outputs(env: TaskEnv, plant: Plant) -> dict[str, Any]:
         if variable.name in outputs and alias in plant.tags
     }
     for name in sorted(outputs - found.keys()):
-        raise _lacks_tag(name)
-    return found
+        raise lacking_tag(name)
+    how = env.config.samplings
+
+    def read() -> dict[str, float]:
+        return {n: own.inverse(feed.values[alias][0]) for n, (alias, own) in found.items()}
+
+    return read, {alias: how.get(name, "last") for name, (alias, _) in found.items()}

@@ -93,6 +93,7 @@ EXAMPLES: Final = {
         "--output tuned.toml",
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
+    "serve": ("fmugym serve house.toml --controller thermostat --speed 9000 --steps 50",),
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
     "demo": ("fmugym demo --output demo.png",),
