@@ -115,3 +115,115 @@ class TestShadow:
         first = round(time / STEP)
         np.testing.assert_allclose(acted, plain["u"][first : first - 4 : -1], atol=1e-6)
         env.close()
+
+
+class TestFaults:
+    """Clear words, and nothing lost from the record."""
+
+    @pytest.fixture()
+    def line(self, server):
+        found = Line(server.address)
+        yield found
+        found.close()
+
+    def test_a_server_that_goes_and_comes_back(self, server, clock, line, tmp_path):
+        clock.patience = 0.2
+        task = house(stale_after="5min", hold="20min")
+        env = RecordSeries(watch(server, clock, task, line.address), path=tmp_path / "plant.csv")
+        policy, told = held_by(env), []
+        observation, _ = env.reset(seed=0)
+        for step in range(8):
+            (line.cut if step == 1 else line.mend if step == 5 else str)()
+            observation, *_, info = env.step(policy(observation))
+            told.append((info["missing"], info.get("fault", "")))
+        env.close()
+        assert [bool(missing) for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
+        assert ["T: " in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
+        assert "connection" in told[2][1]
+        series = env.series
+        assert len(series) == 9
+        assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+        assert len(set(series["proposed.u"][4:6].tolist())) == 1
+        assert series.faults.keys() == {2, 3, 4, 5}
+        text = (tmp_path / "plant.csv").read_text(encoding="utf-8")
+        assert len(text.splitlines()) == 10
+
+    def test_a_server_that_is_started_anew(self, clock, tmp_path):
+        with Server(house(), player(), clock=clock) as first:
+            line = Line(first.address)
+            env = watch(first, clock, address=line.address)
+            env.reset(seed=0)
+            env.step(np.float32([0.5]))
+        clock.patience = 0.2
+        *_, info = env.step(np.float32([0.5]))
+        assert "T: " in info["fault"]
+        with Server(house(), player(), clock=clock, seed=1) as second:
+            line.target = int(second.address.split(":")[1])
+            for _ in range(2):
+                *_, info = env.step(np.float32([0.5]))
+            assert "T: " not in info.get("fault", "")
+            env.close()
+        line.close()
+
+    def test_no_server(self, clock):
+        with watch_at("127.0.0.1:9", clock, house(timeout="0.2s")) as env:
+            with pytest.raises(SimulationError, match=r"127.0.0.1.*T: .*connection"):
+                env.reset()
+
+    def test_a_tag_that_does_not_exist(self, server, clock):
+        tags = dict(house().document["plant"]["tags"])
+        tags["T_floor"] = {"register": 900, "type": "int16"}
+        with watch_at(server.address, clock, house(tags=tags)) as env:
+            with pytest.raises(ConfigError, match=r"T_floor: holding 900 of unit 1.*no such") as e:
+                env.reset()
+        assert "power" not in str(e.value)
+
+    def test_a_wrong_type(self, server, clock):
+        tags = dict(house().document["plant"]["tags"])
+        tags["T"] = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
+        with watch_at(server.address, clock, house(tags=tags)) as env:
+            with pytest.raises(ConfigError, match=r"T: .*expected.*10.*30.*'type'"):
+                env.reset()
+
+    def test_a_clock_that_jumps(self, server, clock, monkeypatch):
+        env = watch(server, clock)
+        env.reset(seed=0)
+        env.step(np.float32([0.5]))
+        before = float(env.unwrapped.time)
+        original = server_time(server, monkeypatch, 4 * 3600.0)
+        *_, truncated, info = env.step(np.float32([0.5]))
+        assert truncated
+        assert "clock has jumped by 14400 s" in info["fault"]
+        env.reset()
+        assert float(env.unwrapped.time) >= before + 4 * 3600.0
+        *_, truncated, info = env.step(np.float32([0.5]))
+        assert not truncated
+        assert original is not None
+        env.close()
+
+    def test_answers_that_are_late(self, server, line):
+        """Two seconds on a line: values are old, and nothing waits for them but who asks."""
+        clock = RealClock(60.0)
+        task = house(poll="10s", stale_after="10min")
+        with Server(house(), player(), clock=clock) as late:
+            line.target, line.delay = int(late.address.split(":")[1]), 0.5
+            env = watch(late, clock, task, line.address)
+            env.reset(seed=0)
+            begin = clock.time()
+            for _ in range(1):
+                *_, info = env.step(np.float32([0.5]))
+            assert clock.time() - begin == pytest.approx(STEP, rel=0.2)
+            assert "fault" not in info
+            env.close()
+
+    def test_two_clients(self, server, clock):
+        first, second = (RecordSeries(watch(server, clock)) for _ in range(2))
+        first.reset(seed=0)
+        second.reset(seed=0)
+        for _ in range(3):
+            first.step(np.float32([0.5]))
+            second.step(np.float32([0.2]))
+        first.close()
+        second.close()
+        for name in ("T", "u", "power"):
+            np.testing.assert_allclose(first.series[name], second.series[name], atol=0.62)

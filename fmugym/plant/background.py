@@ -6,8 +6,12 @@ import asyncio
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from typing import Final
 
 __all__ = ["Background"]
+
+_PATIENCE: Final = 0.1
+"""How long to wait for the effect of a cancellation, in seconds."""
 
 
 class Background:
@@ -45,13 +49,20 @@ class Background:
         except Exception as error:
             self.error = error
 
+    def _cancel(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
     def join(self, seconds: float) -> None:
         """Wait for its end, for some time."""
         self._thread.join(seconds)
 
     def stop(self) -> None:
-        """Cancel the coroutine, and wait for its end."""
-        if self._task is not None:
+        """Cancel the coroutine, and wait for its end.
+
+        Libraries lose cancellations: ``asyncio.wait_for`` does so until Python 3.12.
+        """
+        while not self.is_over:
             with suppress(RuntimeError):  # the loop is closed
-                self._loop.call_soon_threadsafe(self._task.cancel)
-        self._thread.join()
+                self._loop.call_soon_threadsafe(self._cancel)
+            self._thread.join(_PATIENCE)

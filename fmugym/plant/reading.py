@@ -91,8 +91,6 @@ class Poller:
                 self._note(f"it does not answer within {self._timeout:g} s")
             finally:
                 await self._client.close()
-            if (task := asyncio.current_task()) is not None and task.cancelling():
-                return  # a library has made another error of that
             await asyncio.sleep(self._interval / self._speed)
 
     async def _converse(self) -> None:
