@@ -128,7 +128,7 @@ class Feed:
             told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
             if poller.has_answered and any(poller.trouble(name) for name in names):
                 raise ConfigError(f"the plant at {self._plant['address']}: {told}")
-            if time.monotonic() > deadline:
+            if poller.is_refused or time.monotonic() > deadline:
                 raise SimulationError(f"the plant at {self._plant['address']}: {told}")
             time.sleep(0.005)
 

@@ -11,7 +11,7 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.plant.background import Background
 from fmugym.pool.backend.clocks import Clock
 
-__all__ = ["Answer", "Client", "LostError", "Poller", "Reading", "host_and_port"]
+__all__ = ["Answer", "Client", "LostError", "Poller", "Reading", "RefusedError", "host_and_port"]
 
 _MOST: Final = 100_000
 """So many readings of a tag are kept until they are used."""
@@ -19,6 +19,10 @@ _MOST: Final = 100_000
 
 class LostError(FMUGymError):
     """The server is not there, or does not answer."""
+
+
+class RefusedError(LostError):
+    """The server does not want this client, or this client does not want the server."""
 
 
 class Answer(NamedTuple):
@@ -69,6 +73,10 @@ class Poller:
         clock: The monotonic clock by which values are received.
         interval: Time from one question to the next, in s of the clock.
         timeout: How long an answer may take, in s of real time.
+
+    Attributes:
+        has_answered: Whether there was an answer.
+        is_refused: Whether this client was refused when it last connected.
     """
 
     def __init__(self, client: Client, clock: Clock, interval: float, timeout: float) -> None:
@@ -78,7 +86,7 @@ class Poller:
         self._readings: dict[str, deque[Reading]] = {}
         self._faults: dict[str, str] = {}
         self._trouble = "it has not answered yet"
-        self.has_answered = False
+        self.has_answered = self.is_refused = False
         self._background = Background(self._poll, "plant")
 
     async def _poll(self) -> None:
@@ -86,6 +94,7 @@ class Poller:
             try:
                 await self._converse()
             except (LostError, OSError) as error:
+                self.is_refused = isinstance(error, RefusedError)
                 self._note(str(error))
             except TimeoutError:
                 self._note(f"it does not answer within {self._timeout:g} s")

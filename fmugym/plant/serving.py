@@ -18,6 +18,7 @@ from fmugym.episodes.simulation import Player, Policy
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
 from fmugym.plant.background import Background
 from fmugym.plant.modbus import serve_modbus
+from fmugym.plant.opcua import serve_opcua
 from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
 from fmugym.pool.backend.clocks import Clock, RealClock
 
@@ -217,4 +218,4 @@ class Server:
         self.close()
 
 
-_SERVERS: Final[Mapping[str, Any]] = {"modbus": serve_modbus}
+_SERVERS: Final[Mapping[str, Any]] = {"modbus": serve_modbus, "opcua": serve_opcua}

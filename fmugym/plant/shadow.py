@@ -17,6 +17,7 @@ from fmugym.declared import Task, TaskEnv
 from fmugym.declared.format import DEVICE
 from fmugym.plant.feed import Feed, local_time
 from fmugym.plant.modbus import ModbusClient
+from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.reading import Poller
 from fmugym.plant.serving import endless, environment
@@ -28,7 +29,7 @@ from fmugym.task.warm_up import WarmUp, WarmUps
 __all__ = ["Shadow", "connect"]
 
 _OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
-_CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient}
+_CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
 class _PresentTime:
