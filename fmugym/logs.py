@@ -77,7 +77,8 @@ class PlantLog:
 
         The first row names the columns, with or without a unit: ``T [degC]``. There must be a
         column ``time``, in seconds. A column ``episode`` tells episodes apart; without it, an
-        episode begins where the time goes back. Files of ``RecordSeries`` are such logs.
+        episode begins where the time goes back. An empty cell was not measured. Files of
+        ``RecordSeries`` are such logs.
 
         Args:
             path: The file.
@@ -109,10 +110,20 @@ class PlantLog:
         before = "step" in values if inputs_before is None else inputs_before
         return cls(times, values, units, numbers.astype(np.float64), before, texts)
 
-    def parts(self) -> Iterator[PlantLog]:
-        """The episodes, one by one."""
-        ends = np.flatnonzero(np.diff(self.episodes)) + 1
+    def parts(self, needed: Sequence[str] = ()) -> Iterator[PlantLog]:
+        """The episodes, one by one.
+
+        Args:
+            needed: The columns without which a row is none: an episode ends before it.
+        """
+        lacks = np.zeros(len(self.times), np.bool_)
+        for name in needed:
+            lacks |= np.isnan(self.columns[name])
+        is_new = (np.diff(self.episodes) != 0.0) | (np.diff(lacks) != 0)
+        ends = np.flatnonzero(is_new) + 1
         for rows in np.split(np.arange(len(self.times)), ends):
+            if lacks[rows[0]]:
+                continue
             columns = {name: values[rows] for name, values in self.columns.items()}
             yield replace(
                 self,
@@ -152,17 +163,19 @@ def _heading(text: str) -> tuple[str, str | None]:
 
 
 def _is_numeric(rows: Sequence[Sequence[str]], place: int) -> bool:
-    """Whether a column has a number in its first row; others are remarks."""
+    """Whether the first cell of a column that is not empty is a number; others are remarks."""
+    first = next((row[place] for row in rows if row[place]), "")
     try:
-        float(rows[0][place])
+        float(first)
     except ValueError:
         return False
     return True
 
 
 def _number(path: Any, row: Sequence[str], place: int) -> float:
+    """The number in a cell; NaN for what was not measured."""
     try:
-        return float(row[place])
+        return float(row[place] or "nan")
     except ValueError:
         text = f"{shown(str(path))}: expected a number in column {place + 1}, got {row[place]!r}"
         raise ConfigError(text) from None
@@ -190,8 +203,9 @@ def play_log(
     The log is read at the communication points of the task. Reals are interpolated between its
     rows; everything else, and inputs, hold their value until the next row. The actions are those
     that make the task write the logged inputs. Rewards, observations and ends are the task's own.
-    Where an episode ends, the next one begins with the row that follows. The last episode is
-    truncated by the end of the log. An episode of the log shorter than one time step is left out.
+    Where an episode ends, the next one begins with the row that follows. Where an input or output
+    was not measured, an episode is truncated. So is the last one by the end of the log. An episode
+    of the log shorter than one time step is left out.
 
     Args:
         log: The log. It needs a column for each input and output of the task.
@@ -257,12 +271,13 @@ class _Player:
         if inner.inside.warm_up_steps:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
+        self._needed = *inner.inside.spec.outputs, *inner.inside.spec.inputs
         self._columns = _Columns(inner, log, columns)
         self._actions = Actions(inner, self._columns, tolerance)
 
     def play(self, seed: int) -> list[Recording]:
         episodes: list[Recording] = []
-        for part in self._log.parts():
+        for part in self._log.parts(self._columns.of(*self._needed)):
             times, rows = self._columns.rows(part, self._time_step)
             self._plant.rows, self._plant.row = rows, 0
             while self._plant.left > 0:
@@ -313,6 +328,11 @@ class _Columns:
         """How far apart the values of a variable are; 1 if they are all the same."""
         column, factor, _ = self._from[variable.name]
         return float(np.ptp(self._columns[column]) * abs(factor)) or 1.0
+
+    def of(self, *variables: Variable) -> list[str]:
+        """The names of the columns of variables, as far as there are some."""
+        found = [self._from.get(variable.name) for variable in variables]
+        return [one[0] for one in found if one is not None]
 
     def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
         """The communication points of an episode, and the values of the variables there."""

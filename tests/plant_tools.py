@@ -9,11 +9,16 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 import fmugym
 from fmugym.declared import Task
-from fmugym.episodes.simulation import Player, policy_of
+from fmugym.episodes.simulation import Player, Policy, policy_of
 from fmugym.lab import ManualClock
+from fmugym.plant import connect
 from fmugym.plant.background import Background
+from fmugym.plant.serving import _Twin
+from fmugym.plant.shadow import holding
 
 HOUSE = Path(fmugym.__file__).parent / "envs" / "house.toml"
 STEP = 900.0
@@ -152,6 +157,29 @@ def functions_in(sent):
         codes.add(code)
         sent = sent[6 + length :]
     return codes
+
+
+@contextmanager
+def watched(clock, address, task):
+    """An environment in the shadow of a plant."""
+    env = connect(task, address, physical=True, clock=clock)
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+def changed(monkeypatch, change):
+    """Let servers tell other values: ``change`` takes those by the names of tags."""
+    original = _Twin.values
+    monkeypatch.setattr(_Twin, "values", lambda twin: original(twin) | change(original(twin)))
+
+
+def held_by(shadow):
+    """A policy that proposes something else each time, but holds while values are missing."""
+    numbers = iter(np.linspace(0.1, 0.9, 100))
+    policy = holding(Policy(lambda observation: np.float32([next(numbers)])), shadow)
+    return policy.act
 
 
 @contextmanager

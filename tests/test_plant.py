@@ -5,10 +5,23 @@ import pytest
 
 pytest.importorskip("pymodbus", reason="needs pymodbus, of the extra plant")
 
-from plant_tools import STEP, Line, LockStep, functions_in, house, nothing_left, player
+from plant_tools import (
+    STEP,
+    Line,
+    LockStep,
+    changed,
+    functions_in,
+    held_by,
+    house,
+    nothing_left,
+    player,
+    watched,
+)
 
 import fmugym
 from fmugym.episodes.simulation import action_of, policy_of, simulate
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, play_log
 from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
@@ -117,46 +130,77 @@ class TestShadow:
         env.close()
 
 
+@pytest.fixture
+def line(server):
+    found = Line(server.address)
+    yield found
+    found.close()
+
+
+def tags_with(**others):
+    return dict(house().document["plant"]["tags"]) | others
+
+
 class TestFaults:
     """Clear words, and nothing lost from the record."""
 
-    @pytest.fixture()
-    def line(self, server):
-        found = Line(server.address)
-        yield found
-        found.close()
-
-    def test_a_server_that_goes_and_comes_back(self, server, clock, line, tmp_path):
-        clock.patience = 0.2
+    def test_a_server_that_goes_and_comes_back(self, clock, line, tmp_path):
         task = house(stale_after="5min", hold="20min")
-        env = RecordSeries(watch(server, clock, task, line.address), path=tmp_path / "plant.csv")
-        policy, told = held_by(env), []
-        observation, _ = env.reset(seed=0)
-        for step in range(8):
-            (line.cut if step == 1 else line.mend if step == 5 else str)()
-            observation, *_, info = env.step(policy(observation))
-            told.append((info["missing"], info.get("fault", "")))
-        env.close()
-        assert [bool(missing) for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
+        with watched(clock, line.address, task) as shadow:
+            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            policy, told = held_by(shadow), []
+            observation, _ = env.reset(seed=0)
+            for step in range(8):
+                if step == 1:
+                    clock.patience = 0.1
+                    line.cut()
+                if step == 5:
+                    clock.patience = 3.0
+                    line.mend()
+                observation, *_, info = env.step(policy(observation))
+                told.append((bool(info["missing"]), info.get("fault", "")))
+            env.complete()
+        assert [missing for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
         assert ["T: " in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
         assert "connection" in told[2][1]
         series = env.series
-        assert len(series) == 9
         assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
-        assert len(set(series["proposed.u"][4:6].tolist())) == 1
+        assert len(set(series["proposed.u"][4:7].tolist())) == 1
         assert series.faults.keys() == {2, 3, 4, 5}
+        assert np.all(np.diff(series["time"]) == STEP)
         text = (tmp_path / "plant.csv").read_text(encoding="utf-8")
         assert len(text.splitlines()) == 10
 
-    def test_a_server_that_is_started_anew(self, clock, tmp_path):
+    def test_a_log_with_a_gap_is_two_episodes(self, clock, tmp_path, monkeypatch):
+        gone = []
+        changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
+        task = house(stale_after="1min", hold=0)
+        with (
+            Server(house(), player(), clock=clock) as server,
+            watched(clock, server.address, task) as shadow,
+        ):
+            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            env.reset(seed=0)
+            for step in range(9):
+                gone[:] = [True] * (step in (4, 5))
+                env.step(np.float32([0.5]))
+            env.complete()
+        assert np.isnan(env.series["T"]).tolist() == [k in (5, 6) for k in range(10)]
+        assert "holding 0 has no finite number" in env.series.faults[5]
+        log = PlantLog.read(tmp_path / "plant.csv")
+        found = play_log(log, lambda **more: fmugym.load(house(), physical=True, **more))
+        assert [len(one) for one in found] == [4, 2]
+
+    def test_a_server_that_is_started_anew(self, clock):
         with Server(house(), player(), clock=clock) as first:
             line = Line(first.address)
-            env = watch(first, clock, address=line.address)
+            env = connect(house(), line.address, physical=True, clock=clock)
             env.reset(seed=0)
             env.step(np.float32([0.5]))
-        clock.patience = 0.2
+        clock.patience = 0.1
         *_, info = env.step(np.float32([0.5]))
         assert "T: " in info["fault"]
+        clock.patience = 3.0
         with Server(house(), player(), clock=clock, seed=1) as second:
             line.target = int(second.address.split(":")[1])
             for _ in range(2):
@@ -166,64 +210,80 @@ class TestFaults:
         line.close()
 
     def test_no_server(self, clock):
-        with watch_at("127.0.0.1:9", clock, house(timeout="0.2s")) as env:
-            with pytest.raises(SimulationError, match=r"127.0.0.1.*T: .*connection"):
-                env.reset()
+        task = house(timeout="0.2s")
+        with (
+            watched(clock, "127.0.0.1:9", task) as env,
+            pytest.raises(SimulationError, match=r"T: .*connection"),
+        ):
+            env.reset()
 
     def test_a_tag_that_does_not_exist(self, server, clock):
-        tags = dict(house().document["plant"]["tags"])
-        tags["T_floor"] = {"register": 900, "type": "int16"}
-        with watch_at(server.address, clock, house(tags=tags)) as env:
-            with pytest.raises(ConfigError, match=r"T_floor: holding 900 of unit 1.*no such") as e:
-                env.reset()
-        assert "power" not in str(e.value)
+        task = house(tags=tags_with(T_floor={"register": 900, "type": "int16"}))
+        with (
+            watched(clock, server.address, task) as env,
+            pytest.raises(ConfigError, match=r"T_floor: holding 900 of unit 1.*no such") as told,
+        ):
+            env.reset()
+        assert "power: " not in str(told.value)
 
     def test_a_wrong_type(self, server, clock):
-        tags = dict(house().document["plant"]["tags"])
-        tags["T"] = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
-        with watch_at(server.address, clock, house(tags=tags)) as env:
-            with pytest.raises(ConfigError, match=r"T: .*expected.*10.*30.*'type'"):
-                env.reset()
+        wrong = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
+        with (
+            watched(clock, server.address, house(tags=tags_with(T=wrong))) as env,
+            pytest.raises(ConfigError, match=r"T: got .*expected 10 to 30.*'type'"),
+        ):
+            env.reset()
 
-    def test_a_clock_that_jumps(self, server, clock, monkeypatch):
-        env = watch(server, clock)
-        env.reset(seed=0)
-        env.step(np.float32([0.5]))
-        before = float(env.unwrapped.time)
-        original = server_time(server, monkeypatch, 4 * 3600.0)
-        *_, truncated, info = env.step(np.float32([0.5]))
-        assert truncated
-        assert "clock has jumped by 14400 s" in info["fault"]
-        env.reset()
-        assert float(env.unwrapped.time) >= before + 4 * 3600.0
-        *_, truncated, info = env.step(np.float32([0.5]))
-        assert not truncated
-        assert original is not None
-        env.close()
-
-    def test_answers_that_are_late(self, server, line):
-        """Two seconds on a line: values are old, and nothing waits for them but who asks."""
-        clock = RealClock(60.0)
-        task = house(poll="10s", stale_after="10min")
-        with Server(house(), player(), clock=clock) as late:
-            line.target, line.delay = int(late.address.split(":")[1]), 0.5
-            env = watch(late, clock, task, line.address)
+    def test_a_clock_that_jumps(self, clock, monkeypatch):
+        jump = [0.0]
+        changed(monkeypatch, lambda values: {"clock": (values["clock"][0] + jump[0],)})
+        with (
+            Server(house(), player(), clock=clock) as server,
+            watched(clock, server.address, house()) as env,
+        ):
             env.reset(seed=0)
-            begin = clock.time()
-            for _ in range(1):
-                *_, info = env.step(np.float32([0.5]))
-            assert clock.time() - begin == pytest.approx(STEP, rel=0.2)
+            env.step(np.float32([0.5]))
+            before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
+            *_, truncated, info = env.step(np.float32([0.5]))
+            assert truncated
+            assert "clock has jumped by 14400 s" in info["fault"]
+            env.reset()
+            assert float(env.unwrapped.time) >= before + jump[0]
+            *_, truncated, info = env.step(np.float32([0.5]))
+            assert not truncated
             assert "fault" not in info
-            env.close()
+
+    def test_answers_that_are_two_seconds_late(self):
+        """Values are older then, but ticks come in time."""
+        clock = RealClock(300.0)
+        with Server(house(), player(), clock=clock) as server:
+            line = Line(server.address)
+            line.delay = 2.0 / 3.0  # there are three questions
+            task = house(poll="1min", stale_after="20min", timeout="5s")
+            with watched(clock, line.address, task) as env:
+                env.reset(seed=0)
+                begin = clock.time()
+                *_, info = env.step(np.float32([0.5]))
+                assert clock.time() - begin < 1.5 * STEP
+                assert "fault" not in info
+            line.close()
 
     def test_two_clients(self, server, clock):
-        first, second = (RecordSeries(watch(server, clock)) for _ in range(2))
-        first.reset(seed=0)
-        second.reset(seed=0)
-        for _ in range(3):
-            first.step(np.float32([0.5]))
-            second.step(np.float32([0.2]))
-        first.close()
-        second.close()
-        for name in ("T", "u", "power"):
-            np.testing.assert_allclose(first.series[name], second.series[name], atol=0.62)
+        with (
+            watched(clock, server.address, house()) as one,
+            watched(clock, server.address, house()) as other,
+        ):
+            first, second = RecordSeries(one), RecordSeries(other)
+            first.reset(seed=0)
+            second.reset(seed=0)
+            for _ in range(3):
+                first.step(np.float32([0.5]))
+                second.step(np.float32([0.2]))
+        assert set(first.series["time"]) & set(second.series["time"])
+        _, here, there = np.intersect1d(
+            first.series["time"], second.series["time"], return_indices=True
+        )
+        for name in ("T", "T_floor"):
+            np.testing.assert_allclose(
+                first.series[name][here], second.series[name][there], atol=0.1
+            )

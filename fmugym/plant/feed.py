@@ -124,6 +124,7 @@ class Feed:
         while True:
             self._look(self.clock.time() - self._plant.step, self.clock.time())
             if not self.faults:
+                self._require_fit()
                 return
             told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
             if poller.has_answered and any(poller.trouble(name) for name in names):
@@ -131,6 +132,12 @@ class Feed:
             if poller.is_refused or time.monotonic() > deadline:
                 raise SimulationError(f"the plant at {self._plant['address']}: {told}")
             time.sleep(0.005)
+
+    def _require_fit(self) -> None:
+        """Refuse values that a wrong type would make."""
+        for name, tag in self._plant.tags.items():
+            if strange := tag.misfit(self.values[name][0]):
+                raise ConfigError(f"the plant at {self._plant['address']}: {name}: {strange}")
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import struct
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -47,11 +48,14 @@ def _width(tag: Tag) -> int:
     return struct.calcsize(">" + _FORMATS[tag.address["type"]]) // 2
 
 
-def _numbers(tag: Tag, cells: Sequence[Any]) -> tuple[float, ...]:
-    """The numbers in registers or bits."""
+def _answer(tag: Tag, cells: Sequence[Any]) -> Answer:
+    """The numbers in registers or bits; devices write NaN for what they do not know."""
     width = _width(tag)
     parts = [cells[i : i + width] for i in range(0, tag.count * width, width)]
-    return tuple(tag.conversion(_number(tag, part)) for part in parts)
+    numbers = tuple(tag.conversion(_number(tag, part)) for part in parts)
+    if not all(map(math.isfinite, numbers)):
+        return Answer((), f"{tag.address['kind']} {tag.address['register']} has no finite number")
+    return Answer(numbers)
 
 
 def _number(tag: Tag, cells: Sequence[Any]) -> float:
@@ -114,7 +118,7 @@ class ModbusClient:
 
     def __init__(self, plant: Plant, address: str) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
-        self._exceptions = imported("pymodbus.exceptions", "plant").ModbusException
+        self._exceptions = imported("pymodbus.exceptions", "plant")
         self._host, self._port = host_and_port(address, 502)
         self._timeout, self._blocks = plant["timeout"], _blocks(plant)
         self._client: Any = None
@@ -137,7 +141,7 @@ class ModbusClient:
                 own, why = cells[begin - block.begin : end - block.begin], fault
                 if fault and len(block.tags) > 1:  # one of them may be the reason
                     own, why = await self._ask(block, begin, end)
-                found[tag.name] = Answer((), why) if why else Answer(_numbers(tag, own))
+                found[tag.name] = Answer((), why) if why else _answer(tag, own)
         return found
 
     async def _ask(self, block: _Block, begin: int, end: int) -> tuple[Sequence[Any], str]:
@@ -150,8 +154,10 @@ class ModbusClient:
         }
         try:
             told = await calls[block.kind](begin, count=end - begin, device_id=block.unit_id)
-        except self._exceptions as error:
-            raise LostError(f"it does not answer: {error}") from None
+        except self._exceptions.ConnectionException:
+            raise LostError("the connection is lost") from None
+        except self._exceptions.ModbusException:
+            raise LostError("it does not answer, or not by Modbus") from None
         if told.isError():
             code = told.exception_code
             where = f"{block.kind} {begin} of unit {block.unit_id}"

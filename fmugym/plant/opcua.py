@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
@@ -103,6 +104,8 @@ class OpcUaClient:
             return Answer((), f"node {node}: expected a number, got {shown(value)}")
         if len(numbers) != tag.count:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
+        if not all(map(math.isfinite, numbers)):
+            return Answer((), f"node {node} has no finite number")
         return Answer(tuple(tag.conversion(float(one)) for one in numbers))
 
     async def _nearest(self, node: str) -> str:
@@ -245,6 +248,9 @@ async def _add(
 
     def look(_: Any, attribute: Any) -> Any:
         raw = [tag.conversion.inverse(value) for value in values()[tag.name]]
-        return ua.DataValue(ua.Variant(raw if tag.count > 1 else raw[0], ua.VariantType.Double))
+        value = ua.Variant(raw if tag.count > 1 else raw[0], ua.VariantType.Double)
+        if all(map(math.isfinite, raw)):
+            return ua.DataValue(value)
+        return ua.DataValue(value, ua.StatusCode(ua.StatusCodes.BadSensorFailure))
 
     server.set_attribute_value_callback(node, look)

@@ -15,6 +15,7 @@ import numpy as np
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv
 from fmugym.declared.format import DEVICE
+from fmugym.episodes.simulation import Policy
 from fmugym.plant.feed import Feed, local_time
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
@@ -26,7 +27,7 @@ from fmugym.plant.written import Written, lacking_tag
 from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.task.warm_up import WarmUp, WarmUps
 
-__all__ = ["Shadow", "connect"]
+__all__ = ["Shadow", "connect", "holding"]
 
 _OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
@@ -242,3 +243,15 @@ def _reading(
         return {n: own.inverse(feed.values[alias][0]) for n, (alias, own) in found.items()}
 
     return read, {alias: how.get(name, "last") for name, (alias, _) in found.items()}
+
+
+def holding(policy: Policy, shadow: Shadow) -> Policy:
+    """Make a policy hold its last action while values are missing."""
+    last: list[Any] = []
+
+    def act(observation: Any) -> Any:
+        if not (last and shadow.is_missing):
+            last[:] = [policy.act(observation)]
+        return last[0]
+
+    return Policy(act, policy.begin)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fmugym.archive.units import Conversion, conversion_between
@@ -27,13 +28,25 @@ class Tag:
         entry: Where it is declared; its value has the keys of the address.
         conversion: From the plant's number to the unit of the task.
         count: How many numbers there are.
-        bounds: The lowest and the highest value in the task, infinite where there are none.
+        low, high: The limits of the task, infinite where there are none.
     """
 
     name: str
     entry: Entry
     conversion: Conversion
     count: int = 1
+    low: float = -math.inf
+    high: float = math.inf
+
+    def misfit(self, number: float) -> str:
+        """What is strange about a number, which a wrong type would make; "" if nothing is."""
+        width = self.high - self.low
+        if math.isinf(width) or self.low - width <= number <= self.high + width:
+            return ""
+        return (
+            f"got {number:.6g}, expected {self.low:g} to {self.high:g} or not far from it: are "
+            "'type', 'word_order', 'scale' and 'unit' right?"
+        )
 
     @property
     def address(self) -> Mapping[str, Any]:
@@ -106,11 +119,12 @@ def read_plant(env: TaskEnv) -> Plant:
 
 def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     quantities = env.inside.quantities
-    units = {one.name: one.unit for one in (quantities().all if quantities else ())}
+    known = {one.name: one for one in (quantities().all if quantities else ())}
     for name, one in entry.child("tags").items().items():
-        if name not in units:
-            raise one.error(unknown_name("variable of the task", name, units))
-        yield _tag(env, name, one, units[name])
+        if name not in known:
+            raise one.error(unknown_name("variable of the task", name, known))
+        limits = {"low": known[name].low, "high": known[name].high}
+        yield replace(_tag(env, name, one, known[name].unit), **limits)
     if entry.child("clock").value is not None:
         yield _tag(env, "clock", entry.child("clock"), "s")
     for name, one in entry.child("data").items().items():

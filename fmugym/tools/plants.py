@@ -15,10 +15,11 @@ from fmugym.declared import Task
 from fmugym.declared.quantities import duration
 from fmugym.episodes.output_files import Recording
 from fmugym.episodes.progress_bars import progress
-from fmugym.episodes.simulation import Policy, Summary, simulate
+from fmugym.episodes.simulation import Summary, simulate
 from fmugym.errors import ConfigError, plain, shown
-from fmugym.plant import Server, Shadow, connect
+from fmugym.plant import Server, connect
 from fmugym.plant.predicting import Error
+from fmugym.plant.shadow import holding
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
     Commands,
@@ -74,7 +75,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
         played = shadow
         if arguments.output:
             played = recording.begin("shadow", shadow, arguments.variables, arguments.every)
-        policy = _holding(player.make_policy(shadow.unwrapped), shadow)
+        policy = holding(player.make_policy(shadow.unwrapped), shadow)
         with (
             shown_in_any_case(lambda: _show(arguments, recording, done, shadow.errors())),
             progress(arguments.steps, "shadow") as advance,
@@ -83,18 +84,6 @@ def follow_plant(arguments: argparse.Namespace) -> None:
                 done.append(simulate(played, policy, arguments.seed, left, advance))
                 if not arguments.json:
                     say(plain(done[-1].as_text()))
-
-
-def _holding(policy: Policy, shadow: Shadow) -> Policy:
-    """A policy that holds its last action while values are missing."""
-    last: list[Any] = []
-
-    def act(observation: Any) -> Any:
-        if not (last and shadow.is_missing):
-            last[:] = [policy.act(observation)]
-        return last[0]
-
-    return Policy(act, policy.begin)
 
 
 def _show(
