@@ -41,7 +41,7 @@ CLOCKS = {"modbus": {"register": 100, "type": "float64"}, "opcua": "ns=2;s=Clock
 ADDRESSES = {"modbus": "127.0.0.1:1", "opcua": "opc.tcp://127.0.0.1:1"}
 
 
-def house(protocol="modbus", agent=(), **plant):
+def house(protocol="modbus", agent=(), parameters=(("T_start", 20.0),), **plant):
     """The house as a plant; its agent sees no data."""
     document = tomllib.loads(HOUSE.read_text(encoding="utf-8"))
     for one in document["data"].values():
@@ -52,7 +52,7 @@ def house(protocol="modbus", agent=(), **plant):
     if protocol == "opcua":
         given.setdefault("encryption", False)
     document |= {"agent": seen | dict(agent), "plant": given, "clock": "11-06"}
-    document["parameters"] = {"T_start": 20.0}
+    document["parameters"] = dict(parameters)
     return Task.from_dict(document)
 
 

@@ -19,6 +19,7 @@ from plant_tools import (
 )
 
 import fmugym
+from fmugym.declared.series import read_data
 from fmugym.episodes.simulation import action_of, policy_of, simulate
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.lab import RealClock
@@ -287,3 +288,112 @@ class TestFaults:
             np.testing.assert_allclose(
                 first.series[name][here], second.series[name][there], atol=0.1
             )
+
+
+SEEN = {
+    "observations": ["T", "T_set", "T_out", "price"],
+    "forecast": {"of": ["T_out", "price"], "horizon": "4h", "step": "2h", "error": 0.1},
+}
+
+
+class TestData:
+    @pytest.fixture
+    def prices(self, tmp_path):
+        path = tmp_path / "prices.csv"
+
+        def write(hours, first=309 * 24):
+            rows = [f"{3600 * hour},{hour - 300 * 24}" for hour in range(first, first + hours)]
+            path.write_text("\n".join(["time,ct", *rows, ""]), encoding="utf-8")
+
+        write(48)
+        return path, write
+
+    def task(self, prices, count=3, **plant):
+        data = {
+            "price": {"file": str(prices[0]), "column": "ct", "interpolation": "previous"},
+            "T_out": {"register": 200, "count": count, "step": "2h", "unit": "K"},
+        }
+        return house(agent=SEEN, data=data, stale_after="5min", hold="5min", **plant)
+
+    def test_is_refused_without_a_source(self, prices):
+        data = {"price": self.task(prices).document["plant"]["data"]["price"]}
+        with pytest.raises(ConfigError, match=r"sees 'T_out'.*\[plant.data\]"):
+            connect(house(agent=SEEN, data=data))
+
+    def test_is_refused_if_a_tag_does_not_reach_far_enough(self, prices):
+        with pytest.raises(ConfigError, match=r"T_out.* 14400 s ahead.*got 2 and 7200"):
+            connect(self.task(prices, count=2))
+
+    def test_is_what_the_agent_sees(self, clock, prices):
+        task = self.task(prices)
+        year = fmugym.load(house(), physical=True)
+        table = read_data(year.task.root.child("data").child("T_out"))
+        year.close()
+        with (
+            Server(task, player(), clock=clock) as server,
+            watched(clock, server.address, task) as env,
+        ):
+            observation, _ = env.reset(seed=0)
+            for _ in range(3):
+                names = env.unwrapped.observation_names
+                seen = dict(zip(names, observation.tolist(), strict=True))
+                now = float(env.unwrapped.time)
+                for name, ahead in (("", 0.0), ("[+7200 s]", 7200.0), ("[+14400 s]", 14400.0)):
+                    price = (now + ahead) // 3600 - 300 * 24
+                    assert seen[f"price{name}"] == pytest.approx(price)
+                    outside = np.interp(now + ahead, table.times, table.values)
+                    assert seen[f"T_out{name}"] == pytest.approx(outside, abs=0.15)
+                observation, *_, info = env.step(np.float32([0.3]))
+                assert "fault" not in info
+
+    def test_a_file_that_is_not_refreshed(self, clock, prices):
+        task = self.task(prices)
+        prices[1](5)
+        with (
+            Server(task, player(), clock=clock) as server,
+            watched(clock, server.address, task) as env,
+        ):
+            env.reset(seed=0)
+            infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
+            prices[1](24)
+            *_, info = env.step(np.float32([0.3]))
+        assert infos[0]["missing"] == ()
+        assert infos[-1]["missing"] == ("data.price",)
+        assert "prices.csv" in infos[-1]["fault"]
+        assert "fault" not in info
+
+
+class TestPredictions:
+    def test_of_the_same_fmu_are_right(self, server, clock):
+        task = house(states={"T": "T_start", "T_floor": "T_w_0"})
+        found = {}
+        for name, one in (("states", task), ("offsets", house())):
+            env = connect(one, server.address, physical=True, ahead=3 * STEP, clock=clock)
+            env.reset(seed=0)
+            for _ in range(12):
+                *_, info = env.step(np.float32([0.3]))
+            found[name] = {(e.name, e.ahead): e for e in env.errors()}
+            assert set(info["predicted"]) == {"T", "T_floor", "power"}
+            env.close()
+        for errors in found.values():
+            assert {ahead for _, ahead in errors} == {STEP, 2 * STEP, 3 * STEP}
+            assert errors["T", STEP].rms < 0.1
+            assert errors["T", STEP].count == 12
+            assert errors["T", 3 * STEP].count == 10
+        assert found["states"]["T", 3 * STEP].rms < 0.15
+        assert found["states"]["T_floor", 3 * STEP].rms < 1.0
+
+    def test_tell_that_the_fmu_is_another(self, clock):
+        leaky = house(parameters={"T_start": 20.0, "H_ve": 400.0})
+        found = {}
+        for name, task in (("same", house()), ("another", leaky)):
+            with Server(task, player(), clock=clock) as server:
+                env = connect(house(), server.address, physical=True, ahead=4 * STEP, clock=clock)
+                env.reset(seed=0)
+                for _ in range(16):
+                    env.step(np.float32([0.3]))
+                found[name] = {(e.name, e.ahead): e for e in env.errors()}
+                env.close()
+        same, another = (found[name]["T", 4 * STEP] for name in ("same", "another"))
+        assert another.rms > 3.0 * same.rms
+        assert another.bias < -0.1

@@ -147,21 +147,22 @@ def test_a_wrong_type(server, clock):
         env.reset()
 
 
-class TestEncryption:
-    @pytest.fixture(scope="class")
-    def keys(self, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("keys")
-        found = {}
-        for name in ("client", "other"):
-            key, certificate = folder / f"{name}.pem", folder / f"{name}.der"
-            use = [ExtendedKeyUsageOID.CLIENT_AUTH]
-            names = {"commonName": name}
-            making = setup_self_signed_certificate(key, certificate, URI, "localhost", use, names)
-            asyncio.run(making)
-            key.chmod(0o600)
-            found[name] = {"certificate": str(certificate), "key": str(key)}
-        return found
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("keys")
+    found = {}
+    for name in ("client", "other"):
+        key, certificate = folder / f"{name}.pem", folder / f"{name}.der"
+        use = [ExtendedKeyUsageOID.CLIENT_AUTH]
+        names = {"commonName": name}
+        making = setup_self_signed_certificate(key, certificate, URI, "localhost", use, names)
+        asyncio.run(making)
+        key.chmod(0o600)
+        found[name] = {"certificate": str(certificate), "key": str(key)}
+    return found
 
+
+class TestEncryption:
     def task(self, keys, name="client", **plant):
         return house("opcua", encryption=True, **keys[name], **plant)
 
@@ -197,7 +198,7 @@ class TestEncryption:
             env.reset()
 
     def test_needs_a_certificate(self):
-        with pytest.raises(ConfigError, match="'certificate' and 'key'.*encryption = false"):
+        with pytest.raises(ConfigError, match=r"'certificate' and 'key'.*encryption = false"):
             connect(house("opcua", encryption=True))
 
     def test_secrets_are_files_of_their_owner(self, keys, tmp_path):

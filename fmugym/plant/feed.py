@@ -12,6 +12,7 @@ import numpy as np
 
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import Status
+from fmugym.plant.live import Live
 from fmugym.plant.reading import Poller, Reading
 from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock
@@ -77,6 +78,7 @@ class Feed:
         poller: Poller,
         samplings: Mapping[str, str],
         read: Callable[[], Mapping[str, float]],
+        live: Live,
     ) -> None:
         """Begin to read.
 
@@ -85,8 +87,10 @@ class Feed:
             poller: Reads them.
             samplings: How tags are sampled within a step, where that is not ``"last"``.
             read: Returns the outputs in the FMU's units by name, from ``values``.
+            live: Gets the data of each tick.
         """
         self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
+        self._live = live
         self._held = {name: _Held() for name in plant.tags}
         self._tick = 0.0
 
@@ -116,7 +120,10 @@ class Feed:
         now, step = self._now(), self._plant.step
         self._tick = self.clock.time() + (-now % step)
         self.time, self.jump = now + (-now % step), 0.0
+        self._live.begin()
         self._sleep()
+        if self.faults:
+            raise SimulationError(self._told())
 
     def _wait_for_values(self) -> None:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
@@ -126,12 +133,15 @@ class Feed:
             if not self.faults:
                 self._require_fit()
                 return
-            told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
             if poller.has_answered and any(poller.trouble(name) for name in names):
-                raise ConfigError(f"the plant at {self._plant['address']}: {told}")
+                raise ConfigError(self._told())
             if poller.is_refused or time.monotonic() > deadline:
-                raise SimulationError(f"the plant at {self._plant['address']}: {told}")
+                raise SimulationError(self._told())
             time.sleep(0.005)
+
+    def _told(self) -> str:
+        told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
+        return f"the plant at {self._plant['address']}: {told}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""
@@ -153,6 +163,9 @@ class Feed:
     def _sleep(self) -> None:
         self.clock.sleep(self._tick - self.clock.time())
         self._look(self._tick - self._plant.step, self._tick)
+        faults = self._live.refresh(self.time, self.values)
+        self.faults |= faults
+        self.missing += tuple(faults)
 
     def _now(self) -> float:
         """The plant's time."""

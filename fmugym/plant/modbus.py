@@ -152,6 +152,8 @@ class ModbusClient:
             "coil": self._client.read_coils,
             "discrete": self._client.read_discrete_inputs,
         }
+        if not self._client.connected:
+            raise LostError("the connection is lost")
         try:
             told = await calls[block.kind](begin, count=end - begin, device_id=block.unit_id)
         except self._exceptions.ConnectionException:

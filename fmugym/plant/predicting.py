@@ -96,6 +96,11 @@ class Predictions:
         self._offsets: deque[FloatArray] = deque(maxlen=max(steps, 1))
         self._tick = 0
 
+    @property
+    def envs(self) -> list[TaskEnv]:
+        """The environments of the copies."""
+        return [copy.env for copy in self._copies]
+
     def _outputs(self) -> Iterator[tuple[str, tuple[str, Any]]]:
         """The outputs that have tags: their names in the FMU, and conversions to the task."""
         env = self._copies[0].env

@@ -17,6 +17,7 @@ from fmugym.declared import Task, TaskEnv
 from fmugym.declared.format import DEVICE
 from fmugym.episodes.simulation import Policy
 from fmugym.plant.feed import Feed, local_time
+from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.predicting import Predictions
@@ -200,10 +201,13 @@ def connect(
         make_copy = partial(environment, _without_warm_up(watched).physical())
         copies = Predictions(make_copy, feed, plant, int(ahead / plant.step + 1e-9))
         stack.callback(copies.close)
+        live = Live(env, plant)
+        live.envs += copies.envs
         client = _CLIENTS[plant["protocol"]](plant, address or plant["address"])
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
-        feed.open(plant, poller, samplings | dict.fromkeys(written.names, "median"), read)
+        samplings |= dict.fromkeys(written.names, "median")
+        feed.open(plant, poller, samplings, read, live)
         return Shadow(env, feed, written, copies, stack.pop_all())
 
 
