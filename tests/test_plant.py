@@ -378,8 +378,8 @@ class TestPredictions:
         for errors in found.values():
             assert {ahead for _, ahead in errors} == {STEP, 2 * STEP, 3 * STEP}
             assert errors["T", STEP].rms < 0.1
-            assert errors["T", STEP].count == 12
-            assert errors["T", 3 * STEP].count == 10
+            assert errors["T", STEP].number == 12
+            assert errors["T", 3 * STEP].number == 10
         assert found["states"]["T", 3 * STEP].rms < 0.15
         assert found["states"]["T_floor", 3 * STEP].rms < 1.0
 

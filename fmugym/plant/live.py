@@ -53,14 +53,8 @@ class Live:
         self._ahead = _horizon(root)
         for name in sorted(_seen(root)):
             if name not in self._entries:
-                raise (
-                    root.child("data")
-                    .child(name)
-                    .error(
-                        f"the agent sees {name!r}: say in [plant.data] where it comes from while the "
-                        "plant runs"
-                    )
-                )
+                text = f"the agent sees {name!r}: say in [plant.data] where it comes from"
+                raise root.child("data").child(name).error(text)
         steps = (root.child("agent").child("history").value or {}).get("length", 0.0) / plant.step
         self._past: dict[str, deque[tuple[float, float]]] = {
             name: deque(maxlen=int(steps) + 3) for name in self._entries

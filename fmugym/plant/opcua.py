@@ -99,7 +99,7 @@ class OpcUaClient:
             near = await self._nearest(node) if status.name == "BadNodeIdUnknown" else ""
             return Answer((), f"node {node}: {status.name}{near}")
         value = None if told.Value is None else told.Value.Value
-        numbers = list(value) if isinstance(value, list | tuple) else [value]
+        numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value]
         if not all(isinstance(one, bool | int | float) for one in numbers):
             return Answer((), f"node {node}: expected a number, got {shown(value)}")
         if len(numbers) != tag.count:

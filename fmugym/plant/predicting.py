@@ -30,14 +30,14 @@ class Error(NamedTuple):
         ahead: How far ahead, in seconds.
         rms: The root of the mean squared error, in the unit of the task.
         bias: The mean of what the plant had beyond the prediction.
-        count: How many predictions there were.
+        number: How many predictions there were.
     """
 
     name: str
     ahead: float
     rms: float
     bias: float
-    count: int
+    number: int
 
 
 class _Copy:

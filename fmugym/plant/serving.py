@@ -110,7 +110,8 @@ class _Twin:
         """The time of data after the latest step."""
         env = self._env
         if CLOCK in env.variables:
-            return float(env.variables[CLOCK]) + env.step_count * self._plant.step
+            now: float = env.variables[CLOCK] + env.step_count * self._plant.step
+            return now
         return float(env.time)
 
     def _of_tag(self, name: str, found: Mapping[str, float], time: float) -> tuple[float, ...]:
