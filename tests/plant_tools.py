@@ -13,7 +13,7 @@ import numpy as np
 
 import fmugym
 from fmugym.declared import Task
-from fmugym.episodes.simulation import Player, Policy, policy_of
+from fmugym.episodes.simulation import Policy
 from fmugym.lab import ManualClock
 from fmugym.plant import connect
 from fmugym.plant.background import Background
@@ -28,7 +28,7 @@ TAGS = {
         "T": {"register": 0, "type": "float64", "unit": "K"},
         "T_floor": {"register": 4, "kind": "input", "type": "int16", "scale": 0.01},
         "power": {"register": 20, "word_order": "little", "unit": "W"},
-        "u": {"register": 22, "unit_id": 7},
+        "u": {"register": 19, "kind": "coil", "unit_id": 7},
     },
     "opcua": {
         "T": {"node": "ns=2;s=House.T", "unit": "K"},
@@ -51,13 +51,10 @@ def house(protocol="modbus", agent=(), parameters=(("T_start", 20.0),), **plant)
     given |= {"clock": CLOCKS[protocol], "poll": "1min", "timeout": "20s", **plant}
     if protocol == "opcua":
         given.setdefault("encryption", False)
+    document["variables"]["T_mass"] = {"name": "T_m", "unit": "degC"}
     document |= {"agent": seen | dict(agent), "plant": given, "clock": "11-06"}
     document["parameters"] = dict(parameters)
     return Task.from_dict(document)
-
-
-def player(text="thermostat"):
-    return Player(partial(policy_of, text=text), is_physical=True)
 
 
 class LockStep(ManualClock):

@@ -18,7 +18,6 @@ from plant_tools import (
     held_by,
     house,
     nothing_left,
-    player,
     watched,
 )
 
@@ -42,12 +41,12 @@ def clock():
 
 @pytest.fixture
 def server(clock):
-    with Server(house("opcua"), player(), clock=clock) as found:
+    with Server(house("opcua"), "thermostat", clock=clock) as found:
         yield found
 
 
 def test_records_the_same_as_by_modbus(server, clock):
-    with Server(house("modbus"), player(), clock=clock) as other:
+    with Server(house("modbus"), "thermostat", clock=clock) as other:
         found = []
         for protocol, address in (("opcua", server.address), ("modbus", other.address)):
             with watched(clock, address, house(protocol)) as shadow:
@@ -114,7 +113,7 @@ def test_bad_quality(clock, monkeypatch):
     changed(monkeypatch, lambda values: {"T": (np.nan,)} if bad else {})
     task = house("opcua", stale_after="2min", hold="20min")
     with (
-        Server(task, player(), clock=clock) as server,
+        Server(task, "thermostat", clock=clock) as server,
         watched(clock, server.address, task) as shadow,
     ):
         env = RecordSeries(shadow)
@@ -169,7 +168,7 @@ class TestEncryption:
     def test_reads_by_an_encrypted_line(self, clock, keys, monkeypatch):
         monkeypatch.setenv("FMUGYM_PLANT_USER", "reader")
         monkeypatch.setenv("FMUGYM_PLANT_PASSWORD", "secret of the plant")
-        with Server(self.task(keys), player(), clock=clock) as server:
+        with Server(self.task(keys), "thermostat", clock=clock) as server:
             line = Line(server.address)
             with watched(clock, f"opc.tcp://{line.address}", self.task(keys)) as env:
                 env.reset(seed=0)
@@ -182,7 +181,7 @@ class TestEncryption:
     def test_a_certificate_that_is_refused(self, clock, keys):
         task = self.task(keys, "other")
         with (
-            Server(self.task(keys), player(), clock=clock) as server,
+            Server(self.task(keys), "thermostat", clock=clock) as server,
             watched(clock, server.address, task) as env,
             pytest.raises(SimulationError, match=r"refuses this client: BadCertificateUntrusted"),
         ):
@@ -191,7 +190,7 @@ class TestEncryption:
     def test_a_server_with_another_certificate(self, clock, keys):
         task = self.task(keys, server_certificate=keys["other"]["certificate"])
         with (
-            Server(self.task(keys), player(), clock=clock) as server,
+            Server(self.task(keys), "thermostat", clock=clock) as server,
             watched(clock, server.address, task) as env,
             pytest.raises(SimulationError, match=r"its certificate is not that of '.*other.der'"),
         ):

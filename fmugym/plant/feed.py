@@ -13,7 +13,7 @@ import numpy as np
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.plant.live import Live
-from fmugym.plant.reading import Poller, Reading
+from fmugym.plant.polling import Poller, Reading
 from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock
 
@@ -92,7 +92,7 @@ class Feed:
         self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
         self._live = live
         self._held = {name: _Held() for name in plant.tags}
-        self._tick = 0.0
+        self._tick, self._has_begun = 0.0, False
 
     # The backend.
 
@@ -114,7 +114,7 @@ class Feed:
 
         Raises:
             ConfigError: If the server does not know a tag, or one has a wrong type.
-            SimulationError: If there are none in time.
+            SimulationError: If there are none in time. Once there were some, it waits for ever.
         """
         self._wait_for_values()
         now, step = self._now(), self._plant.step
@@ -122,8 +122,9 @@ class Feed:
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
-        if self.faults:
+        if self.missing and not self._has_begun:
             raise SimulationError(self._told())
+        self._has_begun = True
 
     def _wait_for_values(self) -> None:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
@@ -133,11 +134,13 @@ class Feed:
             if not self.faults:
                 self._require_fit()
                 return
+            time.sleep(0.005)
+            if self._has_begun:
+                continue
             if poller.has_answered and any(poller.trouble(name) for name in names):
                 raise ConfigError(self._told())
             if poller.is_refused or time.monotonic() > deadline:
                 raise SimulationError(self._told())
-            time.sleep(0.005)
 
     def _told(self) -> str:
         told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())

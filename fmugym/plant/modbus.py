@@ -5,27 +5,31 @@ from __future__ import annotations
 import logging
 import math
 import struct
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from itertools import groupby
+from typing import Any, Final, NamedTuple
 
 from fmugym.extras import imported
-from fmugym.plant.reading import Answer, LostError, host_and_port
+from fmugym.plant.polling import Answer, LostError, host_and_port
 from fmugym.plant.tags import Plant, Tag
 
 __all__ = ["ModbusClient", "serve_modbus"]
 
 _FORMATS: Final = {
-    **{
-        f"{sign}int{bits}": letter
-        for sign, letters in (("", "hiq"), ("u", "HIQ"))
-        for bits, letter in zip((16, 32, 64), letters, strict=True)
-    },
+    "int16": "h",
+    "int32": "i",
+    "int64": "q",
+    "uint16": "H",
+    "uint32": "I",
+    "uint64": "Q",
     "float32": "f",
     "float64": "d",
 }
-_BITS: Final = ("coil", "discrete")
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
+
+_CODES: Final = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+"""The functions that read, by what they read."""
 
 _SAID: Final = {
     1: "it does not know this function",
@@ -36,150 +40,152 @@ _SAID: Final = {
     11: "the device does not answer",
 }
 
-_KINDS: Final = ("coil", "discrete", "holding", "input")
+Values = Callable[[], Mapping[str, Sequence[float]]]
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
 
 
+class _Place(NamedTuple):
+    """Registers or bits of a device, from the first one to before the last one."""
+
+    unit_id: int
+    kind: str
+    begin: int
+    end: int
+
+    @property
+    def is_bits(self) -> bool:
+        return self.kind in ("coil", "discrete")
+
+    @classmethod
+    def of(cls, plant: Plant, tag: Tag) -> _Place:
+        where = tag.address
+        unit_id = plant["unit_id"] if where.get("unit_id") is None else where["unit_id"]
+        one = cls(unit_id, where["kind"], where["register"], where["register"] + tag.count)
+        return one if one.is_bits else one._replace(end=one.begin + tag.count * _width(tag))
+
+
 def _width(tag: Tag) -> int:
-    """How many registers or bits a number takes."""
-    if tag.address["kind"] in _BITS:
-        return 1
-    return struct.calcsize(">" + _FORMATS[tag.address["type"]]) // 2
+    """How many registers a number takes."""
+    return struct.calcsize(f">{_FORMATS[tag.address['type']]}") // 2
 
 
-def _answer(tag: Tag, cells: Sequence[Any]) -> Answer:
+def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
     """The numbers in registers or bits; devices write NaN for what they do not know."""
-    width = _width(tag)
-    parts = [cells[i : i + width] for i in range(0, tag.count * width, width)]
-    numbers = tuple(tag.conversion(_number(tag, part)) for part in parts)
+    numbers = [float(cell) for cell in cells]
+    if not place.is_bits:
+        content = struct.pack(f">{len(cells)}H", *_ordered(tag, cells))
+        numbers = [*struct.unpack(f">{tag.count}{_FORMATS[tag.address['type']]}", content)]
     if not all(map(math.isfinite, numbers)):
-        return Answer((), f"{tag.address['kind']} {tag.address['register']} has no finite number")
-    return Answer(numbers)
+        return Answer((), f"{place.kind} {place.begin} has no finite number")
+    return Answer(tuple(map(tag.conversion, numbers)))
 
 
-def _number(tag: Tag, cells: Sequence[Any]) -> float:
-    if tag.address["kind"] in _BITS:
-        return float(cells[0])
-    words = cells if tag.address["word_order"] == "big" else cells[::-1]
-    content = b"".join(word.to_bytes(2, "big") for word in words)
-    return float(struct.unpack(">" + _FORMATS[tag.address["type"]], content)[0])
-
-
-def _cells(tag: Tag, value: float) -> list[int]:
-    """The registers, or the bit, of a value."""
-    number = tag.conversion.inverse(value)
-    if tag.address["kind"] in _BITS:
-        return [int(number > 0.5)]
+def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
+    """The registers, or the bits, of values."""
+    numbers = [tag.conversion.inverse(value) for value in values]
+    if place.is_bits:
+        return [int(number > 0.5) for number in numbers]
     form = _FORMATS[tag.address["type"]]
-    content = struct.pack(">" + form, number if form in "fd" else round(number))
-    words = [int.from_bytes(content[i : i + 2], "big") for i in range(0, len(content), 2)]
-    return words if tag.address["word_order"] == "big" else words[::-1]
+    given = numbers if form in "fd" else map(round, numbers)
+    content = struct.pack(f">{tag.count}{form}", *given)
+    return _ordered(tag, struct.unpack(f">{place.end - place.begin}H", content))
 
 
-class _Block:
-    """Neighbours, which are read at once."""
-
-    def __init__(self, kind: str, unit_id: int, first: Tag) -> None:
-        self.kind, self.unit_id, self.tags = kind, unit_id, [first]
-        self.begin = first.address["register"]
-        self.end = self.begin + first.count * _width(first)
-
-    def takes(self, kind: str, unit_id: int, tag: Tag) -> bool:
-        """Whether a tag follows without a gap, and what it then does."""
-        end = self.end + tag.count * _width(tag)
-        is_next = (kind, unit_id, tag.address["register"]) == (self.kind, self.unit_id, self.end)
-        if not is_next or end - self.begin > _MOST:
-            return False
-        self.tags, self.end = [*self.tags, tag], end
-        return True
-
-
-def _blocks(plant: Plant) -> list[_Block]:
-    placed = [(_place(plant, tag), tag) for tag in plant.tags.values()]
-    found: list[_Block] = []
-    for (kind, unit_id, _), tag in sorted(placed, key=lambda one: one[0]):
-        if not found or not found[-1].takes(kind, unit_id, tag):
-            found.append(_Block(kind, unit_id, tag))
-    return found
-
-
-def _place(plant: Plant, tag: Tag) -> tuple[str, int, int]:
-    unit_id = tag.address.get("unit_id")
-    return (
-        tag.address["kind"],
-        plant["unit_id"] if unit_id is None else unit_id,
-        tag.address["register"],
-    )
+def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
+    """The words with the first one of each number first, or back."""
+    if tag.address["word_order"] == "big":
+        return words
+    width = _width(tag)
+    return [words[i - i % width + width - 1 - i % width] for i in range(len(words))]
 
 
 class ModbusClient:
-    """Reads the tags of a plant; see ``reading.Client``."""
+    """Reads the tags of a plant; see ``polling.Client``."""
 
     def __init__(self, plant: Plant, address: str) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
-        self._exceptions = imported("pymodbus.exceptions", "plant")
+        self._errors = imported("pymodbus.exceptions", "plant")
         self._host, self._port = host_and_port(address, 502)
-        self._timeout, self._blocks = plant["timeout"], _blocks(plant)
+        self._timeout = plant["timeout"]
+        self._places = {name: _Place.of(plant, tag) for name, tag in plant.tags.items()}
+        self._blocks = self._neighbours(plant)
         self._client: Any = None
 
+    def _neighbours(self, plant: Plant) -> list[list[Tag]]:
+        """The tags that are read at once, since they follow each other without a gap."""
+        found: list[list[Tag]] = []
+        for tag in sorted(plant.tags.values(), key=lambda tag: self._places[tag.name]):
+            place = self._places[tag.name]
+            if found:
+                first, last = (self._places[found[-1][i].name] for i in (0, -1))
+                is_next = (*last[:2], last.end) == place[:3]
+                if is_next and place.end - first.begin <= _MOST:
+                    found[-1].append(tag)
+                    continue
+            found.append([tag])
+        return found
+
     async def connect(self) -> None:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
         self._client = self._client_of(self._host, port=self._port, **options)
         if not await self._client.connect():
             raise LostError("it refuses the connection, or does not answer")
 
     async def read(self) -> dict[str, Answer]:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         found: dict[str, Answer] = {}
         for block in self._blocks:
-            cells, fault = await self._ask(block, block.begin, block.end)
-            for tag in block.tags:
-                begin = tag.address["register"]
-                end = begin + tag.count * _width(tag)
-                own, why = cells[begin - block.begin : end - block.begin], fault
-                if fault and len(block.tags) > 1:  # one of them may be the reason
-                    own, why = await self._ask(block, begin, end)
-                found[tag.name] = Answer((), why) if why else _answer(tag, own)
+            found |= await self._read(block)
         return found
 
-    async def _ask(self, block: _Block, begin: int, end: int) -> tuple[Sequence[Any], str]:
+    async def _read(self, block: Sequence[Tag]) -> dict[str, Answer]:
+        first, last = (self._places[block[i].name] for i in (0, -1))
+        cells, fault = await self._ask(first._replace(end=last.end))
+        if not fault:
+            places = [(tag, self._places[tag.name]) for tag in block]
+            return {
+                tag.name: _answer(tag, one, cells[one.begin - first.begin : one.end - first.begin])
+                for tag, one in places
+            }
+        if len(block) == 1:
+            return {block[0].name: Answer((), fault)}
+        found: dict[str, Answer] = {}
+        for tag in block:  # one of them may be the reason
+            found |= await self._read([tag])
+        return found
+
+    async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
         """The registers or bits, and what the server says instead."""
-        calls = {
-            "holding": self._client.read_holding_registers,
-            "input": self._client.read_input_registers,
-            "coil": self._client.read_coils,
-            "discrete": self._client.read_discrete_inputs,
-        }
-        if not self._client.connected:
+        client, count = self._client, place.end - place.begin
+        ask = {
+            "holding": client.read_holding_registers,
+            "input": client.read_input_registers,
+            "coil": client.read_coils,
+            "discrete": client.read_discrete_inputs,
+        }[place.kind]
+        if not client.connected:
             raise LostError("the connection is lost")
         try:
-            told = await calls[block.kind](begin, count=end - begin, device_id=block.unit_id)
-        except self._exceptions.ConnectionException:
+            told = await ask(place.begin, count=count, device_id=place.unit_id)
+        except self._errors.ConnectionException:
             raise LostError("the connection is lost") from None
-        except self._exceptions.ModbusException:
+        except self._errors.ModbusException:
             raise LostError("it does not answer, or not by Modbus") from None
         if told.isError():
-            code = told.exception_code
-            where = f"{block.kind} {begin} of unit {block.unit_id}"
+            code, where = told.exception_code, f"{place.kind} {place.begin} of unit {place.unit_id}"
             return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
-        return (told.bits if block.kind in _BITS else told.registers), ""
+        return (told.bits[:count] if place.is_bits else told.registers), ""
 
     async def close(self) -> None:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         if self._client is not None:
             self._client.close()
 
 
-# The server.
-
-
 async def serve_modbus(
-    plant: Plant,
-    port: int,
-    values: Callable[[], Mapping[str, Sequence[float]]],
-    bound: Callable[[str], None],
+    plant: Plant, port: int, values: Values, bound: Callable[[str], None]
 ) -> Callable[[], Awaitable[None]]:
     """Serve tags on the loopback.
 
@@ -193,7 +199,10 @@ async def serve_modbus(
         What ends it.
     """
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
-    devices = [_device(unit, own, values) for unit, own in _by_unit(plant).items()]
+    found = [(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
+    placed = sorted(found, key=lambda one: one[0])
+    units = groupby(placed, key=lambda one: one[0].unit_id)
+    devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
     bound(f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}")
@@ -201,16 +210,7 @@ async def serve_modbus(
     return ended
 
 
-def _by_unit(plant: Plant) -> dict[int, list[_Block]]:
-    found: dict[int, list[_Block]] = {}
-    for block in _blocks(plant):
-        found.setdefault(block.unit_id, []).append(block)
-    return found
-
-
-def _device(
-    unit_id: int, blocks: list[_Block], values: Callable[[], Mapping[str, Sequence[float]]]
-) -> Any:
+def _device(unit_id: int, placed: Sequence[tuple[_Place, Tag]], values: Values) -> Any:
     """A device whose registers are written anew before each reading."""
     simulator = imported("pymodbus.simulator", "plant")
     refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
@@ -220,38 +220,31 @@ def _device(
     ) -> Any:
         if written is not None:
             return refused
-        kind = {1: "coil", 2: "discrete", 3: "holding", 4: "input"}[code]
         now = values()
-        for block in (one for one in blocks if one.kind == kind):
-            cells = [cell for tag in block.tags for v in now[tag.name] for cell in _cells(tag, v)]
-            _place_cells(kind, registers, block.begin, start, cells)
+        for place, tag in placed:
+            if _CODES[place.kind] == code:
+                _put(registers, start, place, _cells(tag, place, now[tag.name]))
         return None
 
-    areas = tuple([*_area(simulator, kind, blocks)] for kind in _KINDS)
+    areas = tuple([_area(simulator, kind, placed)] for kind in _CODES)
     return simulator.SimDevice(unit_id, areas, action=look)
 
 
-def _place_cells(
-    kind: str, registers: list[int], begin: int, start: int, cells: Sequence[int]
-) -> None:
-    if kind not in _BITS:
-        registers[begin - start : begin - start + len(cells)] = cells
+def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) -> None:
+    if not place.is_bits:
+        registers[place.begin - start : place.end - start] = cells
         return
-    for place, bit in enumerate(cells, begin - 16 * start):
-        word, mask = place // 16, 1 << (place % 16)
+    for at, bit in enumerate(cells, place.begin - 16 * start):
+        word, mask = at // 16, 1 << (at % 16)
         registers[word] = registers[word] | mask if bit else registers[word] & ~mask
 
 
-def _area(simulator: Any, kind: str, blocks: Sequence[_Block]) -> Iterator[Any]:
+def _area(simulator: Any, kind: str, placed: Sequence[tuple[_Place, Tag]]) -> Any:
     """What the library needs to know of the registers of a kind, or of the bits."""
-    own = [block for block in blocks if block.kind == kind]
-    if kind in _BITS:
-        bits = max([block.end for block in own], default=1)
-        form = simulator.DataType.BITS
-        yield simulator.SimData(0, values=[False] * (-(-bits // 16) * 16), datatype=form)
-        return
-    for block in own:
-        form, size = simulator.DataType.REGISTERS, block.end - block.begin
-        yield simulator.SimData(block.begin, count=size, datatype=form)
-    if not own:
-        yield simulator.SimData(0)
+    own = [place for place, _ in placed if place.kind == kind] or [_Place(0, kind, 0, 1)]
+    begin, end = min(one.begin for one in own), max(one.end for one in own)
+    if own[0].is_bits:
+        bits = [False] * (-(-end // 16) * 16)
+        return simulator.SimData(0, values=bits, datatype=simulator.DataType.BITS)
+    form = simulator.DataType.REGISTERS
+    return simulator.SimData(begin, count=end - begin, datatype=form)

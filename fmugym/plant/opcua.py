@@ -14,7 +14,7 @@ from typing import Any, Final
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.plant.reading import Answer, LostError, RefusedError
+from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
 
@@ -30,7 +30,7 @@ logging.getLogger("asyncua").addHandler(logging.NullHandler())
 
 
 class OpcUaClient:
-    """Reads the tags of a plant; see ``reading.Client``."""
+    """Reads the tags of a plant; see ``polling.Client``."""
 
     def __init__(self, plant: Plant, address: str) -> None:
         self._ua, self._client_of = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
@@ -44,7 +44,7 @@ class OpcUaClient:
         self._near: dict[str, str] | None = None
 
     async def connect(self) -> None:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         self._client = self._client_of.Client(self._address, timeout=self._plant["timeout"])
         if self._user is not None:
             self._client.set_user(self._user[0])
@@ -82,7 +82,7 @@ class OpcUaClient:
             raise RefusedError(f"its certificate is not that of {shown(str(path))}")
 
     async def read(self) -> dict[str, Answer]:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         attribute = self._ua.AttributeIds.Value
         try:
             told = await self._client.uaclient.read_attributes(self._nodes, attribute)
@@ -129,7 +129,7 @@ class OpcUaClient:
                     yield child.nodeid.to_string()
 
     async def close(self) -> None:
-        """See ``reading.Client``."""
+        """See ``polling.Client``."""
         if self._client is not None:
             client, self._client = self._client, None
             with suppress(self._ua.UaError, OSError, TimeoutError):

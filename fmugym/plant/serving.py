@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from types import TracebackType
 from typing import Any, Final, Self
 
@@ -14,7 +15,7 @@ import numpy as np
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.naming import CLOCK
 from fmugym.declared.series import Series, read_data
-from fmugym.episodes.simulation import Player, Policy
+from fmugym.episodes.simulation import Player, Policy, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
 from fmugym.plant.background import Background
 from fmugym.plant.modbus import serve_modbus
@@ -126,6 +127,12 @@ def _at(series: Series, times: Any) -> Any:
     return np.interp((times - series.start) % series.period, series.times, series.values)
 
 
+def _player_of(text: str) -> Player:
+    is_random = text == "random"
+    make_policy = partial(action_of if is_random else policy_of, text=text)
+    return Player(make_policy, is_physical=not is_random)
+
+
 class Server:
     """Serves the FMU of a task on the loopback, as the plant that its ``[plant]`` describes.
 
@@ -134,7 +141,7 @@ class Server:
 
     Args:
         config: The task, as for ``fmugym.load``.
-        player: Who acts.
+        player: Who acts; or ``"random"``, or a controller as in a task file.
         port: The port; 0 for a free one.
         clock: Tells the time; by default that of the machine.
         seed: Of the episode.
@@ -151,14 +158,15 @@ class Server:
     def __init__(
         self,
         config: Any,
-        player: Player,
+        player: Player | str,
         *,
         port: int = 0,
         clock: Clock | None = None,
         seed: int = 0,
         steps: int | None = None,
     ) -> None:
-        self._task, self._player, self._port = endless(Task.of(config)), player, port
+        self._task, self._port = endless(Task.of(config)), port
+        self._player = _player_of(player) if isinstance(player, str) else player
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
         self.address, self._is_bound = "", threading.Event()
         self._background = Background(self._serve, "plant server")

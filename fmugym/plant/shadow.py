@@ -20,8 +20,8 @@ from fmugym.plant.feed import Feed, local_time
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
+from fmugym.plant.polling import Poller
 from fmugym.plant.predicting import Predictions
-from fmugym.plant.reading import Poller
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import Plant, in_fmu, read_plant
 from fmugym.plant.written import Written, lacking_tag

@@ -121,8 +121,10 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
     quantities = env.inside.quantities
     known = {one.name: one for one in (quantities().all if quantities else ())}
     for name, one in entry.child("tags").items().items():
+        if name not in known and name in (others := _others(env)):
+            continue  # a variable of the FMU that the task does not read
         if name not in known:
-            raise one.error(unknown_name("variable of the task", name, known))
+            raise one.error(unknown_name("variable of the task", name, [*known, *others]))
         limits = {"low": known[name].low, "high": known[name].high}
         yield replace(_tag(env, name, one, known[name].unit), **limits)
     if entry.child("clock").value is not None:
@@ -132,6 +134,10 @@ def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
             raise one.error(unknown_name("data", name, data))
         if "file" not in one.value:
             yield _tag(env, DATA + name, one, data[name].get("unit", ""))
+
+
+def _others(env: TaskEnv) -> set[str]:
+    return {*env.task.document.get("variables", ()), *env.fmu.description.variables}
 
 
 def _tag(env: TaskEnv, name: str, entry: Entry, unit: str) -> Tag:
