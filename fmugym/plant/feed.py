@@ -128,8 +128,9 @@ class Feed:
 
     def _wait_for_values(self) -> None:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
-        poller, names = self._poller, self._plant.tags
+        poller = self._poller
         while True:
+            has_answered = poller.has_answered
             self._look(self.clock.time() - self._plant.step, self.clock.time())
             if not self.faults:
                 self._require_fit()
@@ -137,20 +138,20 @@ class Feed:
             time.sleep(0.005)
             if self._has_begun:
                 continue
-            if poller.has_answered and any(poller.trouble(name) for name in names):
+            if has_answered and any(map(poller.trouble, self._plant.tags)):
                 raise ConfigError(self._told())
             if poller.is_refused or time.monotonic() > deadline:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:
         told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
-        return f"the plant at {self._plant['address']}: {told}"
+        return f"the plant at {self._plant.address}: {told}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""
         for name, tag in self._plant.tags.items():
             if strange := tag.misfit(self.values[name][0]):
-                raise ConfigError(f"the plant at {self._plant['address']}: {name}: {strange}")
+                raise ConfigError(f"the plant at {self._plant.address}: {name}: {strange}")
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""

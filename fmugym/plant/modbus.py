@@ -103,10 +103,10 @@ def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
 class ModbusClient:
     """Reads the tags of a plant; see ``polling.Client``."""
 
-    def __init__(self, plant: Plant, address: str) -> None:
+    def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
         self._errors = imported("pymodbus.exceptions", "plant")
-        self._host, self._port = host_and_port(address, 502)
+        self._host, self._port = host_and_port(plant.address, 502)
         self._timeout = plant["timeout"]
         self._places = {name: _Place.of(plant, tag) for name, tag in plant.tags.items()}
         self._blocks = self._neighbours(plant)

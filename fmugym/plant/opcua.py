@@ -32,10 +32,10 @@ logging.getLogger("asyncua").addHandler(logging.NullHandler())
 class OpcUaClient:
     """Reads the tags of a plant; see ``polling.Client``."""
 
-    def __init__(self, plant: Plant, address: str) -> None:
+    def __init__(self, plant: Plant) -> None:
         self._ua, self._client_of = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
         self._plant, self._tags = plant, list(plant.tags.values())
-        self._address = address if "://" in address else f"opc.tcp://{address}"
+        self._address = plant.address if "://" in plant.address else f"opc.tcp://{plant.address}"
         with plant.entry.placing():
             self._user = credentials(plant.get("credentials"))
             self._keys = _keys_of(plant)

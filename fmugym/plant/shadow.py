@@ -194,7 +194,7 @@ def connect(
     with ExitStack() as stack:
         env = environment(own, backend=feed)
         stack.callback(env.close)
-        plant = read_plant(env)
+        plant = read_plant(env, address)
         written = Written(env, feed, plant)
         read, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
@@ -203,7 +203,7 @@ def connect(
         stack.callback(copies.close)
         live = Live(env, plant)
         live.envs += copies.envs
-        client = _CLIENTS[plant["protocol"]](plant, address or plant["address"])
+        client = _CLIENTS[plant["protocol"]](plant)
         poller = Poller(client, clock, plant.poll, plant["timeout"])
         stack.callback(poller.stop)
         samplings |= dict.fromkeys(written.names, "median")

@@ -61,12 +61,14 @@ class Plant:
 
     Attributes:
         entry: Where it stands.
+        address: That of the server.
         tags: By name.
         step: The time step of the task in seconds.
         poll, stale_after, hold: In seconds.
     """
 
     entry: Entry
+    address: str
     tags: Mapping[str, Tag]
     step: float
     poll: float
@@ -98,11 +100,12 @@ def in_fmu(env: TaskEnv) -> dict[str, tuple[Variable, Conversion]]:
     return found
 
 
-def read_plant(env: TaskEnv) -> Plant:
+def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
     """Read the section of a plant.
 
     Args:
         env: The environment of its task.
+        address: In the place of that of the task.
 
     Raises:
         ConfigError: If there is none, or a name or a unit is wrong. The text says where.
@@ -114,7 +117,8 @@ def read_plant(env: TaskEnv) -> Plant:
     poll = entry.value.get("poll") or step / 10
     stale = entry.value.get("stale_after") or 3 * poll
     hold = entry.value.get("hold")
-    return Plant(entry, tags, step, poll, stale, step if hold is None else hold)
+    address = address or entry.value["address"]
+    return Plant(entry, address, tags, step, poll, stale, step if hold is None else hold)
 
 
 def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
