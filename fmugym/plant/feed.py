@@ -130,7 +130,7 @@ class Feed:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
         poller = self._poller
         while True:
-            has_answered = poller.has_answered
+            has_answered, is_refused = poller.has_answered, poller.is_refused
             self._look(self.clock.time() - self._plant.step, self.clock.time())
             if not self.faults:
                 self._require_fit()
@@ -140,7 +140,7 @@ class Feed:
                 continue
             if has_answered and any(map(poller.trouble, self._plant.tags)):
                 raise ConfigError(self._told())
-            if poller.is_refused or time.monotonic() > deadline:
+            if is_refused or time.monotonic() > deadline:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,6 +16,7 @@ from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
+from fmugym.signals import Ignoring
 
 __all__ = ["OpcUaClient", "serve_opcua"]
 
@@ -132,7 +132,7 @@ class OpcUaClient:
         """See ``polling.Client``."""
         if self._client is not None:
             client, self._client = self._client, None
-            with suppress(self._ua.UaError, OSError, TimeoutError):
+            with Ignoring(Exception):  # there may be nobody to say goodbye to
                 await client.disconnect()
 
 

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple, Protocol
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.plant.background import Background
 from fmugym.pool.backend.clocks import Clock
+from fmugym.signals import ordinary
 
 __all__ = ["Answer", "Client", "LostError", "Poller", "Reading", "RefusedError", "host_and_port"]
 
@@ -93,11 +94,12 @@ class Poller:
         while True:
             try:
                 await self._converse()
-            except (LostError, OSError) as error:
-                self.is_refused = isinstance(error, RefusedError)
-                self._note(str(error))
             except TimeoutError:
                 self._note(f"it does not answer within {self._timeout:g} s")
+            except ordinary(Exception) as error:  # whatever a library makes of a broken line
+                is_own = isinstance(error, LostError)
+                self._note(str(error) if is_own else f"{type(error).__name__}: {error}")
+                self.is_refused = isinstance(error, RefusedError)
             finally:
                 await self._client.close()
             await asyncio.sleep(self._interval / self._speed)
