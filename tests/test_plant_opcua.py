@@ -207,6 +207,13 @@ class TestEncryption:
         with pytest.raises(ConfigError, match=r"mode 644.*expected 600"):
             connect(house("opcua", credentials=str(secret)))
 
+    def test_no_password_goes_over_an_open_line(self, monkeypatch):
+        monkeypatch.setenv("FMUGYM_PLANT_USER", "reader")
+        monkeypatch.setenv("FMUGYM_PLANT_PASSWORD", "secret of the plant")
+        with pytest.raises(ConfigError, match="without encryption") as told:
+            connect(house("opcua"))
+        assert "secret of" not in str(told.value)
+
     def test_task_files_have_no_secrets(self):
         with pytest.raises(ConfigError, match=r"'password' is no key of \[plant\]: .*credentials"):
             house("opcua", password="x").root  # noqa: B018

@@ -39,9 +39,11 @@ class OpcUaClient:
         with plant.entry.placing():
             self._user = credentials(plant.get("credentials"))
             self._keys = _keys_of(plant)
+            if self._user is not None and self._keys is None:
+                raise ConfigError("without encryption, everybody on the line reads the password")
         self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
         self._client: Any = None
-        self._near: dict[str, str] | None = None
+        self._known: list[str] | None = None
 
     async def connect(self) -> None:
         """See ``polling.Client``."""
@@ -110,15 +112,12 @@ class OpcUaClient:
 
     async def _nearest(self, node: str) -> str:
         """The node that was probably meant, in words."""
-        if self._near is None:
-            self._near = {}
-            known = [one async for one in self._known()]
-            for tag in self._tags:
-                near = get_close_matches(tag.address["node"], known, n=1)
-                self._near |= {tag.address["node"]: f"; did you mean {near[0]}?"} if near else {}
-        return self._near.get(node, "")
+        if self._known is None:
+            self._known = [one async for one in self._browsed()]
+        near = get_close_matches(node, self._known, n=1)
+        return f"; did you mean {near[0]}?" if near else ""
 
-    async def _known(self) -> AsyncIterator[str]:
+    async def _browsed(self) -> AsyncIterator[str]:
         """The ids of the first nodes below the objects of the server, but not its own."""
         left, count = [self._client.nodes.objects], 0
         while left and count < _MOST_NODES:
