@@ -406,6 +406,28 @@ class TestPredictions:
         assert another.bias < -0.1
 
 
+class TestServer:
+    def test_tells_what_sensors_show(self, clock):
+        task = house()
+        task.document["variables"]["T"]["noise"] = 0.5
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            watched(clock, server.address, house()) as shadow,
+        ):
+            env = RecordSeries(shadow)
+            env.reset(seed=0)
+            for _ in range(10):
+                env.step(np.float32([0.5]))
+        assert np.diff(env.series["T"], 2).std() > 0.5
+        assert np.diff(env.series["T_floor"], 2).std() < 5.0
+
+    def test_ends_after_its_steps(self, clock):
+        with Server(house(), "random", clock=clock, steps=2) as server:
+            assert not server.wait(0.0)
+            clock.advance(3 * STEP)
+            assert server.wait(20.0)
+
+
 class TestCommands:
     @pytest.fixture
     def file(self, tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from fmugym.declared import Task, TaskEnv, load
+from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import CLOCK
 from fmugym.declared.series import Series, read_data
 from fmugym.episodes.simulation import Player, Policy, action_of, policy_of
@@ -62,6 +63,7 @@ class _Twin:
         assert env.inside.quantities is not None
         self._quantities = env.inside.quantities()
         self._is_late, self._is_straight = self._shapes()
+        self._sensors = self._places_of_sensors()
         self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
         policy.begin()
         self._observation, _ = env.reset(seed=seed)
@@ -81,8 +83,24 @@ class _Twin:
             straight.append(one.kind in ("output", "data") and is_real and not one.holds)
         return np.array(late), np.array(straight)
 
+    def _places_of_sensors(self) -> dict[int, int]:
+        """What sensors show in the observation, by the places of the quantities."""
+        names = self._env.observation_names or ()
+        if "normalize" in self._env.unphysical_keys:
+            return {}
+        declared = self._env.task.document.get("variables", {})
+        return {
+            place: names.index(one.name)
+            for place, one in enumerate(self._quantities.all)
+            if one.kind == "output" and one.name in names
+            if DEVICE.keys() & declared.get(one.name, {}).keys()
+        }
+
     def _read(self) -> Any:
-        return np.array(self._quantities.read(self._env), np.float64)
+        found = np.array(self._quantities.read(self._env), np.float64)
+        for place, seen in self._sensors.items():
+            found[place] = self._observation[seen]
+        return found
 
     def _advance(self) -> None:
         self._before = self._after
@@ -137,7 +155,8 @@ class Server:
     """Serves the FMU of a task on the loopback, as the plant that its ``[plant]`` describes.
 
     Nothing can be written from outside. Values between two steps lie on straight lines; those that
-    hold, and what acts, do not.
+    hold, and what acts, do not. Where an agent's observations are not normalized, they are what the
+    sensors of the task show, with noise and delay.
 
     Args:
         config: The task, as for ``fmugym.load``.
