@@ -362,7 +362,7 @@ class TestData:
             prices[1](24)
             *_, info = env.step(np.float32([0.3]))
         assert infos[0]["missing"] == ()
-        assert infos[-1]["missing"] == ("data.price",)
+        assert infos[-1]["missing"] == ("price",)
         assert "prices.csv" in infos[-1]["fault"]
         assert "fault" not in info
 

@@ -23,7 +23,7 @@ from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.polling import Poller
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import Plant, in_fmu, read_plant
+from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
 from fmugym.plant.written import Written, lacking_tag
 from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.task.warm_up import WarmUp, WarmUps
@@ -153,7 +153,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
         told: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
-        told["missing"] = feed.missing
+        told["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
         return told | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:

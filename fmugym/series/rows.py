@@ -218,11 +218,10 @@ class Rows:
 
     def _leave_out(self, values: FloatArray, infos: Infos) -> None:
         """Leave out what a plant has not told: the environment goes on with older values."""
-        names = [quantity.name for quantity in self._choice.quantities]
         for index, missing in infos.each("missing").items():
-            row = self._indices == index
-            for name in filter(names.__contains__, missing):
-                values[row, names.index(name)] = np.nan
+            for place, quantity in enumerate(self._choice.quantities):
+                if quantity.name in missing:
+                    values[self._indices == index, place] = np.nan
 
     def _values(self, observations: Any) -> FloatArray:
         """What they have, and what they observe."""
