@@ -83,7 +83,7 @@ EXAMPLES: Final = {
         "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96 --output frost.html",
         "fmugym simulate house.toml --output minari:house/measured-v0 --log week.csv "
         "--column pump_speed=u",
-        "fmugym simulate house.toml --plant --agent agent --steps 1344 --ahead 6h --output shadow.csv",
+        "fmugym simulate house.toml --plant --agent agent --ahead 6h --output shadow.csv",
     ),
     "train": (
         "fmugym train examples/cart_pole.toml --output agent --minutes 0.1",
