@@ -300,6 +300,14 @@ SEEN = {
 }
 
 
+@pytest.mark.parametrize("name", ["u", "T_floor"])
+def test_a_task_whose_tags_do_not_suffice(name):
+    tags = tags_with()
+    del tags[name]
+    with pytest.raises(ConfigError, match=r"\[plant\] has no tag for '(u|T_w)'"):
+        connect(house(tags=tags))
+
+
 class TestData:
     @pytest.fixture
     def prices(self, tmp_path):

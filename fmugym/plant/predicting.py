@@ -154,7 +154,7 @@ class Predictions:
         for copy in failed:
             self._restart(copy)
         self._tick += 1
-        if self._states:
+        if self._states and not self._states.keys() & self._feed.faults.keys():
             self._restart(self._copies[self._tick % len(self._copies)])
         return dict(zip(self.names, told.tolist(), strict=True))
 

@@ -30,16 +30,24 @@ class Written:
     Args:
         env: The environment. Its hook ``_get_inputs`` becomes one that reads the plant.
         feed: Has what acts.
+        plant: Has the tags.
+
+    Raises:
+        ConfigError: If an action has no tag.
     """
 
     def __init__(self, env: TaskEnv, feed: Feed, plant: Plant) -> None:
         self._feed, self._inputs = feed, env.inside.spec.inputs
         places = {variable.name: place for place, variable in enumerate(self._inputs)}
-        self._tags = [
-            (places[variable.name], alias, conversion)
+        written = {
+            alias: (places[variable.name], alias, conversion)
             for alias, (variable, conversion) in in_fmu(env).items()
-            if variable.name in places and alias in plant.tags
-        ]
+            if variable.name in places
+        }
+        for alias in env.task.root.child("agent").child("actions").value or ():
+            if alias in written and alias not in plant.tags:
+                raise lacking_tag(alias)
+        self._tags = [one for alias, one in written.items() if alias in plant.tags]
         self.actions = Actions(env, self, math.inf)
         self._own = env._get_inputs
         env._get_inputs = self._get_inputs  # type: ignore[method-assign]
