@@ -19,7 +19,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,7 @@ from fmugym.series.store import TEXT
 from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
-__all__ = ["Columns", "PlantLog", "declared_as", "play_log"]
+__all__ = ["Actions", "Columns", "PlantLog", "declared_as", "play_log"]
 
 _HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*$")
 _INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
@@ -77,7 +77,8 @@ class PlantLog:
 
         The first row names the columns, with or without a unit: ``T [degC]``. There must be a
         column ``time``, in seconds. A column ``episode`` tells episodes apart; without it, an
-        episode begins where the time goes back. Files of ``RecordSeries`` are such logs.
+        episode begins where the time goes back. An empty cell was not measured. Files of
+        ``RecordSeries`` are such logs.
 
         Args:
             path: The file.
@@ -109,10 +110,20 @@ class PlantLog:
         before = "step" in values if inputs_before is None else inputs_before
         return cls(times, values, units, numbers.astype(np.float64), before, texts)
 
-    def parts(self) -> Iterator[PlantLog]:
-        """The episodes, one by one."""
-        ends = np.flatnonzero(np.diff(self.episodes)) + 1
+    def parts(self, needed: Sequence[str] = ()) -> Iterator[PlantLog]:
+        """The episodes, one by one.
+
+        Args:
+            needed: The columns without which a row is none: an episode ends before it.
+        """
+        lacks = np.zeros(len(self.times), np.bool_)
+        for name in needed:
+            lacks |= np.isnan(self.columns[name])
+        is_new = (np.diff(self.episodes) != 0.0) | (np.diff(lacks) != 0)
+        ends = np.flatnonzero(is_new) + 1
         for rows in np.split(np.arange(len(self.times)), ends):
+            if lacks[rows[0]]:
+                continue
             columns = {name: values[rows] for name, values in self.columns.items()}
             yield replace(
                 self,
@@ -152,17 +163,19 @@ def _heading(text: str) -> tuple[str, str | None]:
 
 
 def _is_numeric(rows: Sequence[Sequence[str]], place: int) -> bool:
-    """Whether a column has a number in its first row; others are remarks."""
+    """Whether the first cell of a column that is not empty is a number; others are remarks."""
+    first = next((row[place] for row in rows if row[place]), "")
     try:
-        float(rows[0][place])
+        float(first)
     except ValueError:
         return False
     return True
 
 
 def _number(path: Any, row: Sequence[str], place: int) -> float:
+    """The number in a cell; NaN for what was not measured."""
     try:
-        return float(row[place])
+        return float(row[place] or "nan")
     except ValueError:
         text = f"{shown(str(path))}: expected a number in column {place + 1}, got {row[place]!r}"
         raise ConfigError(text) from None
@@ -190,8 +203,9 @@ def play_log(
     The log is read at the communication points of the task. Reals are interpolated between its
     rows; everything else, and inputs, hold their value until the next row. The actions are those
     that make the task write the logged inputs. Rewards, observations and ends are the task's own.
-    Where an episode ends, the next one begins with the row that follows. The last episode is
-    truncated by the end of the log. An episode of the log shorter than one time step is left out.
+    Where an episode ends, the next one begins with the row that follows. Where an input or output
+    was not measured, an episode is truncated. So is the last one by the end of the log. An episode
+    of the log shorter than one time step is left out.
 
     Args:
         log: The log. It needs a column for each input and output of the task.
@@ -257,14 +271,15 @@ class _Player:
         if inner.inside.warm_up_steps:
             raise ConfigError("the task has a warm-up, which a log cannot repeat: leave it out")
         self._plant, self._log, self._time_step = plant, log, inner.inside.spec.time_step
+        self._needed = *inner.inside.spec.outputs, *inner.inside.spec.inputs
         self._columns = Columns(inner, log, columns)
         for variable in inner.inside.spec.outputs:
             self._columns.require(variable)
-        self._actions = _Actions(inner, self._columns, tolerance)
+        self._actions = Actions(inner, self._columns, tolerance)
 
     def play(self, seed: int) -> list[Recording]:
         episodes: list[Recording] = []
-        for part in self._log.parts():
+        for part in self._log.parts(self._columns.of(*self._needed)):
             times, rows = self._columns.rows(part, self._time_step)
             self._plant.rows, self._plant.row = rows, 0
             while self._plant.left > 0:
@@ -351,6 +366,11 @@ class Columns:
             return values
         return np.append(values[1:], values[-1])
 
+    def of(self, *variables: Variable) -> list[str]:
+        """The names of the columns of variables, as far as there are some."""
+        found = [self._from.get(variable.name) for variable in variables]
+        return [one[0] for one in found if one is not None]
+
     def rows(self, part: PlantLog, time_step: float) -> tuple[FloatArray, list[dict[str, float]]]:
         """The communication points of an episode, and the values of the variables there."""
         count = int((part.times[-1] - part.times[0]) / time_step + 1e-6)
@@ -374,11 +394,27 @@ class Columns:
         return values[after - 1]
 
 
-class _Actions:
-    """Finds the action that makes an environment write given inputs."""
+class Inputs(Protocol):
+    """Inputs that were written."""
 
-    def __init__(self, env: FMUEnv, columns: Columns, tolerance: float) -> None:
-        self._env, self._tolerance = env, tolerance
+    def require(self, variable: Variable) -> None:
+        """Refuse an input of which nothing is known."""
+
+    def range_of(self, variable: Variable) -> float:
+        """How far apart its values are."""
+
+
+class Actions:
+    """Finds the action that makes an environment write given inputs.
+
+    Args:
+        env: The environment. Its hook ``_get_inputs`` is called as it is now.
+        columns: The inputs.
+        tolerance: How far an input may be from the given one, as a part of its range.
+    """
+
+    def __init__(self, env: FMUEnv, columns: Inputs, tolerance: float) -> None:
+        self._env, self._tolerance, self._get_inputs = env, tolerance, env._get_inputs
         self._space: Any = env.action_space
         self._candidates = _candidates(self._space)
         self._columns = columns
@@ -391,7 +427,7 @@ class _Actions:
         Raises:
             ConfigError: If a column is missing, or no action makes these inputs.
         """
-        tried = [self._inputs(action) for action in self._candidates]
+        tried = [self.inputs(action) for action in self._candidates]
         self._find_written(np.array(tried))
         wanted = np.array(
             [row[self._env.inside.spec.inputs[place].name] for place in self._written]
@@ -400,12 +436,12 @@ class _Actions:
         self._require_near(action, wanted, time)
         return action
 
-    def _inputs(self, action: Any) -> FloatArray:
-        """What the environment would write for an action."""
+    def inputs(self, action: Any) -> FloatArray:
+        """What the environment would write for an action, one number for each input."""
         env, before = self._env, self._env.action
         env.action = action
         try:
-            return flat_inputs(env._get_inputs(), env.inside.spec.inputs, shown)
+            return flat_inputs(self._get_inputs(), env.inside.spec.inputs, shown)
         finally:
             env.action = before
 
@@ -432,7 +468,7 @@ class _Actions:
         return flat.reshape(self._space.shape).astype(self._space.dtype)
 
     def _require_near(self, action: Any, wanted: FloatArray, time: float) -> None:
-        made = self._inputs(action)[self._written]
+        made = self.inputs(action)[self._written]
         off = np.abs(made - wanted) > self._tolerance * self._scales
         if off.any():
             place = int(np.flatnonzero(off)[0])

@@ -31,6 +31,7 @@ EXTRAS = {
     "libraries.md": ("stable_baselines3", "torchrl"),
     "systems.md": ("pettingzoo",),
     "datasets.md": ("minari",),
+    "plant.md": ("pymodbus",),
     "rllib.md": ("ray.rllib",),
 }  # what a document's Python needs
 WARNING = {"datasets.md", "libraries.md", "rllib.md"}  # libraries of them warn of themselves

@@ -41,6 +41,7 @@ SLOW_MODULES = {
     "test_native_build",
     "test_packaging",
     "test_pendulum_sim_to_lab",
+    "test_plant_opcua",
     "test_reference_models",
     "test_snapshot_machine",
     "test_shared_data",
@@ -127,6 +128,10 @@ EVERY_OF_OTHERS_IN_CI = 4
 """For the modules that are not in ``EVERY_IN_CI``; their parameters take turns."""
 
 SLOW_TESTS = (
+    "test_plant.py::TestFaults",
+    "test_plant.py::TestPredictions",
+    "test_plant.py::TestData::test_a_file",
+    "test_plant.py::TestData::test_is_what",
     "test_proposal.py::test_bundled",
     "test_proposal.py::test_foreign",
     "test_proposal.py::test_types",

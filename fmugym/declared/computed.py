@@ -20,6 +20,7 @@ from fmugym.declared.mathematics import (
     divide,
     float32,
     float64,
+    interpolated,
     looked_up,
     remainder,
     square,
@@ -269,7 +270,6 @@ def _operation(graph: Graph, node: Node) -> Callable[..., Any]:
         case "take":
             return partial(looked_up, graph.tables[what])
         case "interpolate":
-            places, values = np.split(graph.tables[what][:-2], 2)
-            return lambda place: np.interp(place, places, values)
+            return partial(interpolated, graph.tables, what)
     function: Callable[..., Any] = what
     return function

@@ -12,7 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.checks import check_flag, check_number, check_option, check_text, integer_of
+from fmugym.checks import (
+    check_flag,
+    check_integer,
+    check_number,
+    check_option,
+    check_text,
+    integer_of,
+)
 from fmugym.config import CONFIG, FOREIGN
 from fmugym.declared.expressions import Expression
 from fmugym.declared.quantities import duration, finite, number, number_or_distribution
@@ -36,7 +43,7 @@ from fmugym.pool.spec import SAMPLINGS
 from fmugym.systems.components import Component
 from fmugym.systems.wired import SYSTEM
 
-__all__ = ["AGENT", "DEVICE", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
+__all__ = ["AGENT", "DEVICE", "PLANT", "SCHEMA", "SETPOINT", "TASK", "VERSION"]
 
 SCHEMA: Final = Path(__file__).parent / "task.schema.json"
 """What the keys are, for editors; ``docs/_site/keys.py`` writes it."""
@@ -546,6 +553,128 @@ KPI: Final = Table(
 )
 
 
+# A plant.
+
+
+def _of_width(lowest: int, highest: int) -> Kind:
+    """An integer of a protocol."""
+    return Kind(
+        lambda what, value: check_integer(what, value, lowest, highest),
+        {"type": "integer", "minimum": lowest, "maximum": highest},
+    )
+
+
+_UNIT_ID: Final = _of_width(0, 255)
+
+_ADDRESSES: Final = {
+    "node": Key(TEXT, 'OPC UA: the id of its node, such as `"ns=2;s=House.T"`.'),
+    "register": Key(_of_width(0, 65535), "Modbus: its first register, or its bit, from 0 on."),
+    "kind": Key(
+        option("holding", "input", "coil", "discrete"), "Modbus: where that register is.", "holding"
+    ),
+    "type": Key(
+        option(
+            *(f"{kind}{bits}" for kind in ("int", "uint") for bits in (16, 32, 64)),
+            "float32",
+            "float64",
+        ),
+        "Modbus: how registers make a number; bits make 0 or 1.",
+        "float32",
+    ),
+    "word_order": Key(
+        option("big", "little"),
+        "Modbus: whether the first register is the most significant.",
+        "big",
+    ),
+    "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", None, "that of the plant"),
+    "scale": Key(NUMBER, "What the plant's number is multiplied by.", 1.0),
+    "offset": Key(NUMBER, "What is added then.", 0.0),
+}
+
+TAG: Final = Table(
+    {
+        **_ADDRESSES,
+        "unit": Key(TEXT, "The unit of the result.", None, "that of the task"),
+    },
+    short="node",
+    one_of=("node", "register"),
+)
+
+LIVE: Final = Table(
+    {
+        **{n: one for n, one in DATA.keys.items() if n not in {"input", "min", "max", "values"}},
+        **_ADDRESSES,
+        "count": Key(
+            COUNT,
+            "How many values a tag has: those of now, and of each `step` ahead. One value alone "
+            "holds.",
+            1,
+        ),
+    },
+    short="node",
+    one_of=("node", "register", "file"),
+)
+
+PLANT: Final = Table(
+    {
+        "protocol": Key(option("modbus", "opcua"), "Modbus TCP or OPC UA.", REQUIRED),
+        "address": Key(TEXT, 'Such as `"10.0.0.5:502"`, or `"opc.tcp://10.0.0.5:4840"`.', REQUIRED),
+        "unit_id": Key(_UNIT_ID, "Modbus: the device behind the address.", 1),
+        "tags": Key(
+            Entries(TAG),
+            "By variable, where it is: all that the task reads of the FMU, and the actions.",
+            REQUIRED,
+        ),
+        "clock": Key(
+            TAG,
+            "The plant's time, in seconds since the beginning of the year.",
+            None,
+            "the local time of this machine",
+        ),
+        "poll": Key(POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"),
+        "stale_after": Key(
+            POSITIVE_TIME,
+            "A good value that was received longer ago than this is stale: the last one holds.",
+            None,
+            "three polls",
+        ),
+        "hold": Key(
+            TIME,
+            "How long it holds. After that it is missing in the record, and the agent holds its "
+            "last action.",
+            None,
+            "a step",
+        ),
+        "timeout": Key(
+            POSITIVE_TIME, "How long an answer may take, in seconds of real time.", 5.0, '`"5s"`'
+        ),
+        "data": Key(
+            Entries(LIVE),
+            "By name, where the data that the agent sees come from: a file that something else "
+            "refreshes (keys as in `data`, times in seconds of the year), or a tag.",
+        ),
+        "states": Key(
+            Entries(TEXT),
+            "By measured variable, the parameter in which an episode of the FMU begins with it.",
+        ),
+        "encryption": Key(FLAG, "OPC UA: whether messages are signed and encrypted.", True),
+        "certificate": Key(PATH, "OPC UA: this client's certificate."),
+        "key": Key(PATH, "OPC UA: its private key, a file of mode 600."),
+        "server_certificate": Key(
+            PATH, "OPC UA: the only certificate that the server may have.", None, "any"
+        ),
+        "credentials": Key(
+            PATH,
+            "A file of mode 600 with a line for the user's name and one for the password.",
+            None,
+            "the environment variables `FMUGYM_PLANT_USER` and `FMUGYM_PLANT_PASSWORD`",
+        ),
+    },
+    what="key of [plant]",
+    elsewhere=dict.fromkeys(("user", "password"), ": no task file has secrets; see 'credentials'"),
+)
+
+
 # Systems, the config, and all of a task.
 
 _VERSION_OF_FMI: Final = {"fmi_version": Key(TEXT, "Version of FMI of a bundled FMU.", "2.0")}
@@ -710,6 +839,10 @@ TASK: Final = Table(
             "A condition: cut the episode short, in addition to `episode_length`.",
             None,
             "never",
+        ),
+        "plant": Key(
+            PLANT,
+            "[Where a plant has the variables](plant.md), for `simulate --plant` and `serve`.",
         ),
         "foreign": Key(
             Table(FOREIGN.keys), "[Keys for experts](foreign.md), about FMUs of unknown quality."

@@ -21,6 +21,7 @@ __all__ = [
     "divide",
     "float32",
     "float64",
+    "interpolated",
     "looked_up",
     "maximum",
     "minimum",
@@ -90,6 +91,16 @@ def looked_up(table: Any, index: Any) -> Any:
     if isinstance(index, int | np.integer):
         return float(table[index])
     return np.take(table, index)  # looked up in each call: it is replaced while hooks are traced
+
+
+def interpolated(tables: Any, key: Any, place: Any) -> Any:
+    """The number at a place of a table, on straight lines; see ``Value.interpolated``.
+
+    The table is found in each call, since another one may have taken its place.
+    """
+    table = tables[key]
+    count = len(table) // 2 - 1
+    return np.interp(place, table[:count], table[count:-2], table[-2], table[-1])
 
 
 _STEP: Final = np.int64(0x9E3779B97F4A7C15 - 2**64)

@@ -21,6 +21,7 @@ from fmugym.declared.mathematics import clip, maximum
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.variables import Record, converted
 from fmugym.errors import unknown_name
+from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
@@ -81,6 +82,7 @@ class Naming:
         outputs: The names of the values in ``state``, in their order.
         monitors: The names of other values that are read from the FMU.
         first_step: The step count after the first step, which may be one of the warm-up.
+        lookups: The series that are read, by name.
     """
 
     def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
@@ -90,6 +92,7 @@ class Naming:
         self._ahead = 0.0
         self._derived: dict[tuple[str, Moment, float], Value] = {}
         self.graph = Graph()
+        self.lookups: dict[str, Lookup] = {}
         self.outputs, self.monitors = self._read_names()
 
     def _read_names(self) -> tuple[list[str], list[str]]:
@@ -242,9 +245,12 @@ class Naming:
         if series.is_stepped:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
         table, tables = f"series {name}", self.graph.tables
-        if table not in tables:
-            ends = series.values[[0, -1]]
-            tables[table] = np.concatenate([series.times, series.values, ends])
+        if name not in self.lookups:
+            numbered = [float(len(self.lookups)), series.values[-1]]  # for nobody looks to the left
+            tables[table] = np.concatenate([series.times, series.values, numbered])
+            self.lookups[name] = Lookup(
+                tables, table, series.start, series.period, series.is_stepped
+            )
         place = (self.clock + (shift - series.start)) % series.period
         return place.interpolated(table)
 

@@ -23,7 +23,7 @@ from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.signals import ordinary
 
-__all__ = ["Series", "read_data", "read_schedule"]
+__all__ = ["Series", "read_data", "read_rows", "read_schedule"]
 
 _DAY: Final = 86400.0
 _CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
@@ -122,6 +122,16 @@ def read_data(entry: Entry) -> Series:
     elif period is None:  # one more row than there are
         period = times[-1] - times[0] + (times[-1] - times[-2] if len(times) > 1 else _DAY)
     return Series.of(entry, times, values, float(period), is_stepped)
+
+
+def read_rows(entry: Entry) -> tuple[FloatArray, FloatArray]:
+    """Read the rows of a file as they are now: times in seconds, and values.
+
+    Raises:
+        ConfigError: As ``read_data``.
+    """
+    times, values, _ = _rows_of_file(entry, entry.value["interpolation"] == "previous")
+    return times, values
 
 
 _Rows = tuple[FloatArray, FloatArray, float | None]

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
@@ -98,13 +98,13 @@ class Recording:
         self._about = About({})
 
     def begin(
-        self, name: str, env: FMUEnv, variables: Sequence[str] | None, every: float | None
+        self, name: str, env: Any, variables: Sequence[str] | None, every: float | None
     ) -> RecordSeries:
         """Wrap the environment of the next controller."""
         tables = [path for path in self._paths if path.suffix.lower() in _TABLES]
         first = tables[0] if tables else None
         self._recorders[name] = RecordSeries(env, variables, every=every, path=first)
-        self._about = About.of(env)
+        self._about = About.of(env.unwrapped)
         return self._recorders[name]
 
     def finish(self, seed: int) -> None:

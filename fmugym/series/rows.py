@@ -19,6 +19,8 @@ from fmugym.task.starting import start_time_of
 __all__ = ["Episodes", "Infos", "Outcome", "Rows", "present"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
+_TOLD: Final = {"kpis": "kpi", "proposed": "proposal", "predicted": "prediction"}
+"""The kinds of numbers in infos that are written down as they are, by the key of the info."""
 
 
 class Episodes(Protocol):
@@ -155,7 +157,7 @@ class Rows:
         self._episodes, self._choice, self._indices = episodes, choice, indices
         self._every, self._is_vector = every, is_vector
         self._summed = tuple(_summed(infos))
-        self._kpis = tuple(infos.names("kpis"))
+        self._told = tuple((key, name) for key in _TOLD for name in infos.names(key))
         count = episodes.count
         self._sums = np.zeros((count, 1 + len(self._summed)))
         self._steps = np.zeros(count, np.int64)
@@ -174,7 +176,7 @@ class Rows:
         for path in self._summed:
             kind = _GROUPS.get(path[0], "cost")
             yield Quantity(".".join(path), kind)
-        yield from (Quantity(f"kpis.{name}", "kpi") for name in self._kpis)
+        yield from (Quantity(f"{key}.{name}", _TOLD[key]) for key, name in self._told)
         yield from (Quantity("terminated", "flag"), Quantity("truncated", "flag"))
 
     def go_on(self, steps: Any) -> None:
@@ -204,6 +206,7 @@ class Rows:
         self._steps += ~idle
         ended = (outcome.terminated | outcome.truncated) & ~idle
         values = self._values(outcome.observations)
+        self._leave_out(values, outcome.infos)
         if outcome.last is not None:
             begun = outcome.ended[self._indices]
             values[begun, : outcome.last.shape[1]] = outcome.last[begun]
@@ -212,6 +215,13 @@ class Rows:
         block = self._block(due, values, flags, outcome.infos)
         self._sums[due] = 0.0
         return block
+
+    def _leave_out(self, values: FloatArray, infos: Infos) -> None:
+        """Leave out what a plant has not told: the environment goes on with older values."""
+        for index, missing in infos.each("missing").items():
+            for place, quantity in enumerate(self._choice.quantities):
+                if quantity.name in missing:
+                    values[self._indices == index, place] = np.nan
 
     def _values(self, observations: Any) -> FloatArray:
         """What they have, and what they observe."""
@@ -239,7 +249,7 @@ class Rows:
                 *values[is_due].T,
                 *self._sums[which].T,
             ),
-            *(infos.numbers("kpis", name)[which] for name in self._kpis),
+            *(infos.numbers(*path)[which] for path in self._told),
             *(flag[which] for flag in flags),
         ]
         rows = {index: row for row, index in enumerate(which.tolist())}

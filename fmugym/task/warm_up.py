@@ -108,10 +108,13 @@ class WarmUps:
     Args:
         env: The environment, or the prototype of N.
         warm_up: What happens in them.
+
+    Attributes:
+        warm_up: The same.
     """
 
     def __init__(self, env: Any, warm_up: WarmUp) -> None:
-        self._env, self._warm_up = env, warm_up
+        self._env, self.warm_up = env, warm_up
         starts = env.config.episode_variables
         self._shapes = {name: np.shape(starts[name]) for name in warm_up.writes}
         self._prefix: str | None = None
@@ -169,12 +172,12 @@ class WarmUps:
     ) -> Found:
         """Look for states that warm-ups of new episodes lead to."""
         self._keys = {}
-        if not self._warm_up.caches or not self._can_keep(pool):
+        if not self.warm_up.caches or not self._can_keep(pool):
             return {}
         names = repr([variable.name for variable in variables]).encode()
         found = {}
         for index in indices:
-            own = [np.asarray(rows[name])[..., index] for name in self._warm_up.depends_on]
+            own = [np.asarray(rows[name])[..., index] for name in self.warm_up.depends_on]
             parts = [names, values[:, index].tobytes(), *(np.float64(v).tobytes() for v in own)]
             key = self._key(parts)
             warmed = _memory.find(key) or self._read(key)
@@ -204,7 +207,7 @@ class WarmUps:
         if self._prefix is None:
             self._prefix = state_files(self._env.fmu)
             spec = repr(essence(self._env.inside.spec))
-            self._scope = f"{self._prefix} {spec} {self._warm_up.digest}".encode()
+            self._scope = f"{self._prefix} {spec} {self.warm_up.digest}".encode()
         digests = (hashlib.sha256(part).digest() for part in (self._scope, *parts))
         return hashlib.sha256(b"".join(digests)).digest()
 
@@ -256,7 +259,7 @@ class WarmUps:
         indices: IndexArray,
         skip: npt.NDArray[np.bool_],
     ) -> dict[str, Any]:
-        count, warm_up = len(indices), self._warm_up
+        count, warm_up = len(indices), self.warm_up
         warm_up.begin(count)
         with reading(self._env, readings), np.errstate(all="ignore"):
             env: Any = self._env
@@ -270,7 +273,7 @@ class WarmUps:
     def _step(self, pool: Pool, indices: IndexArray, skip: npt.NDArray[np.bool_]) -> None:
         env: Any = self._env
         given = np.empty((len(pool.inputs), len(indices)))
-        for row, value in zip(given, self._warm_up.inputs(env), strict=True):
+        for row, value in zip(given, self.warm_up.inputs(env), strict=True):
             row[:] = value
         if not env.inside.input_writer.all_real:
             columns = [to_input_types(env.inside.interface.inputs, column) for column in given.T]

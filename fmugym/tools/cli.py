@@ -22,6 +22,8 @@
         [--plot fit.png]
     fmugym export AGENT --task TASK --output agent.c|agent.fmu|agent.onnx [--algorithm PPO]
         [--all-inputs] [--external NAME ...] [--fmi 2.0|3.0] [--platform NAME ...]
+    fmugym simulate TASK --plant [ADDRESS] [WHO] [--ahead TIME] [--speed X] [--output FILE ...]
+    fmugym serve TASK [WHO] [--port N] [--speed X] [--steps N] [--seed N]
     fmugym bench TASK|model.fmu [--envs N ...] [--seconds S]
     fmugym demo [--seed N] [--output picture.png]
 
@@ -89,6 +91,7 @@ from fmugym.tools.gains import add_tune
 from fmugym.tools.inspecting import add_info, add_new, add_validate
 from fmugym.tools.learning import add_train
 from fmugym.tools.options import add_common, free_outputs, note, speaking
+from fmugym.tools.plants import add_serve
 from fmugym.tools.playing import add_bench, add_evaluate, add_simulate
 from fmugym.tools.renamed import renamed
 from fmugym.tools.showing import add_demo
@@ -103,7 +106,7 @@ __all__ = ["main"]
 
 _COMMANDS: Final = (
     *(add_info, add_new, add_validate, add_simulate, add_train, add_evaluate, add_tune),
-    *(add_fit, add_export, add_bench, add_demo),
+    *(add_fit, add_export, add_serve, add_bench, add_demo),
 )
 
 

@@ -86,6 +86,7 @@ EXAMPLES: Final = {
         "--controller 'pid of=T setpoint=21 kp=0.5 ti=14400' --steps 96 --output frost.html",
         "fmugym simulate house.toml --output minari:house/measured-v0 --log week.csv "
         "--column pump_speed=u",
+        "fmugym simulate house.toml --plant --agent agent --ahead 6h --output shadow.csv",
     ),
     "train": (
         "fmugym train examples/cart_pole.toml --output agent --minutes 0.1",
@@ -100,6 +101,7 @@ EXAMPLES: Final = {
         "--output fitted.toml",
     ),
     "export": ("fmugym export trained --task examples/cart_pole.toml --output agent.c",),
+    "serve": ("fmugym serve house.toml --controller thermostat --speed 9000 --steps 50",),
     "evaluate": ("fmugym evaluate examples/cart_pole.toml --agent agent --action 1",),
     "bench": ("fmugym bench task.toml --seconds 0.1",),
     "demo": ("fmugym demo --output demo.png",),

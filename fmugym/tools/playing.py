@@ -29,6 +29,7 @@ from fmugym.tools.options import (
     say_json,
     shown_in_any_case,
 )
+from fmugym.tools.plants import add_of_plants, follow_plant
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -57,6 +58,7 @@ def add_simulate(commands: Commands) -> None:
     )
     command.add_argument("--every", type=float, metavar="SECONDS", help="between rows")
     add_of_datasets(command)
+    add_of_plants(command)
     add_json(command)
 
 
@@ -64,6 +66,11 @@ def _simulate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
     if dataset_of(arguments) is not None:
         make_dataset(arguments)
+        return
+    if arguments.plant is not None:
+        for path in arguments.output:
+            require_format(path, 1)
+        follow_plant(arguments)
         return
     players = players_of(arguments)
     for path in arguments.output:

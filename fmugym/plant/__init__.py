@@ -1,0 +1,16 @@
+"""Plants: an agent in the shadow of one, and an FMU that is one.
+
+::
+
+    env = fmugym.plant.connect("house.toml")
+    observation, info = env.reset()
+    observation, reward, terminated, truncated, info = env.step(agent.act(observation))
+
+This is no safety function. Interlocks stay in the PLC, and whoever enables writing is responsible.
+Nothing in here writes to a plant.
+"""
+
+from fmugym.plant.serving import Server
+from fmugym.plant.shadow import Shadow, connect
+
+__all__ = ["Server", "Shadow", "connect"]

@@ -1,0 +1,217 @@
+"""What holds at the ticks of a plant: a backend that waits, reads, and writes nothing."""
+
+from __future__ import annotations
+
+import datetime
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.fmi.status import Status
+from fmugym.plant.live import Live
+from fmugym.plant.polling import Poller, Reading
+from fmugym.plant.tags import Plant
+from fmugym.pool.backend.clocks import Clock
+
+__all__ = ["Feed", "local_time"]
+
+_LEAST_JUMP: Final = 60.0
+"""Clocks that are apart by less, in seconds, have not jumped."""
+
+_LATE: Final = 0.5
+"""How late a thread of this machine may be, in seconds of real time."""
+
+
+def local_time() -> float:
+    """The seconds since the beginning of the year, in the time of this place."""
+    now = datetime.datetime.now()
+    return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
+
+
+@dataclass
+class _Held:
+    """What is known of a tag.
+
+    Attributes:
+        numbers: The latest ones that were used.
+        received: When they were received.
+    """
+
+    numbers: tuple[float, ...] = ()
+    received: float = -np.inf
+
+
+@dataclass
+class Feed:
+    """The values of a plant at its ticks, which lie on multiples of the time step.
+
+    It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing.
+
+    Args:
+        clock: The monotonic clock of ticks and of what is received.
+        wall: Gives the plant's time in seconds of the year, unless there is a tag for it.
+
+    Attributes:
+        values: The present values of the tags, in the task's units.
+        faults: What is wrong, by the names of tags whose last value holds or is missing.
+        missing: The names of those for which nothing holds any longer.
+        time: The plant's time at the present tick.
+        jump: By how much the plant's time has jumped, in seconds.
+    """
+
+    clock: Clock
+    wall: Callable[[], float]
+    values: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    faults: dict[str, str] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    time: float = 0.0
+    jump: float = 0.0
+    samples_outputs = True
+
+    def open(
+        self,
+        plant: Plant,
+        poller: Poller,
+        samplings: Mapping[str, str],
+        read: Callable[[], Mapping[str, float]],
+        live: Live,
+    ) -> None:
+        """Begin to read.
+
+        Args:
+            plant: Has the tags.
+            poller: Reads them.
+            samplings: How tags are sampled within a step, where that is not ``"last"``.
+            read: Returns the outputs in the FMU's units by name, from ``values``.
+            live: Gets the data of each tick.
+        """
+        self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
+        self._live = live
+        self._held = {name: _Held() for name in plant.tags}
+        self._tick, self._has_begun = 0.0, False
+
+    # The backend.
+
+    def reset(self, start_values: Mapping[str, Any]) -> Mapping[str, float]:
+        """Set nothing."""
+        return self._read()
+
+    def step(self, inputs: Mapping[str, float]) -> tuple[Mapping[str, float], int]:
+        """Write nothing."""
+        return self._read(), Status.OK
+
+    def stop(self) -> None:
+        """Do nothing: the plant goes on."""
+
+    # Ticks.
+
+    def begin(self) -> None:
+        """Wait until all tags have good values, and for the next tick.
+
+        Raises:
+            ConfigError: If the server does not know a tag, or one has a wrong type.
+            SimulationError: If there are none in time. Once there were some, it waits for ever.
+        """
+        self._wait_for_values()
+        now, step = self._now(), self._plant.step
+        self._tick = self.clock.time() + (-now % step)
+        self.time, self.jump = now + (-now % step), 0.0
+        self._live.begin()
+        self._sleep()
+        if self.missing and not self._has_begun:
+            raise SimulationError(self._told())
+        self._has_begun = True
+
+    def _wait_for_values(self) -> None:
+        deadline = time.monotonic() + 2.0 * self._plant["timeout"]
+        poller = self._poller
+        while True:
+            has_answered, is_refused = poller.has_answered, poller.is_refused
+            self._look(self.clock.time() - self._plant.step, self.clock.time())
+            if not self.faults:
+                self._require_fit()
+                return
+            time.sleep(0.005)
+            if self._has_begun:
+                continue
+            if has_answered and any(map(poller.trouble, self._plant.tags)):
+                raise ConfigError(self._told())
+            if is_refused or time.monotonic() > deadline:
+                raise SimulationError(self._told())
+
+    def _told(self) -> str:
+        told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
+        return f"the plant at {self._plant.address}: {told}"
+
+    def _require_fit(self) -> None:
+        """Refuse values that a wrong type would make."""
+        for name, tag in self._plant.tags.items():
+            if strange := tag.misfit(self.values[name][0]):
+                raise ConfigError(f"the plant at {self._plant.address}: {name}: {strange}")
+
+    def advance(self) -> None:
+        """Wait for the next tick; what was read until then becomes present."""
+        self._tick += self._plant.step
+        self.time += self._plant.step
+        self._sleep()
+        apart = self._now() - (self.clock.time() - self._tick) - self.time
+        tolerance = max(
+            min(_LEAST_JUMP, self._plant.step), _LATE * getattr(self.clock, "speed", 1.0)
+        )
+        self.jump = apart if abs(apart) > tolerance else 0.0
+
+    def _sleep(self) -> None:
+        self.clock.sleep(self._tick - self.clock.time())
+        self._look(self._tick - self._plant.step, self._tick)
+        faults = self._live.refresh(self.time, self.values)
+        self.faults |= faults
+        self.missing += tuple(faults)
+
+    def _now(self) -> float:
+        """The plant's time."""
+        held = self._held.get("clock")
+        if held is None:
+            return self.wall()
+        return held.numbers[0] + self.clock.time() - held.received
+
+    def _look(self, begin: float, end: float) -> None:
+        """Find out what holds at the end of a step."""
+        self.faults, missing = {}, []
+        for name, held in self._held.items():
+            readings = self._poller.between(name, begin, end)
+            fresh = [one for one in readings if one.received > max(begin, held.received)]
+            if fresh or (readings and not held.numbers):
+                fresh = fresh or readings
+                held.numbers = self._sampled(name, fresh)
+                held.received = fresh[-1].received
+            age = end - held.received
+            if age > self._plant.stale_after or not held.numbers:
+                why = self._poller.trouble(name) or "nothing was received"
+                self.faults[name] = f"{why} (for {age:.6g} s)" if held.numbers else why
+            if age > self._plant.stale_after + self._plant.hold:
+                missing.append(name)
+        self.missing = tuple(missing)
+        self.values = {name: held.numbers for name, held in self._held.items()}
+
+    def _sampled(self, name: str, readings: Sequence[Reading]) -> tuple[float, ...]:
+        """What a step gives of its readings."""
+        numbers = np.array([one.numbers for one in readings])
+        how = self._samplings.get(name, "last")
+        found = _SAMPLED[how](numbers)
+        if how == "integral":
+            found = found * self._plant.step
+        return tuple(np.ravel(found).tolist())
+
+
+_SAMPLED: Final[Mapping[str, Callable[[Any], Any]]] = {
+    "last": lambda numbers: numbers[-1],
+    "mean": lambda numbers: numbers.mean(axis=0),
+    "integral": lambda numbers: numbers.mean(axis=0),
+    "min": lambda numbers: numbers.min(axis=0),
+    "max": lambda numbers: numbers.max(axis=0),
+    "median": lambda numbers: np.sort(numbers, axis=0)[len(numbers) // 2],
+}

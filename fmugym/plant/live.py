@@ -1,0 +1,168 @@
+"""Data of a task that a plant, or a file that something else refreshes, tells while it runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fmugym.archive.units import conversion_between
+from fmugym.declared import TaskEnv
+from fmugym.declared.entries import Entry
+from fmugym.declared.series import read_rows
+from fmugym.errors import ConfigError, shown
+from fmugym.plant.tags import DATA, Plant
+from fmugym.pool.base import FloatArray
+
+__all__ = ["Live"]
+
+_JUST = 1e-6
+
+
+class _Rows(NamedTuple):
+    """Values from now on.
+
+    Attributes:
+        times: In seconds of the year, the first is now.
+        values: In the unit of the data.
+    """
+
+    times: FloatArray
+    values: FloatArray
+
+
+class Live:
+    """The data of environments, as they are known at a tick.
+
+    Args:
+        env: Its agent sees the data.
+        plant: Says where they come from.
+
+    Attributes:
+        envs: The environments that read them.
+
+    Raises:
+        ConfigError: If the agent sees data that have no live source, or not far enough ahead.
+    """
+
+    def __init__(self, env: TaskEnv, plant: Plant) -> None:
+        root, self._plant = env.task.root, plant
+        self._entries = plant.entry.child("data").items()
+        self._ahead = _horizon(root)
+        for name in sorted(_seen(root)):
+            if name not in self._entries:
+                text = f"the agent sees {name!r}: say in [plant.data] where it comes from"
+                raise root.child("data").child(name).error(text)
+        steps = (root.child("agent").child("history").value or {}).get("length", 0.0) / plant.step
+        self._past: dict[str, deque[tuple[float, float]]] = {
+            name: deque(maxlen=int(steps) + 3) for name in self._entries
+        }
+        self._require_tags()
+        self._units = env.fmu.description.units
+        self._own = {name: root.child("data").child(name).value.get("unit") for name in self._past}
+        self.envs: list[TaskEnv] = [env]
+
+    def _require_tags(self) -> None:
+        """Refuse tags that do not tell as much as the agent sees."""
+        for entry in self._entries.values():
+            count, step = entry.value.get("count", 1), entry.value.get("step")
+            if "file" in entry.value or count == 1:
+                continue
+            if step is None or (count - 1) * step < self._ahead:
+                raise entry.error(
+                    f"the agent sees {self._ahead:g} s ahead: expected 'count' values that are "
+                    f"'step' apart to go as far, got {count} and {step}"
+                )
+
+    def begin(self) -> None:
+        """Forget the values before."""
+        for past in self._past.values():
+            past.clear()
+
+    def refresh(self, now: float, tags: dict[str, tuple[float, ...]]) -> dict[str, str]:
+        """Let environments look up what is known now.
+
+        Args:
+            now: The plant's time, in seconds of the year.
+            tags: The values of the tags.
+
+        Returns:
+            What is wrong with files, by the names of data.
+        """
+        faults: dict[str, str] = {}
+        for name, entry in self._entries.items():
+            try:
+                rows = self._rows(name, entry, now, tags)
+            except ConfigError as error:
+                faults[DATA + name] = str(error)
+            else:
+                self._write(name, rows)
+        return faults
+
+    def _rows(
+        self, name: str, entry: Entry, now: float, tags: dict[str, tuple[float, ...]]
+    ) -> _Rows:
+        if "file" not in entry.value:
+            values = np.array(tags[DATA + name])
+            return _Rows(now + np.arange(len(values)) * (entry.value.get("step") or 1.0), values)
+        times, values = read_rows(entry)
+        unit = conversion_between(entry.value.get("unit"), self._own[name], self._units)
+        values = values * unit.factor + unit.offset
+        holds = entry.value["interpolation"] == "previous"
+        end = times[-1] + (times[-1] - times[-2] if holds and len(times) > 1 else 0.0)
+        if not times[0] <= now + _JUST or end < now + self._ahead:
+            raise ConfigError(
+                f"{shown(entry.value['file'])} has {times[0]:.10g} s to {end:.10g} s, expected "
+                f"{now:.10g} s and {self._ahead:g} s more"
+            )
+        first = np.searchsorted(times, now + _JUST, side="right")
+        present = values[first - 1] if holds else np.interp(now, times, values)
+        return _Rows(np.append(now, times[first:]), np.append(present, values[first:]))
+
+    def _write(self, name: str, rows: _Rows) -> None:
+        past = self._past[name]
+        if not past or past[-1][0] < rows.times[0]:
+            past.append((float(rows.times[0]), float(rows.values[0])))
+        before = np.array(past)[:-1].reshape(-1, 2).T
+        times = np.append(before[0], rows.times)
+        values = np.append(before[1], rows.values)
+        for env in self.envs:
+            lookup = None if env.inside.future is None else env.inside.future.lookups.get(name)
+            if lookup is not None:
+                fits = times < times[0] + lookup.period
+                table = lookup.table_of(name, (times[fits], values[fits]))
+                lookup.tables[lookup.key] = table
+
+
+def _horizon(root: Entry) -> float:
+    """How far ahead the agent sees, in seconds."""
+    forecasts: Sequence[Any] = root.child("agent").child("forecast").value or ()
+    return max((float(one["horizon"]) for one in forecasts), default=0.0)
+
+
+def _seen(root: Entry) -> set[str]:
+    """The data that the agent sees: now, ahead, in the past, and in expressions."""
+    agent = root.child("agent").value or {}
+    left = {*agent.get("observations", ()), *(agent.get("history") or {}).get("of", ())}
+    left |= {name for one in agent.get("forecast") or () for name in one["of"]}
+    data, expressions, setpoints = (
+        root.child(key).value or {} for key in ("data", "expressions", "setpoints")
+    )
+    looked_at: set[str] = set()
+    while left := left - looked_at:
+        name = left.pop()
+        looked_at.add(name)
+        if name in expressions:
+            left |= expressions[name]["expr"].names
+        if (setpoints.get(name) or {}).get("data") is not None:
+            raise (
+                root.child("setpoints")
+                .child(name)
+                .error(
+                    f"the agent sees {name!r}, which follows data: a plant has set points with a "
+                    "schedule or a value"
+                )
+            )
+    return looked_at & data.keys()

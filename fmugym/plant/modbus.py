@@ -1,0 +1,250 @@
+"""Modbus TCP: a client that only reads, and a server that nobody writes to."""
+
+from __future__ import annotations
+
+import logging
+import math
+import struct
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+from fmugym.extras import imported
+from fmugym.plant.polling import Answer, LostError, host_and_port
+from fmugym.plant.tags import Plant, Tag
+
+__all__ = ["ModbusClient", "serve_modbus"]
+
+_FORMATS: Final = {
+    "int16": "h",
+    "int32": "i",
+    "int64": "q",
+    "uint16": "H",
+    "uint32": "I",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
+_MOST: Final = 120
+"""So many registers are asked for at once; the standard allows 125."""
+
+_CODES: Final = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+"""The functions that read, by what they read."""
+
+_SAID: Final = {
+    1: "it does not know this function",
+    2: "there is no such register",
+    3: "it refuses the number of registers",
+    4: "the device has failed",
+    10: "there is no way to this device",
+    11: "the device does not answer",
+}
+
+Values = Callable[[], Mapping[str, Sequence[float]]]
+
+logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
+
+
+class _Place(NamedTuple):
+    """Registers or bits of a device, from the first one to before the last one."""
+
+    unit_id: int
+    kind: str
+    begin: int
+    end: int
+
+    @property
+    def is_bits(self) -> bool:
+        return self.kind in ("coil", "discrete")
+
+    @classmethod
+    def of(cls, plant: Plant, tag: Tag) -> _Place:
+        where = tag.address
+        unit_id = plant["unit_id"] if where.get("unit_id") is None else where["unit_id"]
+        one = cls(unit_id, where["kind"], where["register"], where["register"] + tag.count)
+        return one if one.is_bits else one._replace(end=one.begin + tag.count * _width(tag))
+
+
+def _width(tag: Tag) -> int:
+    """How many registers a number takes."""
+    return struct.calcsize(f">{_FORMATS[tag.address['type']]}") // 2
+
+
+def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
+    """The numbers in registers or bits; devices write NaN for what they do not know."""
+    numbers = [float(cell) for cell in cells]
+    if not place.is_bits:
+        content = struct.pack(f">{len(cells)}H", *_ordered(tag, cells))
+        numbers = [*struct.unpack(f">{tag.count}{_FORMATS[tag.address['type']]}", content)]
+    if not all(map(math.isfinite, numbers)):
+        return Answer((), f"{place.kind} {place.begin} has no finite number")
+    return Answer(tuple(map(tag.conversion, numbers)))
+
+
+def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
+    """The registers, or the bits, of values."""
+    numbers = [tag.conversion.inverse(value) for value in values]
+    if place.is_bits:
+        return [int(number > 0.5) for number in numbers]
+    form = _FORMATS[tag.address["type"]]
+    given = numbers if form in "fd" else map(round, numbers)
+    content = struct.pack(f">{tag.count}{form}", *given)
+    return _ordered(tag, struct.unpack(f">{place.end - place.begin}H", content))
+
+
+def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
+    """The words with the first one of each number first, or back."""
+    if tag.address["word_order"] == "big":
+        return words
+    width = _width(tag)
+    return [words[i - i % width + width - 1 - i % width] for i in range(len(words))]
+
+
+class ModbusClient:
+    """Reads the tags of a plant; see ``polling.Client``."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
+        self._errors = imported("pymodbus.exceptions", "plant")
+        self._host, self._port = host_and_port(plant.address, 502)
+        self._timeout = plant["timeout"]
+        self._places = {name: _Place.of(plant, tag) for name, tag in plant.tags.items()}
+        self._blocks = self._neighbours(plant)
+        self._client: Any = None
+
+    def _neighbours(self, plant: Plant) -> list[list[Tag]]:
+        """The tags that are read at once, since they follow each other without a gap."""
+        found: list[list[Tag]] = []
+        for tag in sorted(plant.tags.values(), key=lambda tag: self._places[tag.name]):
+            place = self._places[tag.name]
+            if found:
+                first, last = (self._places[found[-1][i].name] for i in (0, -1))
+                is_next = (*last[:2], last.end) == place[:3]
+                if is_next and place.end - first.begin <= _MOST:
+                    found[-1].append(tag)
+                    continue
+            found.append([tag])
+        return found
+
+    async def connect(self) -> None:
+        """See ``polling.Client``."""
+        options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
+        self._client = self._client_of(self._host, port=self._port, **options)
+        if not await self._client.connect():
+            raise LostError("it refuses the connection, or does not answer")
+
+    async def read(self) -> dict[str, Answer]:
+        """See ``polling.Client``."""
+        found: dict[str, Answer] = {}
+        for block in self._blocks:
+            found |= await self._read(block)
+        return found
+
+    async def _read(self, block: Sequence[Tag]) -> dict[str, Answer]:
+        first, last = (self._places[block[i].name] for i in (0, -1))
+        cells, fault = await self._ask(first._replace(end=last.end))
+        if not fault:
+            places = [(tag, self._places[tag.name]) for tag in block]
+            return {
+                tag.name: _answer(tag, one, cells[one.begin - first.begin : one.end - first.begin])
+                for tag, one in places
+            }
+        if len(block) == 1:
+            return {block[0].name: Answer((), fault)}
+        found: dict[str, Answer] = {}
+        for tag in block:  # one of them may be the reason
+            found |= await self._read([tag])
+        return found
+
+    async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
+        """The registers or bits, and what the server says instead."""
+        client, count = self._client, place.end - place.begin
+        ask = {
+            "holding": client.read_holding_registers,
+            "input": client.read_input_registers,
+            "coil": client.read_coils,
+            "discrete": client.read_discrete_inputs,
+        }[place.kind]
+        if not client.connected:
+            raise LostError("the connection is lost")
+        try:
+            told = await ask(place.begin, count=count, device_id=place.unit_id)
+        except self._errors.ConnectionException:
+            raise LostError("the connection is lost") from None
+        except self._errors.ModbusException:
+            raise LostError("it does not answer, or not by Modbus") from None
+        if told.isError():
+            code, where = told.exception_code, f"{place.kind} {place.begin} of unit {place.unit_id}"
+            return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
+        return (told.bits[:count] if place.is_bits else told.registers), ""
+
+    async def close(self) -> None:
+        """See ``polling.Client``."""
+        if self._client is not None:
+            self._client.close()
+
+
+async def serve_modbus(
+    plant: Plant, port: int, values: Values, bound: Callable[[str], None]
+) -> Callable[[], Awaitable[None]]:
+    """Serve tags on the loopback.
+
+    Args:
+        plant: Has the tags.
+        port: The port; 0 for a free one.
+        values: Returns the values of now, by the names of tags.
+        bound: Is told the address.
+
+    Returns:
+        What ends it.
+    """
+    server_of = imported("pymodbus.server", "plant").ModbusTcpServer
+    found = [(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
+    placed = sorted(found, key=lambda one: one[0])
+    units = groupby(placed, key=lambda one: one[0].unit_id)
+    devices = [_device(unit_id, [*own], values) for unit_id, own in units]
+    server = server_of(devices, address=("127.0.0.1", port))
+    await server.serve_forever(background=True)
+    bound(f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}")
+    ended: Callable[[], Awaitable[None]] = server.shutdown
+    return ended
+
+
+def _device(unit_id: int, placed: Sequence[tuple[_Place, Tag]], values: Values) -> Any:
+    """A device whose registers are written anew before each reading."""
+    simulator = imported("pymodbus.simulator", "plant")
+    refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
+
+    async def look(
+        code: int, start: int, address: int, count: int, registers: list[int], written: Any
+    ) -> Any:
+        if written is not None:
+            return refused
+        now = values()
+        for place, tag in placed:
+            if _CODES[place.kind] == code:
+                _put(registers, start, place, _cells(tag, place, now[tag.name]))
+        return None
+
+    areas = tuple([_area(simulator, kind, placed)] for kind in _CODES)
+    return simulator.SimDevice(unit_id, areas, action=look)
+
+
+def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) -> None:
+    if not place.is_bits:
+        registers[place.begin - start : place.end - start] = cells
+        return
+    for at, bit in enumerate(cells, place.begin - 16 * start):
+        word, mask = at // 16, 1 << (at % 16)
+        registers[word] = registers[word] | mask if bit else registers[word] & ~mask
+
+
+def _area(simulator: Any, kind: str, placed: Sequence[tuple[_Place, Tag]]) -> Any:
+    """What the library needs to know of the registers of a kind, or of the bits."""
+    own = [place for place, _ in placed if place.kind == kind] or [_Place(0, kind, 0, 1)]
+    begin, end = min(one.begin for one in own), max(one.end for one in own)
+    if own[0].is_bits:
+        bits = [False] * (-(-end // 16) * 16)
+        return simulator.SimData(0, values=bits, datatype=simulator.DataType.BITS)
+    form = simulator.DataType.REGISTERS
+    return simulator.SimData(begin, count=end - begin, datatype=form)

@@ -1,0 +1,255 @@
+"""OPC UA: a client that only reads, and a server that nobody writes to."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, shown
+from fmugym.extras import imported
+from fmugym.plant.polling import Answer, LostError, RefusedError
+from fmugym.plant.secrets import credentials, require_secret
+from fmugym.plant.tags import Plant, Tag
+from fmugym.signals import Ignoring
+
+__all__ = ["OpcUaClient", "serve_opcua"]
+
+_MOST_NODES: Final = 2000
+"""So many nodes are looked at for the nearest name."""
+
+_REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
+"""Words in the names of status codes of a server that refuses a client."""
+
+logging.getLogger("asyncua").addHandler(logging.NullHandler())
+
+
+class OpcUaClient:
+    """Reads the tags of a plant; see ``polling.Client``."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._ua, self._client_of = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
+        self._plant, self._tags = plant, list(plant.tags.values())
+        self._address = plant.address if "://" in plant.address else f"opc.tcp://{plant.address}"
+        with plant.entry.placing():
+            self._user = credentials(plant.get("credentials"))
+            self._keys = _keys_of(plant)
+            if self._user is not None and self._keys is None:
+                raise ConfigError("without encryption, everybody on the line reads the password")
+        self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
+        self._client: Any = None
+        self._known: list[str] | None = None
+
+    async def connect(self) -> None:
+        """See ``polling.Client``."""
+        self._client = self._client_of.Client(self._address, timeout=self._plant["timeout"])
+        if self._user is not None:
+            self._client.set_user(self._user[0])
+            self._client.set_password(self._user[1])
+        try:
+            if self._keys is not None:
+                await self._secure(*self._keys)
+            await self._client.connect()
+        except self._ua.UaError as error:
+            raise self._lost(error) from None
+
+    def _lost(self, error: Exception) -> LostError:
+        name = type(error).__name__
+        if any(word in name for word in _REFUSALS):
+            return RefusedError(f"it refuses this client: {name}")
+        return LostError(f"it does not answer: {name} {error}".strip())
+
+    async def _secure(self, certificate: Path, key: Path) -> None:
+        policies = imported("asyncua.crypto.security_policies", "plant")
+        self._client.application_uri = _uri_in(certificate) or self._client.application_uri
+        pinned = self._plant.get("server_certificate")
+        if pinned is not None:
+            await self._require_pinned(Path(pinned))
+        await self._client.set_security(
+            policies.SecurityPolicyBasic256Sha256,
+            str(certificate),
+            str(key),
+            server_certificate=None if pinned is None else str(pinned),
+        )
+
+    async def _require_pinned(self, path: Path) -> None:
+        """Refuse a server with another certificate than the one in a file."""
+        endpoints = await self._client.connect_and_get_server_endpoints()
+        if _der_of(path) not in [one.ServerCertificate for one in endpoints]:
+            raise RefusedError(f"its certificate is not that of {shown(str(path))}")
+
+    async def read(self) -> dict[str, Answer]:
+        """See ``polling.Client``."""
+        attribute = self._ua.AttributeIds.Value
+        try:
+            told = await self._client.uaclient.read_attributes(self._nodes, attribute)
+        except self._ua.UaError as error:
+            raise self._lost(error) from None
+        found = {}
+        for tag, one in zip(self._tags, told, strict=True):
+            found[tag.name] = await self._answer(tag, one)
+        return found
+
+    async def _answer(self, tag: Tag, told: Any) -> Answer:
+        node, status = tag.address["node"], told.StatusCode
+        if status is not None and not status.is_good():
+            near = await self._nearest(node) if status.name == "BadNodeIdUnknown" else ""
+            return Answer((), f"node {node}: {status.name}{near}")
+        value = None if told.Value is None else told.Value.Value
+        numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value]
+        if not all(isinstance(one, bool | int | float) for one in numbers):
+            return Answer((), f"node {node}: expected a number, got {shown(value)}")
+        if len(numbers) != tag.count:
+            return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
+        if not all(map(math.isfinite, numbers)):
+            return Answer((), f"node {node} has no finite number")
+        return Answer(tuple(tag.conversion(float(one)) for one in numbers))
+
+    async def _nearest(self, node: str) -> str:
+        """The node that was probably meant, in words."""
+        if self._known is None:
+            self._known = [one async for one in self._browsed()]
+        near = get_close_matches(node, self._known, n=1)
+        return f"; did you mean {near[0]}?" if near else ""
+
+    async def _browsed(self) -> AsyncIterator[str]:
+        """The ids of the first nodes below the objects of the server, but not its own."""
+        left, count = [self._client.nodes.objects], 0
+        while left and count < _MOST_NODES:
+            for child in await left.pop(0).get_children():
+                if child.nodeid.NamespaceIndex != 0:
+                    count += 1
+                    left.append(child)
+                    yield child.nodeid.to_string()
+
+    async def close(self) -> None:
+        """See ``polling.Client``."""
+        if self._client is not None:
+            client, self._client = self._client, None
+            with Ignoring(Exception):  # there may be nobody to say goodbye to
+                await client.disconnect()
+
+
+def _node_id(ua: Any, tag: Tag) -> Any:
+    try:
+        return ua.NodeId.from_string(tag.address["node"])
+    except ua.UaError:
+        text = shown(tag.address["node"])
+        raise tag.entry.error(
+            f"expected the id of a node, such as 'ns=2;s=House.T', got {text}"
+        ) from None
+
+
+def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
+    """The certificate and the key of the client; None if nothing is encrypted."""
+    if not plant["encryption"]:
+        return None
+    paths = [plant.get("certificate"), plant.get("key")]
+    if None in paths:
+        raise ConfigError(
+            "OPC UA is encrypted: give this client's 'certificate' and 'key', or say "
+            "encryption = false, with which everybody on the line reads along"
+        )
+    certificate, key = (check_path("a certificate", path) for path in paths)
+    require_secret(key)
+    return certificate, key
+
+
+def _certificate_in(path: Path) -> Any:
+    x509 = imported("cryptography.x509", "plant")
+    content = path.read_bytes()
+    load = x509.load_pem_x509_certificate if b"-----BEGIN" in content else None
+    return (load or x509.load_der_x509_certificate)(content)
+
+
+def _der_of(path: Path) -> bytes:
+    encoding = imported("cryptography.hazmat.primitives.serialization", "plant").Encoding.DER
+    found: bytes = _certificate_in(path).public_bytes(encoding)
+    return found
+
+
+def _uri_in(path: Path) -> str:
+    """The application that a certificate is for."""
+    x509 = imported("cryptography.x509", "plant")
+    names = [
+        one.value.get_values_for_type(x509.UniformResourceIdentifier)
+        for one in _certificate_in(path).extensions
+        if isinstance(one.value, x509.SubjectAlternativeName)
+    ]
+    return str(names[0][0]) if names and names[0] else ""
+
+
+# The server.
+
+
+async def serve_opcua(
+    plant: Plant,
+    port: int,
+    values: Callable[[], Mapping[str, Sequence[float]]],
+    bound: Callable[[str], None],
+) -> Callable[[], Awaitable[None]]:
+    """Serve tags on the loopback; see ``modbus.serve_modbus``.
+
+    Where the plant encrypts, the server makes a certificate of its own, and takes all clients.
+    """
+    ua, asyncua = imported("asyncua.ua", "plant"), imported("asyncua", "plant")
+    server = asyncua.Server()
+    await server.init()
+    server.set_server_name("fmugym")
+    server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    if plant["encryption"]:
+        await _certify(server, ua, plant.get("certificate"))
+    for tag in plant.tags.values():
+        await _add(server, ua, tag, values)
+    await server.start()
+    bound(f"opc.tcp://127.0.0.1:{server.bserver.port}")
+    ended: Callable[[], Awaitable[None]] = server.stop
+    return ended
+
+
+async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
+    """Encrypt with a new certificate, and take no other client than a given one."""
+    make = imported("asyncua.crypto.cert_gen", "plant").setup_self_signed_certificate
+    use = imported("cryptography.x509.oid", "plant").ExtendedKeyUsageOID.SERVER_AUTH
+    refused = imported("asyncua.common.utils", "plant").ServiceError
+    uri = "urn:fmugym:server"
+    with TemporaryDirectory() as folder:
+        key, certificate = Path(folder, "key.pem"), Path(folder, "certificate.der")
+        await make(key, certificate, uri, "localhost", [use], {"commonName": "fmugym"})
+        await server.load_certificate(str(certificate))
+        await server.load_private_key(str(key))
+    await server.set_application_uri(uri)
+    server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+    known = None if trusted is None else _certificate_in(Path(trusted))
+
+    async def validate(certificate: Any, description: Any) -> None:
+        if known is not None and certificate != known:
+            raise refused(ua.StatusCodes.BadCertificateUntrusted)
+
+    server.set_certificate_validator(validate)
+
+
+async def _add(
+    server: Any, ua: Any, tag: Tag, values: Callable[[], Mapping[str, Sequence[float]]]
+) -> None:
+    """Add the node of a tag, whose value is found when somebody reads it."""
+    node = _node_id(ua, tag)
+    while node.NamespaceIndex >= len(await server.get_namespace_array()):
+        await server.register_namespace(f"urn:fmugym:{len(await server.get_namespace_array())}")
+    start = [0.0] * tag.count if tag.count > 1 else 0.0
+    await server.nodes.objects.add_variable(node, tag.name, start, ua.VariantType.Double)
+
+    def look(_: Any, attribute: Any) -> Any:
+        raw = [tag.conversion.inverse(value) for value in values()[tag.name]]
+        value = ua.Variant(raw if tag.count > 1 else raw[0], ua.VariantType.Double)
+        if all(map(math.isfinite, raw)):
+            return ua.DataValue(value)
+        return ua.DataValue(value, ua.StatusCode(ua.StatusCodes.BadSensorFailure))
+
+    server.set_attribute_value_callback(node, look)

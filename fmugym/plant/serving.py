@@ -1,0 +1,249 @@
+"""An FMU as a plant: what a server of the loopback tells of it."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from fmugym.declared import Task, TaskEnv, load
+from fmugym.declared.format import DEVICE
+from fmugym.declared.naming import CLOCK
+from fmugym.declared.series import Series, read_data
+from fmugym.episodes.simulation import Player, Policy, action_of, policy_of
+from fmugym.errors import ConfigError, FMUGymError, SimulationError
+from fmugym.plant.background import Background
+from fmugym.plant.modbus import serve_modbus
+from fmugym.plant.opcua import serve_opcua
+from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
+from fmugym.pool.backend.clocks import Clock, RealClock
+
+__all__ = ["Server", "endless", "environment"]
+
+_ENDS: Final = ("episode_length", "terminated", "truncated")
+
+
+def endless(task: Task) -> Task:
+    """Return the task without an end of its episodes: a plant goes on."""
+    return replace(task, document={k: v for k, v in task.document.items() if k not in _ENDS})
+
+
+def environment(task: Task, **arguments: Any) -> TaskEnv:
+    """Make the environment of a task.
+
+    Raises:
+        ConfigError: If its class is no ``TaskEnv``, whose variables have names.
+    """
+    env = load(task, hooks="python", **arguments)
+    if isinstance(env, TaskEnv):
+        return env
+    env.close()
+    raise ConfigError(f"a plant needs a declared task, got a {type(env).__name__}")
+
+
+class _Twin:
+    """An FMU that somebody controls, and its values as functions of time.
+
+    Args:
+        env: The environment.
+        plant: Has the tags.
+        policy: Acts.
+        clock: Tells the time.
+        seed: Of the episode.
+    """
+
+    def __init__(self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int) -> None:
+        self._env, self._plant, self._policy, self._clock = env, plant, policy, clock
+        assert env.inside.quantities is not None
+        self._quantities = env.inside.quantities()
+        self._is_late, self._is_straight = self._shapes()
+        self._sensors = self._places_of_sensors()
+        self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
+        policy.begin()
+        self._observation, _ = env.reset(seed=seed)
+        self._begin, self.steps = clock.time(), 0
+        self._after = self._read()
+        self._advance()
+
+    def _shapes(self) -> tuple[Any, Any]:
+        """Which quantities are those of the step, and which move on straight lines."""
+        variables, late, straight = in_fmu(self._env), [], []
+        samplings = self._env.config.samplings
+        for one in self._quantities.all:
+            variable, _ = variables.get(one.name, (None, None))
+            is_sampled = variable is not None and variable.name in samplings
+            late.append(one.kind in ("action", "input") or is_sampled)
+            is_real = variable is None or variable.kind == "real"
+            straight.append(one.kind in ("output", "data") and is_real and not one.holds)
+        return np.array(late), np.array(straight)
+
+    def _places_of_sensors(self) -> dict[int, int]:
+        """What sensors show in the observation, by the places of the quantities."""
+        names = self._env.observation_names or ()
+        if "normalize" in self._env.unphysical_keys:
+            return {}
+        declared = self._env.task.document.get("variables", {})
+        return {
+            place: names.index(one.name)
+            for place, one in enumerate(self._quantities.all)
+            if one.kind == "output" and one.name in names
+            if DEVICE.keys() & declared.get(one.name, {}).keys()
+        }
+
+    def _read(self) -> Any:
+        found = np.array(self._quantities.read(self._env), np.float64)
+        for place, seen in self._sensors.items():
+            found[place] = self._observation[seen]
+        return found
+
+    def _advance(self) -> None:
+        self._before = self._after
+        action = self._policy.act(self._observation)
+        self._observation, _, terminated, truncated, info = self._env.step(action)
+        if terminated or truncated:
+            raise SimulationError(f"the FMU has ended: {info.get('fault', 'its stop time')}")
+        self._after = self._read()
+        self.steps += 1
+
+    def values(self) -> dict[str, tuple[float, ...]]:
+        """What all tags have now."""
+        passed = (self._clock.time() - self._begin) / self._plant.step
+        while passed >= self.steps:
+            self._advance()
+        part = passed - (self.steps - 1)
+        moved = self._before + part * (self._after - self._before)
+        now = np.where(self._is_straight, moved, self._before)
+        now = np.where(self._is_late, self._after, now)
+        found = dict(zip([one.name for one in self._quantities.all], now.tolist(), strict=True))
+        time = self._time() + (part - 1.0) * self._plant.step
+        found["clock"] = time
+        return {name: self._of_tag(name, found, time) for name in self._plant.tags}
+
+    def _time(self) -> float:
+        """The time of data after the latest step."""
+        env = self._env
+        if CLOCK in env.variables:
+            now: float = env.variables[CLOCK] + env.step_count * self._plant.step
+            return now
+        return float(env.time)
+
+    def _of_tag(self, name: str, found: Mapping[str, float], time: float) -> tuple[float, ...]:
+        if not name.startswith(DATA):
+            return (found[name],)
+        tag = self._plant.tags[name]
+        ahead = np.arange(tag.count) * (tag.address.get("step") or 0.0)
+        return tuple(_at(self._data[name.removeprefix(DATA)], time + ahead).tolist())
+
+
+def _at(series: Series, times: Any) -> Any:
+    return np.interp((times - series.start) % series.period, series.times, series.values)
+
+
+def _player_of(text: str) -> Player:
+    is_random = text == "random"
+    make_policy = partial(action_of if is_random else policy_of, text=text)
+    return Player(make_policy, is_physical=not is_random)
+
+
+class Server:
+    """Serves the FMU of a task on the loopback, as the plant that its ``[plant]`` describes.
+
+    Nothing can be written from outside. Values between two steps lie on straight lines; those that
+    hold, and what acts, do not. Where an agent's observations are not normalized, they are what the
+    sensors of the task show, with noise and delay.
+
+    Args:
+        config: The task, as for ``fmugym.load``.
+        player: Who acts; or ``"random"``, or a controller as in a task file.
+        port: The port; 0 for a free one.
+        clock: Tells the time; by default that of the machine.
+        seed: Of the episode.
+        steps: How many steps to serve; None for no end.
+
+    Attributes:
+        address: Where it is served, as ``connect`` takes it.
+
+    Raises:
+        ConfigError: If the task has a mistake, or the extra ``plant`` is missing.
+        SimulationError: If the FMU fails.
+    """
+
+    def __init__(
+        self,
+        config: Any,
+        player: Player | str,
+        *,
+        port: int = 0,
+        clock: Clock | None = None,
+        seed: int = 0,
+        steps: int | None = None,
+    ) -> None:
+        self._task, self._port = endless(Task.of(config)), port
+        self._player = _player_of(player) if isinstance(player, str) else player
+        self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
+        self.address, self._is_bound = "", threading.Event()
+        self._background = Background(self._serve, "plant server")
+        while not self._is_bound.wait(0.01) and not self._background.is_over:
+            pass
+        self._raise()
+
+    async def _serve(self) -> None:
+        env: Any = self._player.make_env(lambda **form: environment(self._task, **form))
+        try:
+            plant = read_plant(env)
+            twin = _Twin(env, plant, self._player.make_policy(env), self._clock, self._seed)
+            end = await _SERVERS[plant["protocol"]](plant, self._port, twin.values, self._bound)
+            try:
+                pause = plant.step / 2 / getattr(self._clock, "speed", 1.0)
+                while self._steps is None or twin.steps <= self._steps:
+                    await asyncio.sleep(pause)
+                    twin.values()
+            finally:
+                await end()
+        finally:
+            env.close()
+
+    def _bound(self, address: str) -> None:
+        self.address = address
+        self._is_bound.set()
+
+    def _raise(self) -> None:
+        error = self._background.error
+        if isinstance(error, FMUGymError):
+            raise error
+        if error is not None:
+            raise SimulationError(f"the server has failed: {error}") from error
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the end, for some real time; tells whether it has come.
+
+        Raises:
+            SimulationError: If the FMU has failed.
+        """
+        self._background.join(seconds)
+        self._raise()
+        return self._background.is_over
+
+    def close(self) -> None:
+        """End the server; more than one call is fine."""
+        self._background.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        place: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+_SERVERS: Final[Mapping[str, Any]] = {"modbus": serve_modbus, "opcua": serve_opcua}

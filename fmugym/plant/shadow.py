@@ -1,0 +1,261 @@
+"""An environment in the shadow of a plant: it reads, and writes nothing."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+
+from fmugym.checks import check_flag
+from fmugym.declared import Task, TaskEnv
+from fmugym.declared.format import DEVICE
+from fmugym.episodes.simulation import Policy
+from fmugym.plant.feed import Feed, local_time
+from fmugym.plant.live import Live
+from fmugym.plant.modbus import ModbusClient
+from fmugym.plant.opcua import OpcUaClient
+from fmugym.plant.polling import Poller
+from fmugym.plant.predicting import Predictions
+from fmugym.plant.serving import endless, environment
+from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
+from fmugym.plant.written import Written, lacking_tag
+from fmugym.pool.backend.clocks import Clock, RealClock
+from fmugym.task.warm_up import WarmUp, WarmUps
+
+__all__ = ["Shadow", "connect", "holding"]
+
+_OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
+_CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
+
+
+class _PresentTime:
+    """The start time of an episode: that of the plant."""
+
+    def __init__(self, feed: Feed) -> None:
+        self._feed = feed
+
+    def sample(self, rng: np.random.Generator) -> float:
+        """Return the time of the present tick, in seconds of the year."""
+        return self._feed.time
+
+
+def _watched(task: Task, feed: Feed) -> Task:
+    """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
+    document = {k: v for k, v in endless(task).document.items() if k not in _OF_SIMULATIONS}
+    variables = document.get("variables", {})
+    document["variables"] = {
+        alias: {key: value for key, value in given.items() if key not in DEVICE}
+        for alias, given in variables.items()
+    }
+    agent = dict(document.get("agent", {}))
+    if "forecast" in agent:
+        given = agent["forecast"]
+        agent["forecast"] = [
+            {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
+        ]
+    if "history" in agent:
+        held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+        document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
+    return replace(task, document={**document, "agent": agent, "start_time": _PresentTime(feed)})
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
+class _Watching(WarmUp):
+    """Fills histories: the steps before the first observation, with what acts in the plant."""
+
+    def __init__(self, declared: WarmUp, feed: Feed, written: Written) -> None:
+        self.steps, self.writes = declared.steps, declared.writes
+        self._declared, self._feed, self._written = declared, feed, written
+
+    def begin(self, count: int) -> None:
+        """See ``WarmUp.begin``."""
+        self._declared.begin(count)
+
+    def inputs(self, env: Any) -> Any:
+        """See ``WarmUp.inputs``: wait, and see what has acted."""
+        values = self._declared.inputs(env)
+        self._feed.advance()
+        return self._written.over(np.array([np.ravel(value)[0] for value in values]))
+
+    def update(self, env: Any) -> None:
+        """See ``WarmUp.update``."""
+        self._declared.update(env)
+
+
+class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A task in the shadow of a plant.
+
+    ``reset`` sets nothing: it waits for good values and a tick, and for as long as histories go
+    back. ``step`` writes nothing: it takes what an agent would do, waits for the next tick, and
+    goes on with what has acted in the plant. So rewards, histories and inputs are those of the
+    plant. Infos have
+
+    * ``"proposed"``: what the action would have written, by variable;
+    * ``"predicted"``: what a copy of the FMU foretold a step ago, by variable;
+    * ``"missing"``: the variables that have no value any longer; the last ones go on;
+    * ``"fault"``: what is wrong, also while last values hold.
+
+    An episode ends (``truncated``) if the plant's time jumps.
+
+    Attributes:
+        errors: Returns the errors of all predictions until now.
+    """
+
+    def __init__(
+        self, env: TaskEnv, feed: Feed, written: Written, copies: Predictions, owned: ExitStack
+    ) -> None:
+        super().__init__(env)
+        self._feed, self._written, self._owned = feed, written, owned
+        self._copies, self.errors = copies, copies.errors
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether a value is missing, so that an agent holds its last action."""
+        return bool(self._feed.missing)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin to watch.
+
+        Raises:
+            ConfigError: If the server does not know a tag, or one has a wrong type.
+            SimulationError: If the server does not answer.
+        """
+        self._feed.begin()
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._copies.begin()
+        unknown = dict.fromkeys(self._written.names, math.nan)
+        predicted = dict.fromkeys(self._copies.names, math.nan)
+        return observation, info | self._told(unknown, predicted)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Wait for the next tick; see the class."""
+        proposed = self._written.proposed(action)
+        self._feed.advance()
+        observation, reward, terminated, truncated, info = self.env.step(self._written.action())
+        truncated = truncated or self._feed.jump != 0.0
+        info |= self._told(proposed, self._copies.follow())
+        return observation, reward, terminated, truncated, info
+
+    def _told(self, proposed: dict[str, float], predicted: dict[str, float]) -> dict[str, Any]:
+        feed = self._feed
+        faults = [f"{name}: {why}" for name, why in feed.faults.items()]
+        if feed.jump:
+            faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
+        told: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
+        told["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
+        return told | ({"fault": "; ".join(faults)} if faults else {})
+
+    def close(self) -> None:
+        """End the connection."""
+        self._owned.close()
+
+
+def connect(
+    config: Any,
+    address: str | None = None,
+    *,
+    physical: bool = False,
+    ahead: float = 0.0,
+    clock: Clock | None = None,
+) -> Shadow:
+    """Connect to the plant of a task.
+
+    Args:
+        config: The task, as for ``fmugym.load``, with a section ``[plant]``.
+        address: In the place of that of the task.
+        physical: Whether observations and actions are in the units of the task, as controllers
+            need them.
+        ahead: How far ahead copies of the FMU predict, in seconds; 0 for no copies.
+        clock: A monotonic clock; ``RealClock(speed)`` for a plant that ``fmugym serve`` runs
+            faster.
+
+    Returns:
+        The environment. Closing it ends the connection.
+
+    Raises:
+        ConfigError: If the task has a mistake, has no ``[plant]``, or lacks a tag, or if the extra
+            ``plant`` is missing.
+    """
+    task, clock = Task.of(config), clock or RealClock()
+    feed = Feed(clock, _wall(clock))
+    watched = _watched(task, feed)
+    own = watched.physical() if check_flag("physical", physical) else watched
+    with ExitStack() as stack:
+        env = environment(own, backend=feed)
+        stack.callback(env.close)
+        plant = read_plant(env, address)
+        written = Written(env, feed, plant)
+        read, samplings = _reading(env, feed, plant)
+        _watch_warm_up(env, feed, written)
+        make_copy = partial(environment, _without_warm_up(watched).physical())
+        copies = Predictions(make_copy, feed, plant, int(ahead / plant.step + 1e-9))
+        stack.callback(copies.close)
+        live = Live(env, plant)
+        live.envs += copies.envs
+        client = _CLIENTS[plant["protocol"]](plant)
+        poller = Poller(client, clock, plant.poll, plant["timeout"])
+        stack.callback(poller.stop)
+        samplings |= dict.fromkeys(written.names, "median")
+        feed.open(plant, poller, samplings, read, live)
+        return Shadow(env, feed, written, copies, stack.pop_all())
+
+
+def _wall(clock: Clock) -> Callable[[], float]:
+    """The time of this place; if a clock runs faster, it began with that."""
+    if getattr(clock, "speed", 1.0) == 1.0:
+        return local_time
+    start = local_time() - clock.time()
+    return lambda: start + clock.time()
+
+
+def _without_warm_up(task: Task) -> Task:
+    return replace(task, document={k: v for k, v in task.document.items() if k != "warm_up"})
+
+
+def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
+    if env.inside.warm_ups is not None:
+        watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
+        env.inside.warm_ups = WarmUps(env, watching)
+
+
+def _reading(
+    env: TaskEnv, feed: Feed, plant: Plant
+) -> tuple[Callable[[], Mapping[str, float]], dict[str, str]]:
+    """What reads all that the task reads, in the FMU's units, and how tags are sampled."""
+    outputs = {one.name for one in env.inside.spec.outputs}
+    found = {
+        variable.name: (alias, conversion)
+        for alias, (variable, conversion) in in_fmu(env).items()
+        if variable.name in outputs and alias in plant.tags
+    }
+    for name in sorted(outputs - found.keys()):
+        raise lacking_tag(name)
+    how = env.config.samplings
+
+    def read() -> dict[str, float]:
+        return {n: own.inverse(feed.values[alias][0]) for n, (alias, own) in found.items()}
+
+    return read, {alias: how.get(name, "last") for name, (alias, _) in found.items()}
+
+
+def holding(policy: Policy, shadow: Shadow) -> Policy:
+    """Make a policy hold its last action while values are missing."""
+    last: list[Any] = []
+
+    def act(observation: Any) -> Any:
+        if not (last and shadow.is_missing):
+            last[:] = [policy.act(observation)]
+        return last[0]
+
+    return Policy(act, policy.begin)

@@ -1,0 +1,159 @@
+"""Where a plant has the variables of a task."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from fmugym.archive.units import Conversion, conversion_between
+from fmugym.archive.variable import Variable
+from fmugym.declared import TaskEnv
+from fmugym.declared.entries import Entry
+from fmugym.errors import ConfigError, unknown_name
+
+__all__ = ["DATA", "Plant", "Tag", "in_fmu", "read_plant"]
+
+DATA = "data."
+"""What the names of tags of live data begin with."""
+
+
+@dataclass(frozen=True)
+class Tag:
+    """A variable of a plant.
+
+    Attributes:
+        name: The name in the task.
+        entry: Where it is declared; its value has the keys of the address.
+        conversion: From the plant's number to the unit of the task.
+        count: How many numbers there are.
+        low, high: The limits of the task, infinite where there are none.
+    """
+
+    name: str
+    entry: Entry
+    conversion: Conversion
+    count: int = 1
+    low: float = -math.inf
+    high: float = math.inf
+
+    def misfit(self, number: float) -> str:
+        """What is strange about a number, which a wrong type would make; "" if nothing is."""
+        width = self.high - self.low
+        if math.isinf(width) or self.low - width <= number <= self.high + width:
+            return ""
+        return (
+            f"got {number:.6g}, expected {self.low:g} to {self.high:g} or not far from it: are "
+            "'type', 'word_order', 'scale' and 'unit' right?"
+        )
+
+    @property
+    def address(self) -> Mapping[str, Any]:
+        """The keys of its address."""
+        found: Mapping[str, Any] = self.entry.value
+        return found
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The section ``[plant]`` of a task.
+
+    Attributes:
+        entry: Where it stands.
+        address: That of the server.
+        tags: By name.
+        step: The time step of the task in seconds.
+        poll, stale_after, hold: In seconds.
+    """
+
+    entry: Entry
+    address: str
+    tags: Mapping[str, Tag]
+    step: float
+    poll: float
+    stale_after: float
+    hold: float
+
+    def __getitem__(self, key: str) -> Any:
+        return self.entry.value[key]
+
+    def get(self, key: str) -> Any:
+        """The value of a key; None if it is not given."""
+        return self.entry.value.get(key)
+
+
+def in_fmu(env: TaskEnv) -> dict[str, tuple[Variable, Conversion]]:
+    """The variables that an environment writes and reads, by their names in the task.
+
+    Each comes with the conversion from the FMU's unit to that of the task.
+    """
+    declared, spec = env.task.document.get("variables", {}), env.inside.spec
+    known = {variable.name: variable for variable in (*spec.inputs, *spec.outputs)}
+    found = {}
+    for alias in dict.fromkeys([*declared, *known]):
+        given = declared.get(alias, {})
+        variable = known.get(given.get("name", alias))
+        if variable is not None:
+            units = env.fmu.description.units
+            found[alias] = variable, conversion_between(variable.unit, given.get("unit"), units)
+    return found
+
+
+def read_plant(env: TaskEnv, address: str | None = None) -> Plant:
+    """Read the section of a plant.
+
+    Args:
+        env: The environment of its task.
+        address: In the place of that of the task.
+
+    Raises:
+        ConfigError: If there is none, or a name or a unit is wrong. The text says where.
+    """
+    entry, step = env.task.root.child("plant"), env.inside.spec.time_step
+    if entry.value is None:
+        raise env.task.root.error("the task has no [plant], which says where a plant has what")
+    tags = {tag.name: tag for tag in _tags(env, entry)}
+    poll = entry.value.get("poll") or step / 10
+    stale = entry.value.get("stale_after") or 3 * poll
+    hold = entry.value.get("hold")
+    address = address or entry.value["address"]
+    return Plant(entry, address, tags, step, poll, stale, step if hold is None else hold)
+
+
+def _tags(env: TaskEnv, entry: Entry) -> Iterator[Tag]:
+    quantities = env.inside.quantities
+    known = {one.name: one for one in (quantities().all if quantities else ())}
+    for name, one in entry.child("tags").items().items():
+        if name not in known and name in (others := _others(env)):
+            continue  # a variable of the FMU that the task does not read
+        if name not in known:
+            raise one.error(unknown_name("variable of the task", name, [*known, *others]))
+        limits = {"low": known[name].low, "high": known[name].high}
+        yield replace(_tag(env, name, one, known[name].unit), **limits)
+    if entry.child("clock").value is not None:
+        yield _tag(env, "clock", entry.child("clock"), "s")
+    for name, one in entry.child("data").items().items():
+        if name not in (data := env.task.document.get("data", {})):
+            raise one.error(unknown_name("data", name, data))
+        if "file" not in one.value:
+            yield _tag(env, DATA + name, one, data[name].get("unit", ""))
+
+
+def _others(env: TaskEnv) -> set[str]:
+    return {*env.task.document.get("variables", ()), *env.fmu.description.variables}
+
+
+def _tag(env: TaskEnv, name: str, entry: Entry, unit: str) -> Tag:
+    given = entry.value
+    _require_protocol(entry, env.task.root.child("plant").child("protocol").value)
+    with entry.placing():
+        own = conversion_between(given.get("unit"), unit or None, env.fmu.description.units)
+    raw = Conversion(given["scale"], given["offset"])
+    return Tag(name, entry, own.after(raw), given.get("count", 1))
+
+
+def _require_protocol(entry: Entry, protocol: str) -> None:
+    key = "node" if protocol == "opcua" else "register"
+    if key not in entry.value:
+        raise entry.error(ConfigError(f"the protocol {protocol!r} needs the key {key!r}"))

@@ -1,0 +1,153 @@
+"""The commands about plants: serve, and simulate --plant."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+from fmugym.checks import check_count, check_number
+from fmugym.declared import Task
+from fmugym.declared.quantities import duration
+from fmugym.episodes.output_files import Recording
+from fmugym.episodes.progress_bars import progress
+from fmugym.episodes.simulation import Summary, simulate
+from fmugym.errors import ConfigError, FMUGymError, plain, shown
+from fmugym.plant import Server, connect
+from fmugym.plant.predicting import Error
+from fmugym.plant.shadow import holding
+from fmugym.pool.backend.clocks import RealClock
+from fmugym.tools.options import (
+    Commands,
+    add_command,
+    add_players,
+    check_numbers,
+    only_player,
+    say,
+    say_json,
+    shown_in_any_case,
+)
+
+__all__ = ["add_of_plants", "add_serve", "follow_plant"]
+
+_AHEAD: Final = "3h"
+
+
+def add_of_plants(command: argparse.ArgumentParser) -> None:
+    """Add the options for ``simulate --plant``."""
+    group = command.add_argument_group("in the shadow of a plant (needs the extra plant)")
+    text = "read the plant that [plant] of the task describes, or at another address; write nothing"
+    group.add_argument("--plant", nargs="?", const="", metavar="ADDRESS", help=text)
+    text = f"how far ahead copies of the FMU predict; default {_AHEAD}"
+    group.add_argument("--ahead", metavar="TIME", default=_AHEAD, help=text)
+    _add_speed(group)
+
+
+def _add_speed(command: Any) -> None:
+    text = "seconds of the plant in a second of real time; default 1"
+    command.add_argument("--speed", type=float, default=1.0, help=text)
+
+
+def _clock(arguments: argparse.Namespace) -> RealClock:
+    return RealClock(check_number("--speed", arguments.speed, positive=True))
+
+
+def _task_of(arguments: argparse.Namespace) -> Task:
+    if not Path(arguments.task).is_file():
+        raise ConfigError(f"a plant needs a task file with [plant], got {shown(arguments.task)}")
+    return Task.read(arguments.task)
+
+
+def follow_plant(arguments: argparse.Namespace) -> None:
+    """Let one who acts be the shadow of a plant, until so many steps are done."""
+    player = only_player(arguments)
+    ahead = duration("--ahead", arguments.ahead)
+    make_env: Any = partial(
+        connect, _task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
+    )
+    recording, done = Recording(arguments.task, None, arguments.output), list[Summary]()
+    with closing(player.make_env(make_env)) as env:
+        shadow: Any = env
+        played = shadow
+        if arguments.output:
+            played = recording.begin("shadow", shadow, arguments.variables, arguments.every)
+        policy = holding(player.make_policy(shadow.unwrapped), shadow)
+        with (
+            _finished_after_errors(recording, arguments.seed),
+            shown_in_any_case(lambda: _show(arguments, recording, done, shadow.errors())),
+            progress(arguments.steps, "shadow") as advance,
+        ):
+            while (left := arguments.steps - sum(one.steps for one in done)) > 0:
+                done.append(simulate(played, policy, arguments.seed, left, advance))
+                if not arguments.json:
+                    say(plain(done[-1].as_text()))
+
+
+@contextmanager
+def _finished_after_errors(recording: Recording, seed: int) -> Iterator[None]:
+    try:
+        yield
+    except FMUGymError:
+        recording.finish(seed)
+        raise
+
+
+def _show(
+    arguments: argparse.Namespace,
+    recording: Recording,
+    done: Sequence[Summary],
+    errors: Sequence[Error],
+) -> None:
+    recording.finish(arguments.seed)
+    if arguments.json:
+        told = [one.as_dict() for one in done]
+        predictions = [one._asdict() for one in errors]
+        facts = {"task": arguments.task, "output": arguments.output}
+        say_json({**facts, "episodes": told, "predictions": predictions})
+        return
+    for line in _table(errors):
+        say(plain(line))
+
+
+def _table(errors: Sequence[Error]) -> list[str]:
+    """The errors of predictions, by variable, at each doubling of how far they go."""
+    lines = []
+    for name in dict.fromkeys(one.name for one in errors):
+        own = [one for one in errors if one.name == name]
+        chosen = [own[place - 1] for place in _doubling(len(own))]
+        cells = [f"{one.rms:.3g} ({one.bias:+.2g}) {one.ahead:g} s ahead" for one in chosen]
+        lines.append(f"error of {name}, root mean square (and mean): {', '.join(cells)}")
+    return lines
+
+
+def _doubling(count: int) -> list[int]:
+    powers = [2**power for power in range(count.bit_length()) if 2**power < count]
+    return [*powers, count]
+
+
+def add_serve(commands: Commands) -> None:
+    """Add ``serve``."""
+    text = "let the FMU of a task be a plant on the loopback, as [plant] of the task describes"
+    command = add_command(commands, "serve", _serve, text)
+    command.add_argument("task", metavar="TASK", help="a task file with [plant]")
+    add_players(command)
+    command.add_argument("--port", type=int, default=0, help="by default a free one")
+    command.add_argument("--seed", type=int, default=0, metavar="N", help="default 0")
+    command.add_argument("--steps", type=int, metavar="N", help="how many; default no end")
+    _add_speed(command)
+
+
+def _serve(arguments: argparse.Namespace) -> None:
+    check_numbers(arguments)
+    steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
+    options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
+    task, player = _task_of(arguments), only_player(arguments)
+    with Server(task, player, clock=_clock(arguments), **options) as server:
+        say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
+        sys.stdout.flush()  # a program may wait for the address
+        while not server.wait(0.2):
+            pass

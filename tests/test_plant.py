@@ -1,0 +1,480 @@
+"""Plants: an agent in the shadow of one, and an FMU that is one, by Modbus TCP."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pymodbus", reason="needs pymodbus, of the extra plant")
+
+from plant_tools import (
+    STEP,
+    Line,
+    LockStep,
+    changed,
+    functions_in,
+    held_by,
+    house,
+    nothing_left,
+    watched,
+)
+
+import fmugym
+from fmugym.declared.series import read_data
+from fmugym.episodes.simulation import action_of, policy_of, simulate
+from fmugym.errors import ConfigError, SimulationError
+from fmugym.lab import RealClock
+from fmugym.logs import PlantLog, play_log
+from fmugym.plant import Server, connect
+from fmugym.series import RecordSeries
+from fmugym.tools.cli import main
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left():
+    with nothing_left():
+        yield
+
+
+@pytest.fixture
+def clock():
+    return LockStep()
+
+
+@pytest.fixture
+def server(clock):
+    with Server(house(), "thermostat", clock=clock) as found:
+        yield found
+
+
+def watch(server, clock, task=None, address=None):
+    return connect(task or house(), address or server.address, physical=True, clock=clock)
+
+
+def reference(steps):
+    """The same house under the same thermostat, without a plant."""
+    env = RecordSeries(fmugym.load(house(), physical=True))
+    simulate(env, policy_of(env.unwrapped, "thermostat"), 0, steps)
+    env.close()
+    return env.series
+
+
+class TestShadow:
+    def test_records_what_the_plant_does(self, server, clock, tmp_path):
+        env = RecordSeries(watch(server, clock), path=tmp_path / "plant.csv")
+        env.reset(seed=0)
+        for _ in range(12):
+            _, _, terminated, truncated, info = env.step(np.float32([0.3]))
+            assert not terminated
+            assert not truncated
+            assert "fault" not in info
+        env.close()
+        found, plain = env.series, reference(40)
+        times = np.arange(len(plain)) * STEP
+        begin = float(found["time"][0]) - 309 * 86400.0
+        assert begin % STEP == 0
+        for name, off in (("T", 0.03), ("T_floor", 0.3)):
+            expected = np.interp(begin + np.arange(13) * STEP, times, plain[name])
+            np.testing.assert_allclose(found[name], expected, atol=off)
+        first = round(begin / STEP)
+        np.testing.assert_allclose(found["u"][1:], plain["u"][first + 1 : first + 13], atol=1e-6)
+        assert 0.0 < found["u"].mean() < 1.0
+        np.testing.assert_allclose(found["proposed.u"][1:], 0.3, atol=1e-6)
+        np.testing.assert_allclose(
+            found["power"][1:], plain["power"][first + 1 : first + 13], atol=0.61
+        )
+
+    def test_its_record_is_a_log(self, server, clock, tmp_path):
+        env = RecordSeries(watch(server, clock), path=tmp_path / "plant.csv")
+        simulate(env, action_of(env.unwrapped, "0.5"), 0, 6)
+        env.close()
+        log = PlantLog.read(tmp_path / "plant.csv")
+        assert log.units["T"] == "degC"
+        assert log.inputs_before
+        (recording,) = play_log(log, lambda **more: fmugym.load(house(), physical=True, **more))
+        assert len(recording) == 6
+        np.testing.assert_allclose(recording.rewards, env.series["reward"][1:], atol=1e-9)
+
+    def test_writes_nothing(self, server, clock):
+        line = Line(server.address)
+        env = watch(server, clock, address=line.address)
+        simulate(env, action_of(env.unwrapped, "0.5"), 0, 2)
+        env.close()
+        line.close()
+        assert functions_in(line.sent) == {1, 3, 4}
+
+    def test_the_server_refuses_who_writes(self, server):
+        from pymodbus.client import ModbusTcpClient
+
+        host, port = server.address.split(":")
+        client = ModbusTcpClient(host, port=int(port))
+        assert client.connect()
+        before = client.read_holding_registers(0, count=4).registers
+        assert client.write_register(0, 1).exception_code == 1
+        assert client.read_holding_registers(0, count=4).registers == before
+        client.close()
+
+    def test_fills_histories(self, server, clock):
+        task = house(agent={"history": {"of": ["T", "u"], "length": "1h"}})
+        env = RecordSeries(watch(server, clock, task))
+        observation, _ = env.reset(seed=0)
+        names = list(env.unwrapped.observation_names)
+        past = [observation[names.index(f"T[-{900 * k} s]")] for k in range(1, 5)]
+        assert len(set(past)) == 4
+        time = float(env.series["time"][0]) - 309 * 86400.0
+        plain = reference(12)
+        expected = np.interp(
+            [time - k * STEP for k in range(1, 5)], np.arange(13) * STEP, plain["T"]
+        )
+        np.testing.assert_allclose(past, expected, atol=0.03)
+        acted = [observation[names.index(f"u[-{900 * k} s]")] for k in range(1, 5)]
+        first = round(time / STEP)
+        np.testing.assert_allclose(acted, plain["u"][first : first - 4 : -1], atol=1e-6)
+        env.close()
+
+
+@pytest.fixture
+def line(server):
+    found = Line(server.address)
+    yield found
+    found.close()
+
+
+def tags_with(**others):
+    return dict(house().document["plant"]["tags"]) | others
+
+
+class TestFaults:
+    """Clear words, and nothing lost from the record."""
+
+    def test_a_server_that_goes_and_comes_back(self, clock, line, tmp_path):
+        task = house(stale_after="5min", hold="20min")
+        with watched(clock, line.address, task) as shadow:
+            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            policy, told = held_by(shadow), []
+            observation, _ = env.reset(seed=0)
+            for step in range(8):
+                if step == 1:
+                    clock.patience = 0.1
+                    line.cut()
+                if step == 5:
+                    clock.patience = 3.0
+                    line.mend()
+                observation, *_, info = env.step(policy(observation))
+                told.append((bool(info["missing"]), info.get("fault", "")))
+            env.complete()
+        assert [missing for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
+        assert ["T: " in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
+        assert "connection" in told[2][1]
+        series = env.series
+        assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+        assert len(set(series["proposed.u"][4:7].tolist())) == 1
+        assert series.faults.keys() == {2, 3, 4, 5}
+        assert np.all(np.diff(series["time"]) == STEP)
+        text = (tmp_path / "plant.csv").read_text(encoding="utf-8")
+        assert len(text.splitlines()) == 10
+
+    def test_a_log_with_a_gap_is_two_episodes(self, clock, tmp_path, monkeypatch):
+        gone = []
+        changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
+        task = house(stale_after="1min", hold=0)
+        with (
+            Server(house(), "thermostat", clock=clock) as server,
+            watched(clock, server.address, task) as shadow,
+        ):
+            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            env.reset(seed=0)
+            for step in range(9):
+                gone[:] = [True] * (step in (4, 5))
+                env.step(np.float32([0.5]))
+            env.complete()
+        assert np.isnan(env.series["T"]).tolist() == [k in (5, 6) for k in range(10)]
+        assert "holding 0 has no finite number" in env.series.faults[5]
+        log = PlantLog.read(tmp_path / "plant.csv")
+        found = play_log(log, lambda **more: fmugym.load(house(), physical=True, **more))
+        assert [len(one) for one in found] == [4, 2]
+
+    def test_a_server_that_is_started_anew(self, clock):
+        with Server(house(), "thermostat", clock=clock) as first:
+            line = Line(first.address)
+            env = connect(house(), line.address, physical=True, clock=clock)
+            env.reset(seed=0)
+            env.step(np.float32([0.5]))
+        clock.patience = 0.1
+        *_, info = env.step(np.float32([0.5]))
+        assert "T: " in info["fault"]
+        clock.patience = 3.0
+        with Server(house(), "thermostat", clock=clock, seed=1) as second:
+            line.target = int(second.address.split(":")[1])
+            for _ in range(2):
+                *_, info = env.step(np.float32([0.5]))
+            assert "T: " not in info.get("fault", "")
+            env.close()
+        line.close()
+
+    def test_no_server(self, clock):
+        task = house(timeout="0.2s")
+        with (
+            watched(clock, "127.0.0.1:9", task) as env,
+            pytest.raises(SimulationError, match=r"T: .*connection"),
+        ):
+            env.reset()
+
+    def test_a_tag_that_does_not_exist(self, server, clock):
+        task = house(tags=tags_with(T_floor={"register": 900, "type": "int16"}))
+        with (
+            watched(clock, server.address, task) as env,
+            pytest.raises(ConfigError, match=r"T_floor: holding 900 of unit 1.*no such") as told,
+        ):
+            env.reset()
+        assert "power: " not in str(told.value)
+
+    def test_a_wrong_type(self, server, clock):
+        wrong = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
+        with (
+            watched(clock, server.address, house(tags=tags_with(T=wrong))) as env,
+            pytest.raises(ConfigError, match=r"T: got .*expected 10 to 30.*'type'"),
+        ):
+            env.reset()
+
+    def test_a_clock_that_jumps(self, clock, monkeypatch):
+        jump = [0.0]
+        changed(monkeypatch, lambda values: {"clock": (values["clock"][0] + jump[0],)})
+        with (
+            Server(house(), "thermostat", clock=clock) as server,
+            watched(clock, server.address, house()) as env,
+        ):
+            env.reset(seed=0)
+            env.step(np.float32([0.5]))
+            before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
+            *_, truncated, info = env.step(np.float32([0.5]))
+            assert truncated
+            assert "clock has jumped by 14400 s" in info["fault"]
+            env.reset()
+            assert float(env.unwrapped.time) >= before + jump[0]
+            *_, truncated, info = env.step(np.float32([0.5]))
+            assert not truncated
+            assert "fault" not in info
+
+    def test_answers_that_are_two_seconds_late(self):
+        """Values are older then, but ticks come in time."""
+        clock = RealClock(300.0)
+        with Server(house(), "thermostat", clock=clock) as server:
+            line = Line(server.address)
+            line.delay = 2.0 / 3.0  # there are three questions
+            task = house(poll="1min", stale_after="20min", timeout="5s")
+            with watched(clock, line.address, task) as env:
+                env.reset(seed=0)
+                begin = clock.time()
+                *_, info = env.step(np.float32([0.5]))
+                assert clock.time() - begin < 1.5 * STEP
+                assert "fault" not in info
+            line.close()
+
+    def test_two_clients(self, server, clock):
+        with (
+            watched(clock, server.address, house()) as one,
+            watched(clock, server.address, house()) as other,
+        ):
+            first, second = RecordSeries(one), RecordSeries(other)
+            first.reset(seed=0)
+            second.reset(seed=0)
+            for _ in range(3):
+                first.step(np.float32([0.5]))
+                second.step(np.float32([0.2]))
+        assert set(first.series["time"]) & set(second.series["time"])
+        _, here, there = np.intersect1d(
+            first.series["time"], second.series["time"], return_indices=True
+        )
+        for name in ("T", "T_floor"):
+            np.testing.assert_allclose(
+                first.series[name][here], second.series[name][there], atol=0.1
+            )
+
+
+SEEN = {
+    "observations": ["T", "T_floor", "T_out", "price"],
+    "forecast": {"of": ["T_out", "price"], "horizon": "4h", "step": "2h", "error": 0.1},
+}
+
+
+@pytest.mark.parametrize("name", ["u", "T_floor"])
+def test_a_task_whose_tags_do_not_suffice(name):
+    tags = tags_with()
+    del tags[name]
+    with pytest.raises(ConfigError, match=r"\[plant\] has no tag for '(u|T_w)'"):
+        connect(house(tags=tags))
+
+
+class TestData:
+    @pytest.fixture
+    def prices(self, tmp_path):
+        path = tmp_path / "prices.csv"
+
+        def write(hours, first=309 * 24):
+            rows = [f"{3600 * hour},{hour - 300 * 24}" for hour in range(first, first + hours)]
+            path.write_text("\n".join(["time,ct", *rows, ""]), encoding="utf-8")
+
+        write(48)
+        return path, write
+
+    def task(self, prices, count=3, **plant):
+        data = {
+            "price": {"file": str(prices[0]), "column": "ct", "interpolation": "previous"},
+            "T_out": {"register": 200, "count": count, "step": "2h", "unit": "K"},
+        }
+        return house(agent=SEEN, data=data, stale_after="5min", hold="5min", **plant)
+
+    def test_is_refused_without_a_source(self, prices):
+        data = {"price": self.task(prices).document["plant"]["data"]["price"]}
+        with pytest.raises(ConfigError, match=r"sees 'T_out'.*\[plant.data\]"):
+            connect(house(agent=SEEN, data=data))
+
+    def test_is_refused_if_a_tag_does_not_reach_far_enough(self, prices):
+        with pytest.raises(ConfigError, match=r"T_out.* 14400 s ahead.*got 2 and 7200"):
+            connect(self.task(prices, count=2))
+
+    def test_is_what_the_agent_sees(self, clock, prices):
+        task = self.task(prices)
+        year = fmugym.load(house(), physical=True)
+        table = read_data(year.task.root.child("data").child("T_out"))
+        year.close()
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            watched(clock, server.address, task) as env,
+        ):
+            observation, _ = env.reset(seed=0)
+            for _ in range(3):
+                names = env.unwrapped.observation_names
+                seen = dict(zip(names, observation.tolist(), strict=True))
+                now = float(env.unwrapped.time)
+                for name, ahead in (("", 0.0), ("[+7200 s]", 7200.0), ("[+14400 s]", 14400.0)):
+                    price = (now + ahead) // 3600 - 300 * 24
+                    assert seen[f"price{name}"] == pytest.approx(price)
+                    outside = np.interp(now + ahead, table.times, table.values)
+                    assert seen[f"T_out{name}"] == pytest.approx(outside, abs=0.15)
+                observation, *_, info = env.step(np.float32([0.3]))
+                assert "fault" not in info
+
+    def test_a_file_that_is_not_refreshed(self, clock, prices):
+        task = self.task(prices)
+        prices[1](5)
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            watched(clock, server.address, task) as env,
+        ):
+            env.reset(seed=0)
+            infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
+            prices[1](24)
+            *_, info = env.step(np.float32([0.3]))
+        assert infos[0]["missing"] == ()
+        assert infos[-1]["missing"] == ("price",)
+        assert "prices.csv" in infos[-1]["fault"]
+        assert "fault" not in info
+
+
+class TestPredictions:
+    @pytest.mark.parametrize("restarts", [True, False])
+    def test_of_the_same_fmu_are_right(self, clock, restarts):
+        states = {"T_mass": "T_m_0", "T_floor": "T_w_0"} if restarts else {}
+        tags = tags_with(T_mass={"register": 300, "type": "float64"})
+        tags["T_floor"] = {"register": 310, "type": "float64"}
+        seen = {"observations": ["T", "T_floor", "T_mass"]}
+        task = house(agent=seen, tags=tags, states=states)
+        with Server(task, "thermostat", clock=clock) as server:
+            env = connect(task, server.address, physical=True, ahead=3 * STEP, clock=clock)
+            env.reset(seed=0)
+            for _ in range(12):
+                *_, info = env.step(np.float32([0.3]))
+            errors = {(one.name, one.ahead): one for one in env.errors()}
+            env.close()
+        assert set(info["predicted"]) == {"T", "T_floor", "T_mass", "power"}
+        assert {ahead for _, ahead in errors} == {STEP, 2 * STEP, 3 * STEP}
+        assert errors["T", STEP].number == 12
+        assert errors["T", 3 * STEP].number == 10
+        for ahead in (STEP, 2 * STEP, 3 * STEP):
+            assert errors["T_mass", ahead].rms < 0.02
+            assert errors["T_floor", ahead].rms < (0.3 if restarts else 3.0)
+
+    def test_tell_that_the_fmu_is_another(self, clock):
+        leaky = house(parameters={"T_start": 20.0, "H_ve": 400.0})
+        found = {}
+        for name, task in (("same", house()), ("another", leaky)):
+            with Server(task, "thermostat", clock=clock) as server:
+                env = connect(house(), server.address, physical=True, ahead=4 * STEP, clock=clock)
+                env.reset(seed=0)
+                for _ in range(16):
+                    env.step(np.float32([0.3]))
+                found[name] = {(e.name, e.ahead): e for e in env.errors()}
+                env.close()
+        same, another = (found[name]["T", 4 * STEP] for name in ("same", "another"))
+        assert another.rms > 3.0 * same.rms
+        assert another.bias < -0.1
+
+
+class TestServer:
+    def test_tells_what_sensors_show(self, clock):
+        task = house()
+        task.document["variables"]["T"]["noise"] = 0.5
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            watched(clock, server.address, house()) as shadow,
+        ):
+            env = RecordSeries(shadow)
+            env.reset(seed=0)
+            for _ in range(10):
+                env.step(np.float32([0.5]))
+        assert np.diff(env.series["T"], 2).std() > 0.5
+        assert np.diff(env.series["T_floor"], 2).std() < 5.0
+
+    def test_ends_after_its_steps(self, clock):
+        with Server(house(), "random", clock=clock, steps=2) as server:
+            assert not server.wait(0.0)
+            clock.advance(3 * STEP)
+            assert server.wait(20.0)
+
+
+class TestCommands:
+    @pytest.fixture
+    def file(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        house().write(tmp_path / "house.toml")
+        return "house.toml"
+
+    def test_serve(self, file, capsys):
+        arguments = ["--controller", "thermostat", "--speed", "90000", "--steps", "3"]
+        assert main(["serve", file, *arguments]) == 0
+        assert re.search(r"house.toml at 127.0.0.1:\d+", capsys.readouterr().out)
+
+    def test_simulate_plant(self, file, clock, capsys, monkeypatch):
+        monkeypatch.setattr("fmugym.tools.plants.RealClock", lambda speed: clock)
+        controller = "pid of=T setpoint=21 kp=0.5 ti=14400"
+        with Server(house(), "thermostat", clock=clock) as server:
+            given = ["--plant", server.address, "--ahead", "30min", "--steps", "6"]
+            given += ["--controller", controller, "--output", "plant.csv"]
+            assert main(["simulate", file, *given]) == 0
+            said = capsys.readouterr().out
+            assert main(["simulate", file, *given, "--json", "--force"]) == 0
+        assert re.search(r"error of T, .* 900 s ahead, .* 1800 s ahead", said)
+        told = json.loads(capsys.readouterr().out)
+        assert told["episodes"][0]["steps"] == 6
+        assert {one["ahead"] for one in told["predictions"]} == {900.0, 1800.0}
+        log = PlantLog.read("plant.csv")
+        assert np.all((log.columns["proposed.u"][1:] >= 0) & (log.columns["proposed.u"][1:] <= 1))
+
+    def test_a_task_without_a_plant(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(tmp_path)
+        task = house()
+        del task.document["plant"]
+        task.write(tmp_path / "house.toml")
+        for command in (["simulate", "house.toml", "--plant"], ["serve", "house.toml"]):
+            assert main(command) == 1
+            assert "[plant]" in capsys.readouterr().err
+
+    def test_a_tag_of_no_variable(self, file, capsys):
+        text = Path(file).read_text()
+        Path(file).write_text(text.replace("tags = {T =", "tags = {Tt ="))
+        assert main(["simulate", file, "--plant"]) == 1
+        assert "plant.tags.Tt: unknown variable of the task 'Tt'" in capsys.readouterr().err
