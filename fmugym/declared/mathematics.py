@@ -142,7 +142,6 @@ OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "where": _where,
     "float64": _float64,
     "take": _take,
-    "interp": np.interp,
     "noise": _noise,
     "chance": _chance,
 }

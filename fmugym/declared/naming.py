@@ -16,6 +16,7 @@ from fmugym.declared.expressions import Code, Expression, Names, code_of_number
 from fmugym.declared.variables import Record, converted
 from fmugym.errors import unknown_name
 from fmugym.pool.spec import whole_number_of_steps
+from fmugym.task.future import Lookup, Table
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
@@ -75,6 +76,7 @@ class Naming:
         monitors: The names of other values that are read from the FMU.
         first_step: The step count after the first step, which may be one of the warm-up.
         constants: Tables that code reads by name.
+        lookups: Those of the series that are read.
     """
 
     def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
@@ -84,6 +86,7 @@ class Naming:
         self._ahead = 0.0
         self._derived: dict[tuple[str, Moment, float], Code] = {}
         self.constants: dict[str, Any] = {}
+        self.lookups: dict[str, Lookup] = {}
         self.outputs, self.monitors = self._read_names()
 
     def _read_names(self) -> tuple[list[str], list[str]]:
@@ -223,9 +226,12 @@ class Naming:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
         now, shift = self.clock_code(), shift - series.start
         place = f"remainder(({now} + {shift!r}), {series.period!r})"
-        self.constants[f"times_{name}"] = series.times
-        self.constants[f"values_{name}"] = series.values
-        return f"interp({place}, times_{name}, values_{name})"
+        if name not in self.lookups:
+            table = Table(series.times, series.values)
+            self.lookups[name] = self.constants[f"series_{name}"] = Lookup(
+                len(self.lookups), series.start, series.period, series.is_stepped, table
+            )
+        return f"series_{name}({place})"
 
     def _code_of_steps(self, name: str, moment: Moment) -> str:
         """The random value now; after a step, that of the step."""

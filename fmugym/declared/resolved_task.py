@@ -43,6 +43,7 @@ from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.pool.spec import whole_number_of_steps
+from fmugym.task.future import Future
 from fmugym.task.quantity import Quantities
 
 __all__ = ["ResolvedTask"]
@@ -101,6 +102,13 @@ class ResolvedTask:
         self.unphysical_keys = declared.unphysical_keys
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
+
+    @property
+    def future(self) -> Future:
+        """What hooks read of the future."""
+        data = self._root.child("data").value or {}
+        lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
+        return Future(lookups, (NOISE,) if NOISE in self.config["episode_variables"] else ())
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""

@@ -13,6 +13,7 @@ from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.base import FloatArray
 from fmugym.task.alone import Guard, make_guard
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.future import Future
 from fmugym.task.inputs import InputWriter
 from fmugym.task.interface import Interface
 from fmugym.task.opening import PoolOpening
@@ -82,6 +83,7 @@ class Inside:
         has_chosen: Whether it is known if there is a player.
         plan: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
+        future: What a declared task reads of the future; None for other tasks.
         own: The hooks that the class has itself.
         readings: What hooks read now.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -110,6 +112,7 @@ class Inside:
     base: type
     elements: Any
     ended: bool
+    future: Future | None
     guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
@@ -155,6 +158,7 @@ class Inside:
         self.in_hooks = self.was_reset = False
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
+        self.future = None
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any
 

@@ -126,7 +126,8 @@ class Episodes:
 
     def roll_out(self, start: Snapshot, candidates: Candidates) -> Rollout:
         """Let the environments play all candidates, as many at a time as there are environments."""
-        parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
+        with self._engine.assuming(candidates.tables, candidates.offsets):
+            parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
         return joined_rollouts(parts, candidates.count)
 
     def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
@@ -145,9 +146,14 @@ class Episodes:
 
     def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
         """Bring all environments to the places where candidates begin."""
-        self.place(start, places if len(start) > 1 else np.zeros_like(places))
+        sources = places if len(start) > 1 else np.zeros_like(places)
+        self.restore(start.bundle, sources, self._everywhere)
+        columns = candidates.seen_in(self.columns_of(start))
+        self._engine.place(columns, sources, self._everywhere)
         values = {name: column[places] for name, column in candidates.parameters.items()}
         if values:
             variables = tuple(map(self._prototype.fmu.variable, values))
             self._pool.write(variables, np.stack(list(values.values())))
             self._engine.show_parameters(values)
+        for name, column in candidates.variables.items():
+            self._engine.set_variable(name, column[places])

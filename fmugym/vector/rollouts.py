@@ -10,17 +10,28 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable, unlisted
-from fmugym.checks import check_mapping
+from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
+from fmugym.task.future import Table
+from fmugym.task.snapshot import Columns
 from fmugym.task.starting import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.infos import copy_rows
 
-__all__ = ["Candidates", "Rollout", "joined_rollouts", "roll_out_by_steps", "tunable_values"]
+__all__ = [
+    "Candidates",
+    "Rollout",
+    "joined_rollouts",
+    "keys_of",
+    "offsets_of",
+    "roll_out_by_steps",
+    "tables_of",
+    "tunable_values",
+]
 
 
 class Rollout(NamedTuple):
@@ -93,6 +104,15 @@ class Candidates:
     parameters: Mapping[str, FloatArray] = MappingProxyType({})
     """What the tunable parameters of each candidate are, arrays of shape (n,) by name."""
 
+    variables: Mapping[str, FloatArray] = MappingProxyType({})
+    """What episode variables of each candidate are at the beginning, arrays of shape (n,)."""
+
+    tables: Mapping[str, Table] = MappingProxyType({})
+    """What candidates look up in the place of data, by name."""
+
+    offsets: FloatArray | None = None
+    """What is added to the outputs of all candidates, shape (k,)."""
+
     def __init__(self, count: int, horizon: int, num_envs: int, given: Any) -> None:
         self.count, self.horizon, self._given = count, horizon, given
         firsts = range(0, count, num_envs)
@@ -112,6 +132,16 @@ class Candidates:
         if horizon not in (None, array.shape[1]):
             raise ConfigError(f"the actions have {array.shape[1]} steps, but horizon = {horizon}")
         return cls(len(array), array.shape[1], num_envs, array)
+
+    def seen_in(self, columns: Columns) -> Columns:
+        """What hooks read where candidates begin: outputs with their offsets."""
+        if self.offsets is None:
+            return columns
+        shifted = {}
+        for name in ("values", "previous_state"):
+            rows = np.asarray(columns[name], np.float64)
+            shifted[name] = rows + self.offsets[: rows.shape[1]]
+        return {**columns, **shifted}
 
     def actions(self, places: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
         """The actions of a round, shape (horizon, N, ...); None for a policy."""
@@ -160,6 +190,69 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
             "candidates need values of all elements"
         )
     return {variable.name: values for variable, values in found.items()}
+
+
+def tables_of(env: FMUEnv, data: Any) -> dict[str, Table]:
+    """Check what candidates assume in the place of data.
+
+    Args:
+        env: Its task has the data.
+        data: Times and values by name; None for none.
+
+    Raises:
+        ConfigError: If there is no such data, or the rows make no function of time.
+    """
+    given = {} if data is None else check_mapping("'data'", data)
+    lookups = {} if env.inside.future is None else env.inside.future.lookups
+    for name in given:
+        if name not in lookups:
+            raise ConfigError(unknown_name("data that hooks read", name, lookups))
+    return {name: lookups[name].table_of(name, rows) for name, rows in given.items()}
+
+
+def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
+    """Check what is added to outputs.
+
+    Args:
+        env: The FMU's outputs are its own.
+        offsets: Numbers by the names of outputs and monitored variables, in the FMU's units; None
+            for none.
+
+    Returns:
+        Numbers of shape (k,); None for none.
+
+    Raises:
+        ConfigError: If an output is unknown, or an offset no finite number.
+    """
+    given = {} if offsets is None else check_mapping("'offsets'", offsets)
+    names = list(env.out)
+    for name, value in given.items():
+        if name not in names:
+            raise ConfigError(unknown_name("output in offsets", name, names))
+        check_number(f"the offset of {name!r}", value)
+    return np.array([given.get(name, 0.0) for name in names]) if given else None
+
+
+def keys_of(env: FMUEnv, seed: Any, count: int) -> dict[str, FloatArray]:
+    """Draw what the random numbers of later steps follow from.
+
+    Args:
+        env: The prototype.
+        seed: That of the first candidate, the next one has the next; None if candidates go on
+            with the random numbers of their snapshot.
+        count: The number of candidates.
+
+    Raises:
+        ConfigError: If it is no seed.
+    """
+    first, future = check_seed(seed), env.inside.future
+    if first is None or future is None:
+        return {}
+    streams = [np.random.default_rng(first + index) for index in range(count)]
+    return {
+        name: np.array([env.config.episode_variables[name].sample(one) for one in streams])
+        for name in future.keys
+    }
 
 
 def _require_tunable(variable: Variable) -> None:

@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
+from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
+from fmugym.task.future import Table
 from fmugym.task.snapshot import Columns
 
 __all__ = ["Engine", "StepResult"]
@@ -36,6 +38,7 @@ class Engine(ABC):
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
         has_moved: Whether the last step or reset got as far as the FMUs.
+        offsets: What is added to each output after each step, shape (k,); None for nothing.
         starts_at_ends: Whether the caller wants the next episode to start in the step that ends one
             (the mode ``SAME_STEP``). An engine may leave that to ``reset``.
     """
@@ -46,7 +49,14 @@ class Engine(ABC):
         self.ended = np.zeros(num_envs, np.bool_)
         self.any_ended = False
         self.has_moved = False
+        self.offsets: FloatArray | None = None
         self.starts_at_ends = False
+
+    def add_offsets(self, pool: Pool) -> None:
+        """Add the offsets to the outputs of the instances that have stepped."""
+        if self.offsets is not None:
+            failed = (pool.statuses > WARNING_CODE) & (pool.statuses != TERMINATED_CODE)
+            pool.outputs += np.where(failed, 0.0, self.offsets[:, np.newaxis])
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -179,6 +189,21 @@ class Engine(ABC):
     @abstractmethod
     def place(self, columns: Columns, sources: IndexArray, indices: IndexArray) -> None:
         """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
+
+    @abstractmethod
+    def assuming(
+        self, tables: Mapping[str, Table], offsets: FloatArray | None
+    ) -> AbstractContextManager[None]:
+        """Let hooks read other data and outputs inside of a ``with`` block.
+
+        Args:
+            tables: Those of series, by name.
+            offsets: What is added to each output after each step, shape (k,); None for nothing.
+        """
+
+    @abstractmethod
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """Give an episode variable one value for each environment, shape (N,)."""
 
     @abstractmethod
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:

@@ -27,6 +27,7 @@ from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.construction import plan_of, plan_of_reset
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.future import Table, assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
@@ -492,6 +493,28 @@ class BatchEngine(Engine):
         )
         return not own or not columns.keys() <= set(plan.parameter_names)
 
+    @contextmanager
+    def assuming(self, tables: Mapping[str, Table], offsets: FloatArray | None) -> Iterator[None]:
+        """See ``Engine.assuming``."""
+        future = self.env.inside.future
+        pairs = [] if future is None else future.tables_of_programs(tables)
+        self.offsets = offsets
+        try:
+            self._exchange_tables({own.tobytes(): other for own, other in pairs})
+            with assumed([future], tables):
+                yield
+        finally:
+            self.offsets = None
+            self._exchange_tables({other.tobytes(): own for own, other in pairs})
+
+    def _exchange_tables(self, tables: Mapping[bytes, FloatArray]) -> None:
+        if tables:
+            self._prepare(self._task.with_tables(tables))
+
+    def set_variable(self, name: str, values: FloatArray) -> None:
+        """See ``Engine.set_variable``."""
+        self._row(name)[:] = values
+
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
         """See ``Engine.show_parameters``."""
         for name, numbers in values.items():
@@ -527,6 +550,7 @@ class BatchEngine(Engine):
             actions = self._checked_before(actions, resetting)
         at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
+        step = step if self.offsets is None else None
         self.has_moved = True  # unless the call refuses its arguments
         played: Played
         try:
@@ -573,12 +597,14 @@ class BatchEngine(Engine):
         if starting is None:
             play.before(actions)
             self._pool.step()
+            self.add_offsets(self._pool)
             return play.after(actions)
         indices = starting.nonzero()[0]
         drawn = self._streams.draw(plan, indices)
         play.before(actions)
         self._begin(starting, indices, plan, drawn)
         self._pool.step(None, starting)
+        self.add_offsets(self._pool)
         result, troubled, any_ended, _ = play.after(actions)
         result.infos.update(self._told(plan, drawn, starting))
         return result, troubled, any_ended, starting
@@ -615,7 +641,8 @@ class BatchEngine(Engine):
         seen = self._arrays_of_steps(horizon)
         self.has_moved = True
         arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
-        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged):
+        offsets = np.empty(0) if self.offsets is None else self.offsets
+        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
         return seen if self._divided is None else self._divided(seen)[0], *judged
 
