@@ -153,7 +153,7 @@ class DeclaredWarmUp(WarmUp):
         self.writes, self.caches = writes, caches
         self.depends_on = variables_in(codes)
         told = [repr((p.record.alias, type(p.controller), vars(p.controller))) for p in pilots]
-        tables = [(n, np.asarray(v).tobytes()) for n, v in sorted(constants.items())]
+        tables = [(n, table.tobytes()) for n, table in sorted(constants.items())]
         content = repr((steps, time_step, told, list(codes), tables))
         self.digest = sha256(content.encode()).hexdigest()
         self.begin(1)  # which finds mistakes

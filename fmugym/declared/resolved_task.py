@@ -108,7 +108,8 @@ class ResolvedTask:
         """What hooks read of the future."""
         data = self._root.child("data").value or {}
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
-        return Future(lookups, (NOISE,) if NOISE in self.config["episode_variables"] else ())
+        keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
+        return Future(lookups, keys, self._function(self._naming.clock_code()))
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""

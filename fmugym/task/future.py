@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -56,6 +56,10 @@ class Lookup:
         """A table as programs have it: times, values, and the values beyond both ends."""
         return np.concatenate([*table, [self._number, table.values[-1]]])
 
+    def tobytes(self) -> bytes:
+        """The bytes of its own table, as those of an array."""
+        return self.table_of_program(self.own).tobytes()
+
     def table_of(self, what: str, rows: Any) -> Table:
         """The table of other rows, which repeat after the same period.
 
@@ -100,10 +104,12 @@ class Future(NamedTuple):
     Attributes:
         lookups: Those of the series by name.
         keys: The names of the episode variables from which random numbers of all steps follow.
+        clock: Gives the time of the data in an environment, in seconds.
     """
 
     lookups: Mapping[str, Lookup]
     keys: tuple[str, ...]
+    clock: Callable[[Any], Any]
 
     def tables_of_programs(
         self, tables: Mapping[str, Table]
