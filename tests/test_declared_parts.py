@@ -9,9 +9,9 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
+from fmugym.checks import duration
 from fmugym.declared.expressions import Code, Expression, Names, function_of
 from fmugym.declared.mathematics import FUNCTIONS
-from fmugym.declared.quantities import duration
 
 
 class Env:

@@ -15,15 +15,17 @@ import numpy as np
 from fmugym.baselines.base import Controller, FloatArray
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
+from fmugym.baselines.mpc import MPC
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Search", "controller_of", "has_range", "search_of"]
+__all__ = ["Search", "controller_of", "has_range", "plans_ahead", "search_of"]
 
-_KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "pid": PID}
+_KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "mpc": MPC, "pid": PID}
 
 _EXAMPLES: Final[dict[type[Controller], str]] = {
     Hysteresis: "hysteresis of=T setpoint=21 band=0.5",
+    MPC: "mpc horizon=24h",
     PID: "pid of=T setpoint=21 kp=0.5",
 }
 
@@ -44,7 +46,8 @@ def controller_of(text: str) -> Controller:
 
     Args:
         text: ``"pid of=T setpoint=21 kp=0.5 ti=14400"``, ``"hysteresis of=T setpoint=T_set
-            band=0.5"`` with the arguments of the classes, or ``"schedule 06:00=1 22:00=0.3"``.
+            band=0.5"`` with the arguments of the classes, ``"schedule 06:00=1 22:00=0.3"``, or
+            ``"mpc horizon=24h warm='pid of=T setpoint=21 kp=0.5'"``.
 
     Raises:
         ConfigError: If there is no such controller, or its arguments are wrong.
@@ -58,6 +61,8 @@ def controller_of(text: str) -> Controller:
                 f"{name}={value} is a range, of which 'fmugym tune' and 'fmugym train' find the "
                 "best number"
             )
+    if isinstance(arguments.get("warm"), str):
+        arguments["warm"] = controller_of(arguments["warm"])
     return _made(_KINDS[kind], arguments)
 
 
@@ -147,6 +152,11 @@ def search_of(text: str) -> Search:
             "such as kp=0.05..5"
         )
     return search
+
+
+def plans_ahead(text: Any) -> bool:
+    """Whether a text names a controller that plans with copies, and so takes its time."""
+    return isinstance(text, str) and text.split()[:1] == ["mpc"]
 
 
 def has_range(text: Any) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
 from fmugym.baselines.entrants import NO_MERIT, Merit
-from fmugym.baselines.parsing import has_range, search_of
+from fmugym.baselines.parsing import has_range, plans_ahead, search_of
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reason, shown
@@ -139,7 +139,10 @@ def _begun(quest: Quest) -> _Course:
             f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
         )
     probe = Probe.of(quest.make_env, quest.envs)
-    given = probe.document.get("controllers", {})
+    declared = probe.document.get("controllers", {})
+    given = {name: one for name, one in declared.items() if not plans_ahead(one)}
+    for name in declared.keys() - given.keys():
+        quest.tell(f"left out: {name}, which plans too slowly here; 'fmugym evaluate' compares it")
     tunable = {name: search_of(one) for name, one in given.items() if has_range(one)}
     fixed = [
         Agent(name, one) if isinstance(one, str) else Agent.constant(name, one, probe.ranges)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,13 @@ from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot, scope_of
 from fmugym.vector.engines.base import Engine
-from fmugym.vector.rollouts import Candidates, Rollout, joined_rollouts, roll_out_by_steps
+from fmugym.vector.rollouts import (
+    Candidates,
+    Rollout,
+    joined_rollouts,
+    roll_out_by_steps,
+    tables_of,
+)
 
 __all__ = ["Episodes"]
 
@@ -101,6 +108,14 @@ class Episodes:
             if present is not None:
                 self.place(present, self._everywhere)
                 self.is_ready = True
+
+    def assuming(self, data: Any) -> AbstractContextManager[None]:
+        """Let hooks read other data inside of a ``with`` block; see ``FMUVectorEnv.rollout``.
+
+        Raises:
+            ConfigError: If there is no such data, or the rows make no function of time.
+        """
+        return self._engine.assuming(tables_of(self._prototype, data), None)
 
     def start_of_rollout(
         self, snapshot: Snapshot | None, present: Snapshot | None, count: int

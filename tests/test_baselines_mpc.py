@@ -1,0 +1,302 @@
+"""Model predictive control: plans, what they assume of the future, and where they begin."""
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.baselines import MPC, PID, controller_of
+from fmugym.baselines.mpc import _Foresight
+from fmugym.envs import CartPoleEnv
+from fmugym.task.future import Lookup, Table
+
+HOUR, DT = 3600.0, 600.0
+CALM = np.zeros(24)
+
+
+def wheel(wind=CALM, forecast="2h", observed=True, limits=(-1, 1), **changes):
+    """A wheel without friction, whose speed shall be 1: reaching it takes four steps."""
+    seen = ["q_dot", "wind"] if observed else ["q_dot"]
+    ahead = {"forecast": {"of": ["wind"], "horizon": forecast, "step": "1h"}} if forecast else {}
+    return {
+        "fmu": {"bundled": "Pendulum"},
+        "time_step": DT,
+        "episode_length": "10h",
+        "clock": 2 * HOUR,
+        "parameters": {
+            **dict.fromkeys(("g", "b", "c"), 0.0),
+            **dict.fromkeys(("m", "l"), 1.0),
+            "body": "point_mass",
+            "max_step": DT,
+            "tau_max": 1.0,
+            "theta_dot_max": 1e6,
+        },
+        "variables": {"push": dict(zip(("min", "max"), limits, strict=True)) if limits else {}},
+        "data": {"wind": {"values": np.array(wind).tolist(), "step": HOUR}},
+        "inputs": {"tau": "0.25 / 600 * push + wind"},
+        "agent": {"actions": ["push"], "observations": seen, **ahead},
+        "reward": "-(q_dot - 1)**2",
+    } | changes
+
+
+def play(env, controller, steps, seed=0):
+    """The actions and the rewards of an episode."""
+    controller.bind(env)
+    observation, info = env.reset(seed=seed)
+    actions, rewards = [], []
+    for _ in range(steps):
+        actions.append(np.array(controller.act(observation, info)))
+        observation, reward, terminated, truncated, info = env.step(actions[-1])
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return np.array(actions), np.array(rewards)
+
+
+def mpc(horizon="1h 40min", **arguments):
+    return MPC(horizon, **{"candidates": 128, "moves": 10} | arguments)
+
+
+@pytest.fixture
+def opened():
+    envs = []
+
+    def make(task, **changes):
+        envs.append(fmugym.load(task) if isinstance(task, dict) else task(**changes))
+        return envs[-1].unwrapped
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def bound():
+    controllers = []
+
+    def make(*arguments, **options):
+        controllers.append(mpc(*arguments, **options))
+        return controllers[-1]
+
+    yield make
+    for controller in controllers:
+        controller.close()
+
+
+class TestPlans:
+    def test_are_nearly_the_best(self, opened, bound):
+        """The best is full push for four steps, and none afterwards."""
+        best = [-((1 - 0.25 * step) ** 2) for step in (1, 2, 3, 4)]
+        for arguments in ({}, {"perfect": True}):
+            actions, rewards = play(opened(wheel()), bound(**arguments), 12)
+            assert rewards[:4] == pytest.approx(best, abs=0.02)
+            assert np.abs(rewards[4:]).max() < 0.005
+            assert actions[:3] == pytest.approx(np.ones((3, 1)), abs=0.05)
+
+    def test_are_the_same_again(self, opened, bound):
+        first, second, other = (
+            play(opened(wheel()), bound(seed=seed), 6)[0].tolist() for seed in (1, 1, 2)
+        )
+        assert first == second != other
+
+    def test_have_moves_that_hold(self, opened, bound):
+        controller = bound(moves=3)
+        controller.bind(opened(wheel()))
+        moves = controller._actions(np.array([[0.0, 0.5, 1.0]]))[0, :, 0]
+        assert moves.tolist() == [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1]
+
+    def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, opened, bound):
+        """A search of two candidates a round finds little itself."""
+        pid = {"of": "q_dot", "setpoint": 1.0, "kp": 2.0}
+        few = {"candidates": 16, "rounds": 2, "moves": 10}
+        _, alone = play(opened(wheel()), PID(**pid), 10)
+        _, rewards = play(opened(wheel()), bound(warm=PID(**pid), **few), 10)
+        assert rewards.sum() > alone.sum() - 0.01
+
+    def test_of_several_environments_are_those_of_single_ones(self, opened, bound):
+        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
+        envs = fmugym.FMUVectorEnv(partial(fmugym.load, task), 2, autoreset_mode="Disabled")
+        controller = bound().bind(envs)
+        observations, infos = envs.reset(seed=3)
+        rows = []
+        for _ in range(4):
+            rows.append(controller.act(observations, infos))
+            observations, *_, infos = envs.step(rows[-1])
+        envs.close()
+        for index in range(2):
+            alone, _ = play(opened(task), bound(), 4, seed=3 + index)
+            assert np.array(rows)[:, index].tolist() == alone.tolist()
+
+    def test_balance_a_cart_pole(self, opened, bound):
+        _, rewards = play(opened(CartPoleEnv), bound("0.4s", moves=20, perfect=True), 60)
+        assert len(rewards) == 60
+
+
+class TestFuture:
+    def test_is_not_known_beyond_the_forecast(self, opened, bound):
+        later = CALM.copy()
+        later[8:] = 1e-3
+        same = [play(opened(wheel(wind)), bound("4h"), 12)[0].tolist() for wind in (CALM, later)]
+        assert same[0] == same[1]
+        known = [
+            play(opened(wheel(wind)), bound("8h", moves=12, perfect=True), 4)[0].tolist()
+            for wind in (CALM, later)
+        ]
+        assert known[0] != known[1]
+
+    def test_is_known_as_far_as_the_forecast_goes(self, opened, bound):
+        """Wind comes in half an hour; who knows brakes before it."""
+        gust = CALM.copy()
+        gust[3] = 1.5e-3
+        rewards = {
+            forecast: play(opened(wheel(gust, forecast)), bound(), 18)[1].sum()
+            for forecast in ("2h", None)
+        }
+        assert rewards["2h"] > rewards[None] + 0.05
+
+    def test_of_a_forecast(self):
+        lookup = Lookup(0, 0.0, 365 * 86400.0, False, Table(np.array([0.0, 1.0]), np.zeros(2)))
+        names = ("x", "wind", "wind[+7200 s]", "wind[+3600 s]")
+        foresight = _Foresight(names, {"wind": lookup}, HOUR, 30)
+        past = [np.array([0.0, 100.0 + hour, 0.0, 0.0]) for hour in range(24)]
+        now = np.array([0.0, 5.0, 7.0, 6.0])
+        times, values = foresight.ahead([*past, now], 1e6)["wind"]
+        assert (times - 1e6).tolist() == [HOUR * k for k in range(32)]
+        assert values[:3].tolist() == [5.0, 6.0, 7.0]
+        assert values[3:24].tolist() == [103.0 + k for k in range(21)]  # of a day before
+        assert values[24:].tolist() == [5.0, 6.0, 7.0, 103.0, 104.0, 105.0, 106.0, 107.0]
+        times, values = foresight.ahead([now], 0.0)["wind"]
+        assert values[3:24].tolist() == [7.0] * 21  # nothing is known of the day before
+        assert foresight.is_present.tolist() == [True, True, False, False]
+
+    def test_of_data_that_are_not_observed_is_their_mean(self):
+        rows = Table(np.array([0.0, 1.0, 3.0, 4.0]), np.array([0.0, 2.0, 2.0, 0.0]))
+        foresight = _Foresight(("x",), {"wind": Lookup(0, 0.0, 4.0, False, rows)}, 1.0, 3)
+        assert foresight.ahead([np.zeros(1)], 9.0) == {"wind": ([9.0], [1.5])}
+        assert foresight.observed(np.zeros(1), np.zeros(1), 9.0)["wind"] == ([8.0, 9.0], [1.5, 1.5])
+
+
+class TestModel:
+    def test_is_corrected_by_offsets(self, opened, bound):
+        """The wheel begins by 0.24 faster than the copy, and so it stays."""
+        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
+        env = opened(task)
+        seed = next(s for s in range(100) if env.reset(seed=s)[0][0] > 0.49)
+        errors = {}
+        for correction in (0.0, 0.5):
+            _, rewards = play(env, bound(correction=correction), 25, seed)
+            errors[correction] = np.sqrt(-rewards[12:].mean())
+        assert errors[0.0] == pytest.approx(0.24, abs=0.03)
+        assert errors[0.5] < 0.08
+
+    def test_begins_in_the_nominal_state(self, opened, bound):
+        """Speeds are drawn around 0.5; those of the copy begin there."""
+        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0.4, 0.6)})
+        controller = bound()
+        play(opened(task), controller, 1)
+        assert controller._episodes[0].seen[0] == pytest.approx(0.5, abs=0.01)
+
+    def test_may_begin_in_the_observed_state(self, opened, bound):
+        """An unstable pendulum, whose noisy angle a copy would soon leave."""
+        task = {
+            "fmu": {"bundled": "Pendulum"},
+            "time_step": 0.05,
+            "episode_length": "10s",
+            "parameters": {
+                "theta_0": {"distribution": "uniform", "low": -0.3, "high": 0.3},
+                "m": 1.0,
+                "l": 1.0,
+                "g": 10.0,
+                "b": 0.05,
+                "body": "uniform_rod",
+                "tau_max": 2.0,
+                "solver": "rk4",
+                "max_step": 0.025,
+            },
+            "variables": {
+                "theta": {"noise": 0.01},
+                "theta_dot": {"noise": 0.02},
+                "tau": {"min": -2, "max": 2},
+            },
+            "agent": {"actions": ["tau"], "observations": ["theta", "theta_dot"]},
+            "reward": "-(4 * (1 - cos(theta)) + 0.1 * theta_dot**2)",
+        }
+        states = "theta:theta_0,theta_dot:theta_dot_0"
+        controller = bound("1.5s", moves=15, candidates=256, states=states)
+        _, rewards = play(opened(task), controller, 60, seed=2)
+        assert rewards[-20:].min() > -0.1
+
+
+class TestText:
+    def test_names_the_arguments(self):
+        controller = controller_of(
+            "mpc horizon=24h candidates=64 perfect=true warm='pid of=q_dot setpoint=1 kp=2'"
+        )
+        assert (controller.horizon, controller.candidates, controller.perfect) == (86400, 64, True)
+        assert isinstance(controller.warm, PID)
+
+    def test_stands_in_task_files(self, opened):
+        text = "mpc horizon=1h candidates=32"
+        env = opened(wheel(controllers={"ahead": text}))
+        from fmugym.episodes.simulation import policy_of, simulate
+
+        summary = simulate(env, policy_of(env, "ahead"), 0, 6)
+        assert summary.total_reward > -2.0
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("arguments", "reason"),
+        [
+            ({"horizon": "soon"}, "horizon must be"),
+            ({"horizon": 0}, "horizon"),
+            ({"moves": 0}, "moves"),
+            ({"rounds": 2.5}, "rounds must be a whole number"),
+            ({"candidates": 8}, "candidates"),
+            ({"correction": 2.0}, "correction"),
+            ({"perfect": "maybe"}, "perfect must be true or false"),
+            ({"budget": 0}, "budget"),
+            ({"states": "theta"}, "states must be as in"),
+        ],
+    )
+    def test_of_arguments(self, arguments, reason):
+        with pytest.raises(ConfigError, match=reason):
+            MPC(**{"horizon": "1h"} | arguments)
+
+    @pytest.mark.parametrize(
+        ("task", "arguments", "reason"),
+        [
+            (wheel(limits=None), {}, "'min' and 'max'"),
+            (wheel(), {"horizon": 60.0}, "shorter than the step"),
+            (wheel(), {"states": {"q_dt": "q_dot_0"}}, "'q_dot'"),
+            (wheel(), {"states": {"q_dot": "q_dot_0"}}, "without data"),
+        ],
+    )
+    def test_of_tasks(self, opened, bound, task, arguments, reason):
+        with pytest.raises(ConfigError, match=reason):
+            bound(**arguments).bind(opened(task))
+
+    def test_of_actions_that_are_several_choices(self, opened, bound):
+        class Several(CartPoleEnv):
+            def _get_action_space(self):
+                return gymnasium.spaces.MultiDiscrete([2, 2])
+
+            def _get_inputs(self):
+                return 10.0 * self.action[0]
+
+        with pytest.raises(ConfigError, match="numbers or one choice"):
+            bound().bind(opened(Several))
+
+    def test_of_plants(self, opened, bound):
+        with pytest.raises(ConfigError, match="a backend stands in"):
+            bound().bind(opened(partial(CartPoleEnv, backend="fmpy")))
+
+    def test_of_slow_replays(self, opened, bound):
+        env = opened(partial(CartPoleEnv, fmi_version="1.0"))
+        controller = bound("0.4s", budget=1e-6).bind(env)
+        observation, info = env.reset(seed=0)
+        with pytest.raises(ConfigError, match="cannot save its state"):
+            controller.act(observation, info)
