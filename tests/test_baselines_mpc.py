@@ -1,17 +1,21 @@
 """Model predictive control: plans, what they assume of the future, and where they begin."""
 
+import json
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
+from PIL import Image
 
 import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import MPC, PID, controller_of
 from fmugym.baselines.mpc import _Foresight
 from fmugym.envs import CartPoleEnv
+from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.task.future import Lookup, Table
+from fmugym.tools.cli import main
 
 HOUR, DT = 3600.0, 600.0
 CALM = np.zeros(24)
@@ -241,8 +245,6 @@ class TestText:
     def test_stands_in_task_files(self, opened):
         text = "mpc horizon=1h candidates=32"
         env = opened(wheel(controllers={"ahead": text}))
-        from fmugym.episodes.simulation import policy_of, simulate
-
         summary = simulate(env, policy_of(env, "ahead"), 0, 6)
         assert summary.total_reward > -2.0
 
@@ -300,3 +302,39 @@ class TestRefusals:
         observation, info = env.reset(seed=0)
         with pytest.raises(ConfigError, match="cannot save its state"):
             controller.act(observation, info)
+
+
+class TestCommandLine:
+    @pytest.fixture
+    def path(self, tmp_path):
+        path = tmp_path / "wheel.toml"
+        fmugym.Task.of(wheel(controllers={"ahead": "mpc horizon=1h candidates=64"})).write(path)
+        return str(path)
+
+    def test_compares_it_with_others(self, path, tmp_path, capsys):
+        perfect = "mpc horizon=1h candidates=64 perfect=true"
+        names = ["pid of=q_dot setpoint=1 kp=1", "ahead", perfect]
+        asked = [word for name in names for word in ("--controller", name)]
+        plot = tmp_path / "scores.png"
+        options = ["--steps", "8", "--episodes", "2", "--plot", str(plot), "--json"]
+        assert main(["evaluate", path, *asked, *options]) == 0
+        scores = json.loads(capsys.readouterr().out)["scores"]
+        found = {score["name"]: score["mean_reward"] for score in scores}
+        assert found[names[0]] < found["ahead"]
+        assert found[perfect] == pytest.approx(found["ahead"], abs=0.02)
+        with Image.open(plot) as image:
+            assert image.size[1] > 300
+
+    def test_training_leaves_it_out(self, path, tmp_path, capsys):
+        options = ["--output", str(tmp_path / "agent"), "--rounds", "2", "--envs", "8"]
+        assert main(["train", path, *options]) == 0
+        assert "left out: ahead, which plans too slowly" in capsys.readouterr().err
+
+    def test_its_numbers_are_not_tuned(self, path, capsys):
+        assert main(["tune", path, "mpc horizon=3600..7200"]) == 1
+        assert "'mpc' cannot be tuned; known are: hysteresis, pid" in capsys.readouterr().err
+
+    def test_it_does_not_act_in_a_warm_up(self, opened):
+        table = {"period": "1h", "controller": "mpc horizon=1h"}
+        with pytest.raises(ConfigError, match="none of in a warm-up"):
+            opened(wheel(warm_up=table))

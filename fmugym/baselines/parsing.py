@@ -23,6 +23,8 @@ __all__ = ["Search", "controller_of", "has_range", "plans_ahead", "search_of"]
 
 _KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "mpc": MPC, "pid": PID}
 
+_UNTUNED: Final = {"mpc", "schedule"}
+
 _EXAMPLES: Final[dict[type[Controller], str]] = {
     Hysteresis: "hysteresis of=T setpoint=21 band=0.5",
     MPC: "mpc horizon=24h",
@@ -134,8 +136,9 @@ def search_of(text: str) -> Search:
             wrong.
     """
     kind, arguments = _parts(text)
-    if kind == "schedule":
-        raise ConfigError(f"a schedule cannot be tuned; known are: {', '.join(_KINDS)}")
+    if kind in _UNTUNED:
+        known = ", ".join(sorted(_KINDS.keys() - _UNTUNED))
+        raise ConfigError(f"{kind!r} cannot be tuned; known are: {known}")
     ends = {name: _ends(name, value) for name, value in arguments.items() if has_range(value)}
     negative = frozenset(name for name, (_, high) in ends.items() if high < 0)
     ranges = {
