@@ -257,6 +257,24 @@ class TestSeed:
 
 
 @pytest.mark.parametrize("way", WAYS)
+def test_costs_are_those_of_the_infos(way):
+    costs = {"effort": "abs(push)", "speed": {"expr": "max(q_dot, 0)", "limit": 9}}
+    task = spinning() | {"costs": costs, "episode_length": "2h"}
+    snapshot, *_ = root(task)
+    envs = environments(task, way)
+    found = envs.rollout(snapshot, pushes())
+    with fmugym.load(task) as env:
+        for index, candidate in enumerate(pushes()):
+            env.restore_state(snapshot)
+            for step, action in enumerate(candidate[: found.lengths[index]]):
+                paid = env.step(action)[-1]["costs"]
+                assert {name: one[index, step] for name, one in found.costs.items()} == paid
+    assert found.lengths.tolist() == [10] * N
+    assert not found.costs["effort"][:, 10:].any()
+    envs.close()
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_present_episodes_and_their_streams_go_on_as_before(way):
     task = spinning(noise=0.5)
     make = partial(fmugym.load, task)

@@ -50,7 +50,7 @@ def one_by_one(env, snapshot, actions):
 
 
 def rows_of(rollout):
-    observations, rewards, terminated, truncated, _ = (part.tolist() for part in rollout)
+    observations, rewards, terminated, truncated = (part.tolist() for part in rollout[:4])
     return [
         list(zip(*candidate, strict=True))
         for candidate in zip(observations, rewards, terminated, truncated, strict=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -23,6 +24,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.task.future import Lookup
 from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
+from fmugym.vector.rollouts import costs_in
 
 __all__ = ["MPC"]
 
@@ -33,6 +35,9 @@ _SIGMA: Final = 0.25
 _SAMPLES: Final = 1001
 """The nominal value of what is drawn is the median of so many samples."""
 
+_PENALTY: Final = 1e9
+"""How much more a unit of a cost beyond its limit counts than one of the reward."""
+
 _FORECAST: Final = re.compile(r"(.+)\[\+(.+) s\]")
 
 
@@ -41,8 +46,9 @@ class MPC(Controller):
 
     In each step, candidates for the actions until the horizon play on copies of the environment,
     and the first action of the best one is taken. The reward is that of the task. A plan has a few
-    moves, each of which holds for the same number of steps. The search begins with the plan of the
-    step before, and goes on by the adaptation of a covariance matrix (``fmugym.baselines.cma``).
+    moves, each of which holds for the same number of steps. Plans that keep the limits of costs
+    come first. The search begins with the plan of the step before, and goes on by the adaptation of
+    a covariance matrix (``fmugym.baselines.cma``).
 
     The controller sees what an agent sees. A copy begins in the nominal state of the task and gets
     the same actions. It reads data as they were observed, and ahead as they are forecast. Beyond a
@@ -129,6 +135,8 @@ class MPC(Controller):
                     "MPC needs an FMU that it can copy, but a backend stands in for this one"
                 )
             make = partial(copy.copy, env)
+            self._cost_limits = getattr(env, "cost_limits", {})
+            self._step_limit = env.inside.step_limit
             lookups = {} if env.inside.future is None else env.inside.future.lookups
         self._places = [self._place_of(name) for name in self.states]
         if self.states and lookups:
@@ -215,7 +223,9 @@ class MPC(Controller):
         data = self._foresight.observed(episode.rows[-1], row, now)
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
-            observations, _, terminated, truncated, _ = copied.step(episode.action)
+            observations, _, terminated, truncated, infos = copied.step(episode.action)
+            for name, values in costs_in(infos).items():
+                episode.costs[name] = episode.costs.get(name, 0.0) + float(values[0])
             episode.has_ended = bool(terminated[0] or truncated[0])
             if not episode.has_ended:
                 episode.seen = np.asarray(observations[0], np.float64)
@@ -291,20 +301,49 @@ class MPC(Controller):
         plans = [self._shifted(episode.plan)]
         if episode.warm is not None:
             plans.append(self._plan_of(self._warm_actions(episode.warm, row, start, assumed)))
-        found = _returns(one, start, [self._actions(plan[np.newaxis]) for plan in plans], assumed)
-        best, most = plans[int(np.argmax(found))], max(found)
+        allowed = self._allowed(episode)
+        found = [self._value(one, start, plan[np.newaxis], assumed, allowed) for plan in plans]
+        best, most = plans[int(np.argmax(found))], float(max(found)[0])
         rng = np.random.default_rng([self.seed, len(episode.rows)])
         cma = CMA(best, _SIGMA, many.num_envs, rng, np.ones(best.size), largest_sigma=_SIGMA)
         for _ in range(self.rounds):
             tried = np.clip(cma.ask(), 0.0, 1.0)
-            returns = many.rollout(start, self._actions(tried), **assumed).rewards.sum(axis=1)
-            cma.tell(np.argsort(-returns, kind="stable"))
-            leader = int(returns.argmax())
-            if returns[leader] > most:
-                best, most = tried[leader], float(returns[leader])
+            values = self._value(many, start, tried, assumed, allowed)
+            cma.tell(np.argsort(-values, kind="stable"))
+            leader = int(values.argmax())
+            if values[leader] > most:
+                best, most = tried[leader], float(values[leader])
         mean = np.clip(cma.mean, 0.0, 1.0)
-        value = _returns(one, start, [self._actions(mean[np.newaxis])], assumed)[0]
+        value = self._value(one, start, mean[np.newaxis], assumed, allowed)[0]
         return mean if value > most else best
+
+    def _value(
+        self,
+        envs: FMUVectorEnv,
+        start: Snapshot,
+        plans: FloatArray,
+        assumed: Mapping[str, Any],
+        allowed: Mapping[str, float],
+    ) -> FloatArray:
+        """The returns of plans; whatever goes beyond the limit of a cost counts far more."""
+        found = envs.rollout(start, self._actions(plans), **assumed)
+        values: FloatArray = found.rewards.sum(axis=1)
+        for name, most in allowed.items():
+            values = values - _PENALTY * np.maximum(found.costs[name].sum(axis=1) - most, 0.0)
+        return values
+
+    def _allowed(self, episode: _Episode) -> dict[str, float]:
+        """What costs may add up to until the horizon, from what the episode has left of them."""
+        steps = len(self._move_of)
+        left = (
+            max(1, self._step_limit - len(episode.rows))
+            if self._step_limit < sys.maxsize
+            else steps
+        )
+        return {
+            name: max(0.0, limit - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
+            for name, limit in self._cost_limits.items()
+        }
 
     def _shifted(self, plan: FloatArray) -> FloatArray:
         """A plan, one step later."""
@@ -326,13 +365,6 @@ class MPC(Controller):
         return np.array(actions, np.float64)[:, 0]
 
 
-def _returns(
-    envs: FMUVectorEnv, start: Snapshot, plans: Sequence[Any], assumed: Mapping[str, Any]
-) -> list[float]:
-    """The returns of some plans."""
-    return [float(envs.rollout(start, plan, **assumed).rewards.sum()) for plan in plans]
-
-
 class _Episode:
     """What is known of the episode of one environment.
 
@@ -344,6 +376,7 @@ class _Episode:
         plan: The latest plan, flat, from 0 to 1.
         action: The latest action, as the copy takes it.
         rows: All observations.
+        costs: What the costs of the copy add up to, by name.
         warm: The other controller, as if it had seen the same.
     """
 
@@ -356,6 +389,7 @@ class _Episode:
 
     def __init__(self) -> None:
         self.rows: list[FloatArray] = []
+        self.costs: dict[str, float] = {}
         self.has_ended = False
 
 

@@ -25,6 +25,7 @@ from fmugym.vector.infos import copy_rows
 __all__ = [
     "Candidates",
     "Rollout",
+    "costs_in",
     "joined_rollouts",
     "keys_of",
     "offsets_of",
@@ -46,6 +47,8 @@ class Rollout(NamedTuple):
         terminated: Whether the step has ended the episode, shape (n, horizon).
         truncated: Whether the step has cut it short, shape (n, horizon).
         lengths: The steps that each candidate has done, shape (n,).
+        costs: Those that infos tell as ``"costs"``, by name, each of shape (n, horizon); 0 after
+            the end.
     """
 
     observations: Any
@@ -53,10 +56,16 @@ class Rollout(NamedTuple):
     terminated: MaskArray
     truncated: MaskArray
     lengths: npt.NDArray[np.int64]
+    costs: dict[str, FloatArray]
 
     @classmethod
     def of(
-        cls, observations: Any, rewards: FloatArray, terminated: MaskArray, truncated: MaskArray
+        cls,
+        observations: Any,
+        rewards: FloatArray,
+        terminated: MaskArray,
+        truncated: MaskArray,
+        costs: Mapping[str, FloatArray],
     ) -> Rollout:
         """Make it of arrays with steps on the first axis."""
         ends = terminated | truncated
@@ -64,7 +73,14 @@ class Rollout(NamedTuple):
         first = ends.argmax(axis=0) + 1 if horizon else np.zeros(rewards.shape[1], np.int64)
         lengths = np.where(ends.any(axis=0), first, horizon)
         turned = _mapped(lambda arrays: np.swapaxes(arrays[0], 0, 1), [observations])
-        return cls(turned, rewards.T, terminated.T, truncated.T, lengths)
+        runs = np.arange(horizon)[:, np.newaxis] < lengths
+        paid = {name: np.where(runs, values, 0.0).T for name, values in costs.items()}
+        return cls(turned, rewards.T, terminated.T, truncated.T, lengths, paid)
+
+
+def costs_in(infos: Mapping[str, Any]) -> dict[str, FloatArray]:
+    """The costs that infos of N environments tell, by name."""
+    return {name: one for name, one in infos.get("costs", {}).items() if name[0] != "_"}
 
 
 def _mapped(function: Callable[[list[Any]], Any], trees: Sequence[Any]) -> Any:
@@ -333,11 +349,13 @@ def roll_out_by_steps(
         over |= result.terminated | result.truncated
         observations = result.observations
         results.append(result)
+    costs = [costs_in(result.infos) for result in results]
     return Rollout.of(
         _mapped(np.stack, [result.observations for result in results]),
         np.stack([result.rewards for result in results]),
         np.stack([result.terminated for result in results]),
         np.stack([result.truncated for result in results]),
+        {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in costs[0]},
     )
 
 

@@ -216,7 +216,8 @@ class Engine(ABC):
             actions: Shape (horizon, N, ...), checked, of the type of the action space.
 
         Returns:
-            Observations, rewards, terminated and truncated, each with the steps on the first axis;
+            Observations, rewards, terminated, truncated, and costs by name, each with the steps on
+            the first axis;
             see ``Rollout`` for what follows an end. None if the engine cannot do it, or if a step
             has failed.
         """

@@ -45,6 +45,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
+from fmugym.vector.rollouts import costs_in
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams, no_draws
 from fmugym.vector.views import batched, column, some, take
@@ -644,7 +645,8 @@ class BatchEngine(Engine):
         offsets = np.empty(0) if self.offsets is None else self.offsets
         if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
-        return seen if self._divided is None else self._divided(seen)[0], *judged
+        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
+        return observations, *judged, costs_in(infos)
 
     def _arrays_of_steps(self, horizon: int) -> Any:
         """Make the arrays of many steps, with a first axis for the steps."""
