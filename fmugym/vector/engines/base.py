@@ -52,11 +52,17 @@ class Engine(ABC):
         self.offsets: FloatArray | None = None
         self.starts_at_ends = False
 
-    def add_offsets(self, pool: Pool) -> None:
-        """Add the offsets to the outputs of the instances that have stepped."""
+    def add_offsets(self, pool: Pool, idle: MaskArray | None = None) -> None:
+        """Add the offsets to the outputs of the instances that have stepped.
+
+        Args:
+            pool: Has the outputs.
+            idle: Which instances have not stepped, shape (N,); None if all have.
+        """
         if self.offsets is not None:
             failed = (pool.statuses > WARNING_CODE) & (pool.statuses != TERMINATED_CODE)
-            pool.outputs += np.where(failed, 0.0, self.offsets[:, np.newaxis])
+            left_out = failed if idle is None else failed | idle
+            pool.outputs += np.where(left_out, 0.0, self.offsets[:, np.newaxis])
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""

@@ -575,6 +575,7 @@ class BatchEngine(Engine):
         play.before(checked)
         self._pool.step(None, resting)
         self._pool.statuses[resting] = 0  # a fault was told when it came
+        self.add_offsets(self._pool, resting)
         result: StepResult
         result, troubled, *_ = play.after(checked)
         if troubled or self._left_after:
@@ -605,7 +606,7 @@ class BatchEngine(Engine):
         play.before(actions)
         self._begin(starting, indices, plan, drawn)
         self._pool.step(None, starting)
-        self.add_offsets(self._pool)
+        self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
         result.infos.update(self._told(plan, drawn, starting))
         return result, troubled, any_ended, starting

@@ -140,7 +140,7 @@ class PerEnvEngine(Engine):
                 self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
                 self._pool.step(None, idle, self._pool.observations)
                 if self.offsets is not None:
-                    self.add_offsets(self._pool)
+                    self.add_offsets(self._pool, idle)
                     observed = self._pool.observations
                     observed[:] = self._pool.outputs[: observed.shape[1]].T
             self.has_moved = True
