@@ -274,6 +274,44 @@ def test_costs_are_those_of_the_infos(way):
     envs.close()
 
 
+@pytest.mark.parametrize("told", [3.0, {"of": "all"}, {"of": [1.0, 2.0, 3.0]}])
+def test_costs_are_no_others_that_a_class_tells(told):
+    class Telling(Track):
+        def _get_info(self):
+            return {"costs": told}
+
+    envs = vector_of(Telling, 2, hooks="per_env")
+    envs.reset(seed=0)
+    assert envs.rollout(None, np.zeros((2, 3, 1), np.float32)).costs == {}
+    envs.close()
+
+
+def test_costs_that_are_not_told_are_zero():
+    """Two candidates tell none at all, and the other two from the third step on."""
+
+    class Paying(Track):
+        def _get_info(self):
+            return {"costs": {"push": 2.0}} if self.action > 0 and self.step_count > 2 else {}
+
+    envs = vector_of(Paying, 2, hooks="per_env")
+    envs.reset(seed=0)
+    start = envs.save_state(0)
+    pushed = np.repeat([0.0, 0.0, 0.01, 0.01], 4).reshape(4, 4, 1).astype(np.float32)
+    found = envs.rollout(start, pushed).costs["push"]
+    assert found.tolist() == [[0.0] * 4] * 2 + [[0.0, 0.0, 2.0, 2.0]] * 2
+    envs.close()
+
+
+def test_costs_are_told_beside_the_five_parts_of_the_result():
+    task = spinning() | {"costs": {"effort": "abs(push)"}}
+    envs = environments(task)
+    found = envs.rollout(root(task)[0], pushes())
+    _, rewards, _, _, _ = found
+    assert rewards is found.rewards
+    assert found.costs["effort"] == pytest.approx(np.abs(pushes()[..., 0]), rel=1e-6)
+    envs.close()
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_present_episodes_and_their_streams_go_on_as_before(way):
     task = spinning(noise=0.5)

@@ -224,7 +224,7 @@ class MPC(Controller):
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
             observations, _, terminated, truncated, infos = copied.step(episode.action)
-            for name, values in costs_in(infos).items():
+            for name, values in costs_in(infos, (1,)).items():
                 episode.costs[name] = episode.costs.get(name, 0.0) + float(values[0])
             episode.has_ended = bool(terminated[0] or truncated[0])
             if not episode.has_ended:
@@ -328,8 +328,10 @@ class MPC(Controller):
         """The returns of plans; whatever goes beyond the limit of a cost counts far more."""
         found = envs.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
-        for name, most in allowed.items():
-            values = values - _PENALTY * np.maximum(found.costs[name].sum(axis=1) - most, 0.0)
+        for name, paid in found.costs.items():
+            if name in allowed:
+                excess = np.maximum(paid.sum(axis=1) - allowed[name], 0.0)
+                values = values - _PENALTY * excess
         return values
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:

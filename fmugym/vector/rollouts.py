@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -35,8 +35,18 @@ __all__ = [
 ]
 
 
-class Rollout(NamedTuple):
+class _Steps(NamedTuple):
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    lengths: npt.NDArray[np.int64]
+
+
+class Rollout(_Steps):
     """What n candidates have led to in up to ``horizon`` steps.
+
+    It is a tuple of the first five attributes.
 
     After the end of a candidate's episode its last observation is repeated, its rewards are 0, and
     the flags are False.
@@ -47,16 +57,11 @@ class Rollout(NamedTuple):
         terminated: Whether the step has ended the episode, shape (n, horizon).
         truncated: Whether the step has cut it short, shape (n, horizon).
         lengths: The steps that each candidate has done, shape (n,).
-        costs: Those that infos tell as ``"costs"``, by name, each of shape (n, horizon); 0 after
-            the end.
+        costs: The numbers that infos tell as ``"costs"``, by name, each of shape (n, horizon); 0
+            after the end.
     """
 
-    observations: Any
-    rewards: FloatArray
-    terminated: MaskArray
-    truncated: MaskArray
-    lengths: npt.NDArray[np.int64]
-    costs: dict[str, FloatArray]
+    costs: Mapping[str, FloatArray] = MappingProxyType({})
 
     @classmethod
     def of(
@@ -74,13 +79,33 @@ class Rollout(NamedTuple):
         lengths = np.where(ends.any(axis=0), first, horizon)
         turned = _mapped(lambda arrays: np.swapaxes(arrays[0], 0, 1), [observations])
         runs = np.arange(horizon)[:, np.newaxis] < lengths
-        paid = {name: np.where(runs, values, 0.0).T for name, values in costs.items()}
-        return cls(turned, rewards.T, terminated.T, truncated.T, lengths, paid)
+        found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
+        found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
+        return found
 
 
-def costs_in(infos: Mapping[str, Any]) -> dict[str, FloatArray]:
-    """The costs that infos of N environments tell, by name."""
-    return {name: one for name, one in infos.get("costs", {}).items() if name[0] != "_"}
+def costs_in(infos: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, FloatArray]:
+    """The costs that infos of environments tell, by name.
+
+    Args:
+        infos: Those of a step, or of all steps of a rollout.
+        shape: That of the rewards. What a class tells as ``"costs"`` in another shape, or as no
+            numbers, is its own affair.
+    """
+    told = infos.get("costs")
+    return {
+        name: paid
+        for name, paid in (told.items() if isinstance(told, dict) else ())
+        if not str(name).startswith("_")  # which says whose costs are told
+        and isinstance(paid, np.ndarray)
+        and paid.shape == shape
+        and paid.dtype.kind in "biuf"
+    }
+
+
+def _names(costs: Iterable[Mapping[str, FloatArray]]) -> list[str]:
+    """The names of costs, some of which a step with a fault may not tell."""
+    return list(dict.fromkeys(name for told in costs for name in told))
 
 
 def _mapped(function: Callable[[list[Any]], Any], trees: Sequence[Any]) -> Any:
@@ -97,10 +122,15 @@ def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
     """Put rollouts together, and keep the first candidates."""
     if len(parts) == 1 and len(parts[0].rewards) == count:
         return parts[0]
-    return Rollout._make(
+    joined = Rollout._make(
         _mapped(lambda arrays: np.concatenate(arrays)[:count], part)
         for part in zip(*parts, strict=True)
     )
+    joined.costs = {
+        name: np.concatenate([one.costs.get(name, 0.0 * one.rewards) for one in parts])[:count]
+        for name in _names(one.costs for one in parts)
+    }
+    return joined
 
 
 class Candidates:
@@ -349,13 +379,13 @@ def roll_out_by_steps(
         over |= result.terminated | result.truncated
         observations = result.observations
         results.append(result)
-    costs = [costs_in(result.infos) for result in results]
+    costs = [costs_in(result.infos, result.rewards.shape) for result in results]
     return Rollout.of(
         _mapped(np.stack, [result.observations for result in results]),
         np.stack([result.rewards for result in results]),
         np.stack([result.terminated for result in results]),
         np.stack([result.truncated for result in results]),
-        {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in costs[0]},
+        {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)},
     )
 
 

@@ -223,9 +223,8 @@ class Engine(ABC):
 
         Returns:
             Observations, rewards, terminated, truncated, and costs by name, each with the steps on
-            the first axis;
-            see ``Rollout`` for what follows an end. None if the engine cannot do it, or if a step
-            has failed.
+            the first axis; see ``Rollout`` for what follows an end. None if the engine cannot do
+            it, or if a step has failed.
         """
         return None
 

@@ -647,7 +647,7 @@ class BatchEngine(Engine):
         if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
-        return observations, *judged, costs_in(infos)
+        return observations, *judged, costs_in(infos, judged[0].shape)
 
     def _arrays_of_steps(self, horizon: int) -> Any:
         """Make the arrays of many steps, with a first axis for the steps."""
