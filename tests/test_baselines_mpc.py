@@ -14,7 +14,7 @@ from fmugym.baselines import MPC, PID, controller_of
 from fmugym.baselines.mpc import _Foresight
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
-from fmugym.task.future import Lookup, Table
+from fmugym.task.future import Future, Lookup, Table
 from fmugym.tools.cli import main
 
 HOUR, DT = 3600.0, 600.0
@@ -177,7 +177,7 @@ class TestFuture:
     def test_of_a_forecast(self):
         lookup = Lookup(0, 0.0, 365 * 86400.0, False, Table(np.array([0.0, 1.0]), np.zeros(2)))
         names = ("x", "wind", "wind[+7200 s]", "wind[+3600 s]")
-        foresight = _Foresight(names, {"wind": lookup}, HOUR, 30)
+        foresight = _Foresight(names, Future({"wind": lookup}, (), float), HOUR, 30)
         past = [np.array([0.0, 100.0 + hour, 0.0, 0.0]) for hour in range(24)]
         now = np.array([0.0, 5.0, 7.0, 6.0])
         times, values = foresight.ahead([*past, now], 1e6)["wind"]
@@ -191,9 +191,33 @@ class TestFuture:
 
     def test_of_data_that_are_not_observed_is_their_mean(self):
         rows = Table(np.array([0.0, 1.0, 3.0, 4.0]), np.array([0.0, 2.0, 2.0, 0.0]))
-        foresight = _Foresight(("x",), {"wind": Lookup(0, 0.0, 4.0, False, rows)}, 1.0, 3)
+        future = Future({"wind": Lookup(0, 0.0, 4.0, False, rows)}, (), float)
+        foresight = _Foresight(("x",), future, 1.0, 3)
         assert foresight.ahead([np.zeros(1)], 9.0) == {"wind": ([9.0], [1.5])}
         assert foresight.observed(np.zeros(1), np.zeros(1), 9.0)["wind"] == ([8.0, 9.0], [1.5, 1.5])
+
+    @pytest.mark.parametrize("interpolation", ["linear", "previous"])
+    def test_mean_leaves_scenarios_out(self, opened, interpolation):
+        """Values of 1 from 10 to 12 January and on 30 December, which are held out; else 3."""
+        days = np.full(365, 3.0)
+        days[[9, 10, 11, 363]] = 1.0
+        rows = {"values": days.repeat(24).tolist(), "step": HOUR, "interpolation": interpolation}
+        scenarios = {
+            "frost": {"start": "01-09", "length": "4d"},
+            "turn": {"start": "12-29", "length": "2d"},
+        }
+        task = wheel(observed=False, forecast=None, data={"wind": rows}, scenarios=scenarios)
+        for scenario in (None, "frost"):
+            env = opened(partial(fmugym.load, task, scenario=scenario))
+            future = env.inside.future
+            assert future.lookups["wind"].mean() < 2.99
+            foresight = _Foresight(("q_dot",), future, DT, 3)
+            _, values = foresight.ahead([np.zeros(1)], 0.0)["wind"]
+            assert values == pytest.approx([3.0], abs=1e-12)
+
+    def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
+        rows = Table(np.array([0.0, 43200.0, 86400.0]), np.array([1.0, 5.0, 1.0]))
+        assert Lookup(0, 0.0, 86400.0, False, rows).mean([(0.0, 1e6)]) == 3.0
 
 
 class TestModel:
@@ -287,6 +311,7 @@ class TestRefusals:
         [
             (wheel(limits=None), {}, "'min' and 'max'"),
             (wheel(), {"horizon": 60.0}, "shorter than the step"),
+            (wheel(), {"horizon": "25h"}, "'wind', which repeat after 86400 s; take horizon=86400"),
             (wheel(), {"states": {"q_dt": "q_dot_0"}}, "'q_dot'"),
             (wheel(), {"states": {"q_dot": "q_dot_0"}}, "without data"),
         ],

@@ -21,7 +21,7 @@ from fmugym.checks import check_number, check_seed, duration
 from fmugym.distributions import is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
-from fmugym.task.future import Lookup
+from fmugym.task.future import Future
 from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.rollouts import costs_in
@@ -52,7 +52,8 @@ class MPC(Controller):
 
     The controller sees what an agent sees. A copy begins in the nominal state of the task and gets
     the same actions. It reads data as they were observed, and ahead as they are forecast. Beyond a
-    forecast, the value of a day before is repeated; data that are not observed have their mean.
+    forecast, the value of a day before is repeated; data that are not observed have their mean,
+    without that of the scenarios.
     Differences between what is observed and what the copy gives, filtered, become offsets of the
     outputs. The controller is told the episode variables, such as the clock, but no noise.
 
@@ -106,7 +107,7 @@ class MPC(Controller):
 
         Raises:
             ConfigError: Also if the environment cannot be saved, its actions have no limits or are
-                no numbers, or the horizon is shorter than a step.
+                no numbers, or the horizon is shorter than a step or longer than the data.
         """
         self._env: Any = env.unwrapped
         return super().bind(env, names)
@@ -137,13 +138,16 @@ class MPC(Controller):
             make = partial(copy.copy, env)
             self._cost_limits = getattr(env, "cost_limits", {})
             self._step_limit = env.inside.step_limit
-            lookups = {} if env.inside.future is None else env.inside.future.lookups
+            future = env.inside.future or Future({}, (), float)
+        lookups = future.lookups
+        for name, lookup in lookups.items():
+            _require_within(self.horizon, name, lookup.period)
         self._places = [self._place_of(name) for name in self.states]
         if self.states and lookups:
             raise ConfigError(
                 f"MPC takes 'states' for tasks without data only, but there is {min(lookups)!r}"
             )
-        self._foresight = _Foresight(self.names, lookups, self.time_step, steps)
+        self._foresight = _Foresight(self.names, future, self.time_step, steps)
         for count in (1, self.candidates // self.rounds):
             self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
         if self.warm is not None:
@@ -400,7 +404,7 @@ class _Foresight:
 
     Args:
         names: Those of the observation's elements.
-        lookups: The data by name.
+        future: Has the data.
         time_step: The length of a step in s.
         steps: Those until the horizon.
 
@@ -411,13 +415,14 @@ class _Foresight:
     def __init__(
         self,
         names: Sequence[str],
-        lookups: Mapping[str, Lookup],
+        future: Future,
         time_step: float,
         steps: int,
     ) -> None:
-        self._lookups, self._time_step, self._steps = lookups, time_step, steps
+        self._lookups, self._time_step, self._steps = future.lookups, time_step, steps
         self.is_present = np.array(["[" not in name for name in names])
-        self._known: dict[str, list[tuple[float, int]]] = {name: [] for name in lookups}
+        self._known: dict[str, list[tuple[float, int]]] = {name: [] for name in future.lookups}
+        self._means = {n: one.mean(future.held_out) for n, one in future.lookups.items()}
         for place, name in enumerate(names):
             match = _FORECAST.fullmatch(name)
             of, ahead = (match[1], float(match[2])) if match else (name, 0.0)
@@ -436,7 +441,7 @@ class _Foresight:
     def _course(self, name: str, rows: Sequence[FloatArray], now: float) -> tuple[Any, Any]:
         lookup, known = self._lookups[name], sorted(self._known[name])
         if not known:
-            return [now], [_mean(lookup)]
+            return [now], [self._means[name]]
         count = min(self._steps + 2, int(np.ceil(lookup.period / self._time_step)))
         times = np.arange(count) * self._time_step
         aheads = np.array([ahead for ahead, _ in known])
@@ -464,18 +469,19 @@ class _Foresight:
     def observed(self, before: FloatArray, row: FloatArray, now: float) -> dict[str, Any]:
         """Times and values of the step that has just ended, by name."""
         found = {}
-        for name, lookup in self._lookups.items():
+        for name in self._lookups:
             places = [place for ahead, place in self._known[name] if ahead == 0.0]
-            values = [before[places[0]], row[places[0]]] if places else [_mean(lookup)] * 2
+            values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
 
 
-def _mean(lookup: Lookup) -> float:
-    """The mean of a series over its period."""
-    times, values = lookup.own
-    middles = (values[1:] + values[:-1]) / 2
-    return float(np.average(middles, weights=np.diff(times)))
+def _require_within(horizon: float, name: str, period: float) -> None:
+    if horizon > period:
+        raise ConfigError(
+            f"the horizon of {horizon:g} s is longer than the data {name!r}, which repeat after "
+            f"{period:g} s; take horizon={period:g} or less"
+        )
 
 
 def _whole(what: str, value: float, least: int) -> int:

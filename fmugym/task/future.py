@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from fmugym.pool.base import FloatArray
 from fmugym.signals import ordinary
 
 __all__ = ["Future", "Lookup", "Table", "assumed"]
+
+_YEAR: Final = 365 * 86400.0
 
 
 class Table(NamedTuple):
@@ -51,6 +53,23 @@ class Lookup:
     def __call__(self, place: Any) -> Any:
         """The values at places from 0 to the period; to the left of them, nobody looks."""
         return np.interp(place, *self.present, left=self._number)
+
+    def mean(self, held_out: Sequence[tuple[float, float]] = ()) -> float:
+        """The mean over a period.
+
+        Args:
+            held_out: Beginnings and lengths in seconds of parts of each year that are left out. If
+                nothing else is there, such as in the data of a day, nothing is left out.
+        """
+        times, values = self.own
+        widths = np.diff(times)
+        is_seen = np.ones(len(widths), np.bool_)
+        for begin, length in held_out:
+            since = self.start + times[:-1] - begin
+            is_seen &= np.remainder(since, _YEAR) >= length
+            is_seen &= np.remainder(-since, _YEAR) > widths
+        middles = (values[1:] + values[:-1]) / 2
+        return float(np.average(middles, weights=widths * is_seen if is_seen.any() else widths))
 
     def table_of_program(self, table: Table) -> FloatArray:
         """A table as programs have it: times, values, and the values beyond both ends."""
@@ -105,11 +124,13 @@ class Future(NamedTuple):
         lookups: Those of the series by name.
         keys: The names of the episode variables from which random numbers of all steps follow.
         clock: Gives the time of the data in an environment, in seconds.
+        held_out: When in a year the scenarios of the task are, beginnings and lengths in seconds.
     """
 
     lookups: Mapping[str, Lookup]
     keys: tuple[str, ...]
     clock: Callable[[Any], Any]
+    held_out: tuple[tuple[float, float], ...] = ()
 
     def tables_of_programs(
         self, tables: Mapping[str, Table]
