@@ -10,6 +10,7 @@ from html import escape
 from typing import Final
 
 from fmugym.checks import check_path
+from fmugym.series.intervals import confidence
 from fmugym.series.plots import as_svg
 from fmugym.series.summary import (
     Course,
@@ -205,19 +206,21 @@ def _means(found: Mapping[str, Sequence[EpisodeSummary]], limits: Mapping[str, f
     best = max(_mean([one.reward for one in episodes]) for episodes in found.values())
     cells = []
     for name, episodes in found.items():
-        reward = _mean([one.reward for one in episodes])
+        rewards = [one.reward for one in episodes]
+        reward, half = _mean(rewards), confidence(rewards)
         is_best = len(found) > 1 and reward == best
         cells.append(
             [
                 _text(name, "first"),
                 _cell(str(len(episodes))),
                 _cell(_number(reward), "best" if is_best else ""),
+                _cell(_number(half)),
                 *(_cell(_number(_mean_of(episodes, "terms", n))) for n in terms),
                 *(_cost(_mean_of(episodes, "costs", n), limits.get(n)) for n in costs),
                 *(_cell(_number(_mean_of(episodes, "kpis", n))) for n in kpis),
             ]
         )
-    return _table(["", "episodes", "reward", *terms, *costs, *kpis], cells)
+    return _table(["", "episodes", "reward", "± (95 %)", *terms, *costs, *kpis], cells)
 
 
 def _mean(values: Sequence[float]) -> float:
