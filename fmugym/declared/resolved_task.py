@@ -38,7 +38,7 @@ from fmugym.declared.observing import (
 )
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
-from fmugym.declared.seasons import read_scenarios
+from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
@@ -111,9 +111,8 @@ class ResolvedTask:
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
         clock = self._function(self._naming.clock_code())
-        scenarios = read_scenarios(self._root.child("scenarios"))
-        held_out = tuple((one.start, one.length) for one in scenarios.values())
-        return Future(lookups, keys, clock, held_out)
+        held_out = held_out_times((self._task.outside or self._task).root)
+        return Future(lookups, keys, clock, tuple((one.start, one.length) for one in held_out))
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""

@@ -124,7 +124,7 @@ class Future(NamedTuple):
         lookups: Those of the series by name.
         keys: The names of the episode variables from which random numbers of all steps follow.
         clock: Gives the time of the data in an environment, in seconds.
-        held_out: When in a year the scenarios of the task are, beginnings and lengths in seconds.
+        held_out: When in a year no training is, beginnings and lengths in seconds.
     """
 
     lookups: Mapping[str, Lookup]
