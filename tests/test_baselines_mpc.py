@@ -106,11 +106,22 @@ class TestPlans:
         )
         assert first == second != other
 
-    def test_have_moves_that_hold(self, opened, bound):
+    def test_differ_by_moves_that_hold(self, opened, bound):
         controller = bound(moves=3)
         controller.bind(opened(wheel()))
-        moves = controller._actions(np.array([[0.0, 0.5, 1.0]]))[0, :, 0]
-        assert moves.tolist() == [-1, -1, -1, -1, 0, 0, 0, 0, 1, 1]
+        plan = np.linspace(0.4, 0.6, 10)[:, None]
+        moved = controller._moved_by(plan, np.array([[0.0, 0.1, 0.5]]))[0] - plan
+        assert moved[:, 0] == pytest.approx([0.0] * 4 + [0.1] * 4 + [1 - plan[8, 0]] * 2, abs=0.06)
+
+    def test_go_on_with_that_of_the_step_before(self, opened, bound):
+        """A search that finds nothing keeps what it had, step by step."""
+        controller = bound(candidates=8, rounds=1)
+        env = opened(wheel())
+        play(env, controller, 1)
+        episode = controller._episodes[0]
+        before = episode.plan = np.linspace(1.0, 0.0, 10)[:, None]
+        first = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
+        assert first[0].ravel().tolist() == [*before[1:, 0], 0.0]
 
     def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, opened, bound):
         """A search of two candidates a round finds little itself."""
@@ -119,6 +130,28 @@ class TestPlans:
         _, alone = play(opened(wheel()), PID(**pid), 10)
         _, rewards = play(opened(wheel()), bound(warm=PID(**pid), **few), 10)
         assert rewards.sum() > alone.sum() - 0.01
+
+    def test_begin_with_what_the_task_file_declares(self, opened, bound):
+        """Ranges have their middle; other plans are none."""
+        given = {
+            "pi": "pid of=q_dot setpoint=1 kp=1..4",
+            "off": "hysteresis of=q_dot setpoint=1 band=0.1",
+            "ahead": "mpc horizon=1h",
+            "still": 0.0,
+        }
+        controller = bound()
+        env = opened(wheel(controllers=given))
+        play(env, controller, 2)
+        episode = controller._episodes[0]
+        pid, thermostat = episode.warm
+        assert pid.kp == pytest.approx(2.5)
+        assert thermostat.band == pytest.approx(0.1)
+        plans = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
+        assert plans.shape == (3, 10, 1)
+        expected = PID("q_dot", 1.0, kp=2.5)
+        copies = opened(wheel())
+        actions, _ = play(copies, expected, 11)
+        assert 2 * plans[1, :, 0] - 1 == pytest.approx(actions[1:, 0], abs=0.01)
 
     def test_of_several_environments_are_those_of_single_ones(self, opened, bound):
         task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
@@ -176,24 +209,31 @@ class TestFuture:
 
     def test_of_a_forecast(self):
         lookup = Lookup(0, 0.0, 365 * 86400.0, False, Table(np.array([0.0, 1.0]), np.zeros(2)))
-        names = ("x", "wind", "wind[+7200 s]", "wind[+3600 s]")
+        names = ("x", "wind", "wind[+10800 s]", "wind[+7200 s]")
         foresight = _Foresight(names, Future({"wind": lookup}, (), float), HOUR, 30)
-        past = [np.array([0.0, 100.0 + hour, 0.0, 0.0]) for hour in range(24)]
-        now = np.array([0.0, 5.0, 7.0, 6.0])
-        times, values = foresight.ahead([*past, now], 1e6)["wind"]
+        now, told = np.array([0.0, 5.0, 8.0, 6.0]), {}
+        foresight.note(told, now, 0)
+        times, values = foresight.ahead(told, 0, 1e6)["wind"]
         assert (times - 1e6).tolist() == [HOUR * k for k in range(32)]
-        assert values[:3].tolist() == [5.0, 6.0, 7.0]
-        assert values[3:24].tolist() == [103.0 + k for k in range(21)]  # of a day before
-        assert values[24:].tolist() == [5.0, 6.0, 7.0, 103.0, 104.0, 105.0, 106.0, 107.0]
-        times, values = foresight.ahead([now], 0.0)["wind"]
-        assert values[3:24].tolist() == [7.0] * 21  # nothing is known of the day before
+        assert values[:4].tolist() == [5.0, 5.5, 6.0, 8.0]
+        assert values[4:24].tolist() == [8.0] * 20  # nothing is known of the day before
+        assert values[24:].tolist() == [5.0, 5.5, 6.0] + [8.0] * 5
+        for hour in range(23):
+            foresight.note(told, np.array([0.0, 100.0 + hour, 200.0 + hour, 300.0 + hour]), hour)
+        foresight.note(told, now, 23)
+        times, values = foresight.ahead(told, 23, 1e6)["wind"]
+        assert values[:4].tolist() == [5.0, 322.0, 6.0, 8.0]  # the second was forecast an hour ago
+        assert values[4:24].tolist() == [103.0 + k for k in range(20)]  # of a day before
+        assert values[24:28].tolist() == [5.0, 322.0, 6.0, 8.0]
         assert foresight.is_present.tolist() == [True, True, False, False]
 
     def test_of_data_that_are_not_observed_is_their_mean(self):
         rows = Table(np.array([0.0, 1.0, 3.0, 4.0]), np.array([0.0, 2.0, 2.0, 0.0]))
         future = Future({"wind": Lookup(0, 0.0, 4.0, False, rows)}, (), float)
         foresight = _Foresight(("x",), future, 1.0, 3)
-        assert foresight.ahead([np.zeros(1)], 9.0) == {"wind": ([9.0], [1.5])}
+        told = {}
+        foresight.note(told, np.zeros(1), 0)
+        assert foresight.ahead(told, 0, 9.0) == {"wind": ([9.0], [1.5])}
         assert foresight.observed(np.zeros(1), np.zeros(1), 9.0)["wind"] == ([8.0, 9.0], [1.5, 1.5])
 
     @pytest.mark.parametrize("interpolation", ["linear", "previous"])
@@ -212,8 +252,24 @@ class TestFuture:
             future = env.inside.future
             assert future.lookups["wind"].mean() < 2.99
             foresight = _Foresight(("q_dot",), future, DT, 3)
-            _, values = foresight.ahead([np.zeros(1)], 0.0)["wind"]
+            _, values = foresight.ahead({"wind": {}}, 0, 0.0)["wind"]
             assert values == pytest.approx([3.0], abs=1e-12)
+
+    @pytest.mark.parametrize("scenario", [None, "autumn"])
+    def test_mean_is_that_of_the_season(self, opened, scenario):
+        """Values of 1 from November to March, with a week that begins on 1 March; else 5."""
+        days = np.full(365, 5.0)
+        days[304:], days[:66] = 1.0, 1.0
+        task = wheel(
+            observed=False,
+            forecast=None,
+            episode_length="7d",
+            clock={"from": "11-01", "to": "03-01"},
+            data={"wind": {"values": days.repeat(24).tolist(), "step": HOUR}},
+            scenarios={"autumn": {"start": "09-01", "length": "2d"}},
+        )
+        future = opened(partial(fmugym.load, task, scenario=scenario)).inside.future
+        assert future.lookups["wind"].mean(future.held_out) == pytest.approx(1.0, abs=0.01)
 
     def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
         rows = Table(np.array([0.0, 43200.0, 86400.0]), np.array([1.0, 5.0, 1.0]))
@@ -222,23 +278,41 @@ class TestFuture:
 
 class TestModel:
     def test_is_corrected_by_offsets(self, opened, bound):
-        """The wheel begins by 0.24 faster than the copy, and so it stays."""
-        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
-        env = opened(task)
-        seed = next(s for s in range(100) if env.reset(seed=s)[0][0] > 0.49)
+        """The wheel begins by 0.24 faster than the copies, and so it stays."""
+        env = opened(wheel(parameters=wheel()["parameters"] | {"q_dot_0": 0.24}))
         errors = {}
         for correction in (0.0, 0.5):
-            _, rewards = play(env, bound(correction=correction), 25, seed)
+            controller = bound(correction=correction, model=partial(fmugym.load, wheel()))
+            _, rewards = play(env, controller, 25)
             errors[correction] = np.sqrt(-rewards[12:].mean())
         assert errors[0.0] == pytest.approx(0.24, abs=0.03)
         assert errors[0.5] < 0.08
 
     def test_begins_in_the_nominal_state(self, opened, bound):
-        """Speeds are drawn around 0.5; those of the copy begin there."""
+        """Speeds are drawn around 0.5; that of the first copy begins there, others beside it."""
         task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0.4, 0.6)})
         controller = bound()
         play(opened(task), controller, 1)
-        assert controller._episodes[0].seen[0] == pytest.approx(0.5, abs=0.01)
+        speeds = controller._episodes[0].seen[:, 0]
+        assert speeds[0] == pytest.approx(0.5, abs=0.01)
+        assert sorted(speeds) == pytest.approx(0.4 + 0.2 * (np.arange(9) + 0.5) / 9, abs=0.01)
+
+    def test_is_the_copy_that_fits_best(self, opened, bound):
+        """The wheel is lighter than the median; a thrust moves it further."""
+        own = wheel()["parameters"] | {"m": fmugym.Uniform(0.5, 1.5)}
+        env, controller = opened(wheel(parameters=own)), bound(seed=1)
+        seed = next(s for s in range(99) if env.reset(seed=s)[1]["drawn"]["m"] < 0.6)
+        play(env, controller, 4, seed)
+        episode = controller._episodes[0]
+        expected = np.abs(episode.seen[:, 0] - env.state[0]).argmin()
+        assert episode.best == expected != 0
+
+    def test_may_be_another_environment(self, opened, bound):
+        """That of the planner is twice as heavy: it pushes too hard."""
+        heavy = wheel(parameters=wheel()["parameters"] | {"m": 2.0})
+        controller = bound(model=partial(fmugym.load, heavy), correction=0.0)
+        play(opened(wheel()), controller, 2)
+        assert controller._episodes[0].seen[0, 0] == pytest.approx(0.125, abs=0.02)
 
     def test_may_begin_in_the_observed_state(self, opened, bound):
         """A pendulum swings up that is too heavy to be lifted; its sensors are noisy."""
@@ -300,6 +374,7 @@ class TestRefusals:
             ({"perfect": "maybe"}, "perfect must be true or false"),
             ({"budget": 0}, "budget"),
             ({"states": "theta"}, "states must be as in"),
+            ({"model": "house.toml"}, "model must be a function"),
         ],
     )
     def test_of_arguments(self, arguments, reason):
@@ -314,6 +389,7 @@ class TestRefusals:
             (wheel(), {"horizon": "25h"}, "'wind', which repeat after 86400 s; take horizon=86400"),
             (wheel(), {"states": {"q_dt": "q_dot_0"}}, "'q_dot'"),
             (wheel(), {"states": {"q_dot": "q_dot_0"}}, "without data"),
+            (wheel(), {"model": CartPoleEnv}, "the model observes x, x_dot"),
         ],
     )
     def test_of_tasks(self, opened, bound, task, arguments, reason):
@@ -332,8 +408,11 @@ class TestRefusals:
             bound().bind(opened(Several))
 
     def test_of_plants(self, opened, bound):
-        with pytest.raises(ConfigError, match="a backend stands in"):
-            bound().bind(opened(partial(CartPoleEnv, backend="fmpy")))
+        plant = opened(partial(CartPoleEnv, backend="fmpy"))
+        with pytest.raises(ConfigError, match="a backend stands in for this one: give 'model'"):
+            bound().bind(plant)
+        _, rewards = play(plant, bound("0.4s", moves=20, model=CartPoleEnv), 15)
+        assert len(rewards) == 15
 
     def test_of_slow_replays(self, opened, bound):
         env = opened(partial(CartPoleEnv, fmi_version="1.0"))
@@ -364,10 +443,22 @@ class TestCommandLine:
         with Image.open(plot) as image:
             assert image.size[1] > 300
 
-    def test_training_leaves_it_out(self, path, tmp_path, capsys):
-        options = ["--output", str(tmp_path / "agent"), "--rounds", "2", "--envs", "8"]
-        assert main(["train", path, *options]) == 0
-        assert "left out: ahead, which plans too slowly" in capsys.readouterr().err
+    def test_training_compares_it_where_there_is_time(self, tmp_path, capsys):
+        given = {
+            "pi": "pid of=q_dot setpoint=1 kp=0.1..4",
+            "ahead": "mpc horizon=1h candidates=64",
+            "slow": "mpc horizon=10h candidates=20000",
+        }
+        path = tmp_path / "wheel.toml"
+        fmugym.Task.of(wheel(controllers=given)).write(path)
+        options = ["--output", str(tmp_path / "agent"), "--rounds", "9", "--envs", "8"]
+        assert main(["train", str(path), *options, "--episodes", "2", "--json"]) == 0
+        told = capsys.readouterr()
+        found = json.loads(told.out)
+        test, baseline = found["test"], found["baseline"]
+        assert test["ahead"]["total_reward"] > test[baseline]["total_reward"] - 0.01
+        assert "slow" not in test
+        assert "left out: slow, whose test would take about" in told.err
 
     def test_its_numbers_are_not_tuned(self, path, capsys):
         assert main(["tune", path, "mpc horizon=3600..7200"]) == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from time import perf_counter
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.base import Controller, FloatArray
+from fmugym.baselines.base import Controller, FloatArray, attribute_of
 from fmugym.baselines.cma import CMA
 from fmugym.checks import check_number, check_seed, duration
 from fmugym.distributions import is_distribution
@@ -30,10 +30,18 @@ __all__ = ["MPC"]
 
 _DAY: Final = 86400.0
 _SIGMA: Final = 0.25
-"""Of the first candidates, as a part of the range of an action."""
+_LEAST_SIGMA: Final = 0.02
+"""How far candidates go from the plan, in parts of the range of an action: at first, and at the
+least."""
+
+_COPIES: Final = 9
+"""So many copies run beside each environment."""
+
+_LASTING: Final = 0.98
+"""The part of the past errors of a copy that counts after a step."""
 
 _SAMPLES: Final = 1001
-"""The nominal value of what is drawn is the median of so many samples."""
+"""The copies have quantiles of so many samples of what is drawn."""
 
 _PENALTY: Final = 1e9
 """How much more a unit of a cost beyond its limit counts than one of the reward."""
@@ -45,24 +53,27 @@ class MPC(Controller):
     """Model predictive control with copies of the FMU as the model.
 
     In each step, candidates for the actions until the horizon play on copies of the environment,
-    and the first action of the best one is taken. The reward is that of the task. A plan has a few
-    moves, each of which holds for the same number of steps. Plans that keep the limits of costs
-    come first. The search begins with the plan of the step before, and goes on by the adaptation of
-    a covariance matrix (``fmugym.baselines.cma``).
+    and the first action of the best one is taken. The reward is that of the task, and plans that
+    keep the limits of costs come first. The search begins with the better of the plan of the step
+    before and what simple controllers would do. Candidates differ from that by a few moves, each of
+    which holds for the same number of steps. Half of them come from the adaptation of a covariance
+    matrix (``fmugym.baselines.cma``), the others change the best plan in some moves in a row.
 
-    The controller sees what an agent sees. A copy begins in the nominal state of the task and gets
-    the same actions. It reads data as they were observed, and ahead as they are forecast. Beyond a
-    forecast, the value of a day before is repeated; data that are not observed have their mean,
-    without that of the scenarios.
-    Differences between what is observed and what the copy gives, filtered, become offsets of the
-    outputs. The controller is told the episode variables, such as the clock, but no noise.
+    The controller sees what an agent sees. Nine copies get the same actions as the environment.
+    They differ in the parameters that the task draws, and the one whose observations fit best is
+    the model. Copies read data as they were observed, and ahead as they were forecast last. Beyond
+    a forecast, the value of a day before is repeated; data that are not observed have their mean in
+    the training period. Differences between what is observed and what a copy gives, filtered,
+    become offsets of the outputs. The controller is told the episode variables, such as the clock,
+    but no noise.
 
     Args:
         horizon: How far plans go: seconds, or a text such as ``"24h"``.
-        moves: The most moves of a plan.
+        moves: The most moves by which a candidate differs.
         candidates: How many candidates play in a decision.
         rounds: How often the search learns from them in a decision.
-        warm: A controller whose actions are a candidate, too, bound to nothing else.
+        warm: A controller whose actions are a candidate, too, bound to nothing else. By default
+            those that the task file declares; ranges in them have their middle.
         correction: By which part the offsets follow the differences in a step, from 0 to 1.
         budget: How long a decision may take, in seconds of real time, if the FMU cannot save its
             state; None for any time.
@@ -74,6 +85,8 @@ class MPC(Controller):
         perfect: Whether the true state and the true future are known. Nobody can beat this but by
             a better search; it shows how much there is to gain.
         seed: Of the candidates. The same arguments give the same actions.
+        model: A function that makes the environment to plan with, which has the observations and
+            actions of the controlled one. By default that is copied, which a plant cannot be.
     """
 
     def __init__(
@@ -81,17 +94,18 @@ class MPC(Controller):
         horizon: Any,
         moves: float = 24,
         candidates: float = 256,
-        rounds: float = 4,
+        rounds: float = 8,
         warm: Controller | None = None,
         correction: float = 0.3,
         budget: float | None = 1.0,
         states: Mapping[str, str] | str | None = None,
         perfect: bool | str = False,
         seed: float = 0,
+        model: Callable[[], Any] | None = None,
     ) -> None:
         self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
         self.moves, self.rounds = _whole("moves", moves, 1), _whole("rounds", rounds, 1)
-        self.candidates = _whole("candidates", candidates, 8 * self.rounds)
+        self.candidates = _whole("candidates", candidates, 4 * self.rounds)
         self.warm = warm
         self.correction = check_number("correction", correction, 0.0, 1.0)
         self.budget = None if budget is None else check_number("budget", budget, positive=True)
@@ -100,6 +114,9 @@ class MPC(Controller):
         self.perfect = perfect in (True, "true")
         self.states = _pairs(states)
         self.seed = check_seed(_whole("seed", seed, 0)) or 0
+        if model is not None and not callable(model):
+            raise ConfigError(f"model must be a function, got {shown(model)}")
+        self.model = model
         self._envs: list[FMUVectorEnv] = []
 
     def bind(self, env: Any, names: Any = None) -> MPC:
@@ -126,37 +143,62 @@ class MPC(Controller):
                 f"the horizon of {self.horizon:g} s is shorter than the step of "
                 f"{self.time_step:g} s"
             )
-        length = -(-steps // self.moves)
-        self._move_of = np.arange(steps) // length
-        self._count_of_moves = int(self._move_of[-1]) + 1
-        self._size = self._count_of_moves * self._low.size
+        self._move_of = np.arange(steps) // -(-steps // self.moves)
+        self._moves = int(self._move_of[-1]) + 1
+        make = self._model_of()
+        for count in (_COPIES, self.candidates // self.rounds):
+            self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
+        self._prototype = self._envs[0].inside.prototype
+        self._cost_limits = getattr(self._prototype, "cost_limits", {})
+        future = self._prototype.inside.future or Future({}, (), float)
+        self._places = [self._place_of(name) for name in self.states]
+        self._require_fit(future)
+        self._foresight = _Foresight(self.names, future, self.time_step, steps)
+        self._warm = self._bound_warm()
+        self._inverse: FloatArray | None = None
+
+    def _model_of(self) -> Callable[[], Any]:
+        """What makes copies."""
+        if self.model is not None:
+            return self.model
         with _single(self._env, 0) as env:
             if env.inside.pool.save_method is None:
                 raise ConfigError(
-                    "MPC needs an FMU that it can copy, but a backend stands in for this one"
+                    "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
+                    "'model', a function that makes the environment to plan with"
                 )
-            make = partial(copy.copy, env)
-            self._cost_limits = getattr(env, "cost_limits", {})
-            self._step_limit = env.inside.step_limit
-            future = env.inside.future or Future({}, (), float)
-        lookups = future.lookups
-        for name, lookup in lookups.items():
-            _require_within(self.horizon, name, lookup.period)
-        self._places = [self._place_of(name) for name in self.states]
-        if self.states and lookups:
+            return partial(copy.copy, env)
+
+    def _require_fit(self, future: Future) -> None:
+        """Refuse a model of another task, a horizon beyond the data, and states beside data."""
+        copied = self._envs[0]
+        names = attribute_of(copied, "observation_names") or self.names
+        space = copied.single_action_space
+        if (names, space) != (self.names, self.space):
             raise ConfigError(
-                f"MPC takes 'states' for tasks without data only, but there is {min(lookups)!r}"
+                f"the model observes {', '.join(names)} and takes actions of {space}, expected "
+                f"{', '.join(self.names)} and {self.space}"
             )
-        self._foresight = _Foresight(self.names, future, self.time_step, steps)
-        for count in (1, self.candidates // self.rounds):
-            self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
-        if self.warm is not None:
-            self.warm.bind(self._envs[0], self.names)
-        self._inverse: FloatArray | None = None
+        for name, lookup in future.lookups.items():
+            _require_within(self.horizon, name, lookup.period)
+        if self.states and future.lookups:
+            raise ConfigError(
+                "MPC takes 'states' for tasks without data only, but there is "
+                f"{min(future.lookups)!r}"
+            )
 
     def _place_of(self, name: str) -> int:
         self._check_signal("states", name)
         return self.names.index(name)
+
+    def _bound_warm(self) -> list[Controller]:
+        """The simple controllers, bound to the copies."""
+        from fmugym.baselines.parsing import simple_controllers
+
+        task = getattr(self._prototype, "task", None)
+        declared = {} if task is None else task.document.get("controllers", {})
+        found = simple_controllers(declared) if self.warm is None else [self.warm]
+        return [one.bind(self._envs[0], self.names) for one in found]
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if mask.all():
@@ -178,67 +220,85 @@ class MPC(Controller):
                 episode = self._episodes[index] = self._begun(env)
             else:
                 self._follow(episode, row, now)
+        self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
         with ExitStack() as stack:
             for envs in self._envs:
                 stack.enter_context(envs.inside.episodes.assuming(data))
             episode.plan = self._search(episode, start, assumed, row)
-        episode.rows.append(row)
-        episode.action = self._actions(episode.plan[np.newaxis])[0, :1]
+        episode.row, episode.steps = row, episode.steps + 1
+        episode.action = self._actions(episode.plan[np.newaxis])[0, 0]
         self._require_time(start, perf_counter() - begin)
-        return np.asarray(episode.action[0], np.float64)
+        return np.asarray(episode.action, np.float64)
 
     def _require_time(self, start: Snapshot, took: float) -> None:
-        if start.method == "replay" and self.budget is not None and took > self.budget:
+        if start.method != "state" and self.budget is not None and took > self.budget:
             raise ConfigError(
                 f"a decision took {took:.3g} s of at most {self.budget:g} s: the FMU cannot save "
                 "its state, so that each candidate plays the episode again. Take fewer candidates, "
                 "or a larger budget"
             )
 
-    # The copy that runs beside the environment.
+    # The copies that run beside the environment.
 
     def _begun(self, env: FMUEnv) -> _Episode:
-        """Begin an episode of the copy, in the nominal state."""
+        """Begin an episode of the copies; the first one has the nominal parameters."""
         copied, episode = self._envs[0], _Episode()
-        values = _nominal(env)
-        if env.config.draws_start_time:
-            values["start_time"] = env.time - env.step_count * env.config.time_step
-        options = {"model_parameters": values} if values else {}
-        observations, _ = copied.reset(seed=self.seed, options=options)
+        values = _quantiles(self._prototype, self.seed)
+        if self._prototype.config.draws_start_time:
+            values["start_time"] = np.full(_COPIES, env.time - env.step_count * self.time_step)
+        for place in range(_COPIES if values else 1):
+            mask = np.arange(_COPIES) == place if place else np.ones(_COPIES, np.bool_)
+            options: dict[str, Any] = {"reset_mask": mask}
+            given = {name: float(each[place]) for name, each in values.items()}
+            options |= {"model_parameters": given} if given else {}
+            observations, _ = copied.reset(seed=self.seed, options=options)
         keys = () if env.inside.future is None else env.inside.future.keys
         for name, value in env.variables.items():
-            if np.ndim(value) == 0 and name not in keys:
-                copied.inside.engine.set_variable(name, np.array([float(value)]))
-        episode.seen = np.asarray(observations[0], np.float64)
+            if np.ndim(value) == 0 and name not in keys and name in self._prototype.variables:
+                copied.inside.engine.set_variable(name, np.full(_COPIES, float(value)))
+        episode.seen = np.asarray(observations, np.float64)
+        episode.errors = np.zeros(episode.seen.shape)
         episode.snapshot = copied.save_state()
-        episode.plan = np.full(self._size, 0.5)
-        episode.warm = copy.deepcopy(self.warm)
+        episode.plan = np.full(self._shape_of_plan, 0.5)
+        episode.rng = np.random.default_rng(self.seed)
+        size = self._moves * self._low.size
+        form = np.zeros(size), _SIGMA, self._envs[1].num_envs // 2, episode.rng, np.ones(size)
+        episode.cma = CMA(*form, largest_sigma=_SIGMA)
+        episode.warm = copy.deepcopy(self._warm)
         if self._inverse is None:
-            self._inverse = self._find_inverse(episode.snapshot)
-        episode.offsets = np.zeros(len(self._inverse))
+            self._inverse = self._find_inverse(episode.snapshot[0])
+        episode.offsets = np.zeros((_COPIES, len(self._inverse)))
         return episode
 
     def _follow(self, episode: _Episode, row: FloatArray, now: float) -> None:
-        """Let the copy do the step that the environment has done, with what was observed."""
-        if episode.has_ended:
+        """Let the copies do the step that the environment has done, with what was observed."""
+        if episode.have_ended:
             return
         copied = self._envs[0]
-        data = self._foresight.observed(episode.rows[-1], row, now)
+        data = self._foresight.observed(episode.row, row, now)
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
-            observations, _, terminated, truncated, infos = copied.step(episode.action)
-            for name, values in costs_in(infos, (1,)).items():
-                episode.costs[name] = episode.costs.get(name, 0.0) + float(values[0])
-            episode.has_ended = bool(terminated[0] or truncated[0])
-            if not episode.has_ended:
-                episode.seen = np.asarray(observations[0], np.float64)
-                episode.snapshot = copied.save_state()
+            actions = np.repeat(episode.action[np.newaxis], _COPIES, axis=0)
+            observations, _, terminated, truncated, infos = copied.step(actions)
+            goes_on = np.flatnonzero(~(terminated | truncated))
+            episode.have_ended = not len(goes_on)
+            if episode.have_ended:
+                return
+            for name, values in costs_in(infos, (_COPIES,)).items():
+                paid = float(values[episode.best])
+                episode.costs[name] = episode.costs.get(name, 0.0) + paid
+            sources = np.where(terminated | truncated, goes_on[0], np.arange(_COPIES))
+            episode.snapshot = copied.save_state()[sources]
+        episode.seen = np.asarray(observations, np.float64)[sources]
+        off = (row - episode.seen) * self._foresight.is_present
+        episode.errors = _LASTING * episode.errors[sources] + off**2
+        episode.offsets = episode.offsets[sources]
 
     def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
         """How offsets of the outputs follow from differences of observations."""
         copied = self._envs[0]
-        action = self._actions(np.full((1, self._size), 0.5))
+        action = self._actions(np.full((1, *self._shape_of_plan), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
         columns = []
@@ -258,145 +318,170 @@ class MPC(Controller):
         if self.states:
             return self._moved(episode, row), {}, {"seed": self.seed}
         assert self._inverse is not None
-        wanted = self._inverse @ (row - episode.seen)
+        wanted = (row - episode.seen) @ self._inverse.T
         episode.offsets += self.correction * (wanted - episode.offsets)
-        names = list(self._envs[0].inside.prototype.out)
-        assumed = {
-            "offsets": dict(zip(names, episode.offsets.tolist(), strict=True)),
-            "seed": self.seed,
-        }
-        return episode.snapshot, self._foresight.ahead([*episode.rows, row], now), assumed
+        offsets = episode.offsets[episode.best].tolist()
+        names = list(self._prototype.out)
+        assumed = {"offsets": dict(zip(names, offsets, strict=True)), "seed": self.seed}
+        data = self._foresight.ahead(episode.told, episode.steps, now)
+        return episode.snapshot[episode.best], data, assumed
 
     def _moved(self, episode: _Episode, row: FloatArray) -> Snapshot:
-        """Let the copy go on in the state that was observed."""
-        expected = episode.seen[self._places]
+        """Let the copies go on in the state that was observed."""
+        expected = episode.seen[:, self._places].mean(axis=0)  # their sensors are noisy, too
         values = expected + self.correction * (row[self._places] - expected)
-        values = row[self._places] if not episode.rows else values
+        values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
+        nominal = {n: float(v[0]) for n, v in _quantiles(self._prototype, self.seed).items()}
         copied = self._envs[0]
-        options = {"model_parameters": _nominal(copied.inside.prototype) | starts}
-        copied.reset(seed=self.seed, options=options)
-        episode.snapshot, episode.has_ended = copied.save_state(), False
-        return episode.snapshot
+        seed = self.seed + episode.steps
+        copied.reset(seed=seed, options={"model_parameters": nominal | starts})
+        episode.snapshot, episode.have_ended = copied.save_state(), False
+        return episode.snapshot[0]
 
     # The search for a plan.
 
+    @property
+    def _shape_of_plan(self) -> tuple[int, int]:
+        return len(self._move_of), self._low.size
+
     def _actions(self, plans: FloatArray) -> Any:
-        """The actions of plans of shape (n, moves * m), shape (n, steps, ...)."""
-        moves = np.clip(plans, 0.0, 1.0).reshape(len(plans), -1, self._low.size)
-        values = self._low + moves[:, self._move_of] * (self._high - self._low)
+        """The actions of plans of shape (n, steps, m), shape (n, steps, ...)."""
+        values = self._low + plans * (self._high - self._low)
         if isinstance(self.space, spaces.Discrete):
             return np.rint(values[..., 0]).astype(self.space.dtype)
         return values.reshape(*values.shape[:2], *self.space.shape or ()).astype(self.space.dtype)
-
-    def _plan_of(self, actions: FloatArray) -> FloatArray:
-        """The plan whose moves are the means of actions of shape (steps, m)."""
-        parts = (actions.reshape(len(actions), -1) - self._low) / (self._high - self._low)
-        each = range(self._count_of_moves)
-        moves = np.array([parts[self._move_of == move].mean(axis=0) for move in each])
-        plan: FloatArray = np.clip(moves, 0.0, 1.0).ravel()
-        return plan
 
     def _search(
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
     ) -> FloatArray:
         """The best plan of all that play."""
-        one, many = self._envs
-        plans = [self._shifted(episode.plan)]
-        if episode.warm is not None:
-            plans.append(self._plan_of(self._warm_actions(episode.warm, row, start, assumed)))
-        allowed = self._allowed(episode)
-        found = [self._value(one, start, plan[np.newaxis], assumed, allowed) for plan in plans]
-        best, most = plans[int(np.argmax(found))], float(max(found)[0])
-        rng = np.random.default_rng([self.seed, len(episode.rows)])
-        cma = CMA(best, _SIGMA, many.num_envs, rng, np.ones(best.size), largest_sigma=_SIGMA)
+        beside, many = self._envs
+        value = partial(self._value, start, assumed, self._allowed(episode))
+        plans = self._first_plans(episode, start, assumed, row)
+        values = value(beside, plans)
+        best = base = plans[values.argmax()]
+        most, cma = values.max(), episode.cma
+        cma.mean = np.zeros_like(cma.mean)
         for _ in range(self.rounds):
-            tried = np.clip(cma.ask(), 0.0, 1.0)
-            values = self._value(many, start, tried, assumed, allowed)
-            cma.tell(np.argsort(-values, kind="stable"))
-            leader = int(values.argmax())
-            if values[leader] > most:
-                best, most = tried[leader], float(values[leader])
-        mean = np.clip(cma.mean, 0.0, 1.0)
-        value = self._value(one, start, mean[np.newaxis], assumed, allowed)[0]
-        return mean if value > most else best
+            cma.sigma = max(cma.sigma, _LEAST_SIGMA)
+            near = self._moved_by(base, cma.ask())
+            pulses = self._pulses(episode.rng, many.num_envs - len(near))
+            plans = np.concatenate([near, self._moved_by(best, pulses)])
+            values = value(many, plans)
+            cma.tell(np.argsort(-values[: len(near)], kind="stable"))
+            if values.max() > most:
+                best, most = plans[values.argmax()], values.max()
+        mean = self._moved_by(base, cma.mean[np.newaxis])
+        chosen: FloatArray = mean[0] if value(beside, mean)[0] > most else best
+        return chosen
+
+    def _pulses(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Changes of one number of the action in some moves in a row, shape (n, moves * m)."""
+        begins, lengths = rng.integers(self._moves, size=count), rng.integers(1, 5, count)
+        since = np.arange(self._moves)[:, np.newaxis] - begins
+        heights = rng.uniform(-1.0, 1.0, count) * ((since >= 0) & (since < lengths))
+        pulses = np.zeros((count, self._moves, self._low.size))
+        pulses[np.arange(count), :, rng.integers(self._low.size, size=count)] = heights.T
+        return pulses.reshape(count, -1)
+
+    def _moved_by(self, plan: FloatArray, moves: FloatArray) -> FloatArray:
+        """A plan with other moves, which have shape (n, moves * m)."""
+        changes = moves.reshape(len(moves), -1, self._low.size)[:, self._move_of]
+        return np.clip(plan + changes, 0.0, 1.0)
 
     def _value(
         self,
-        envs: FMUVectorEnv,
         start: Snapshot,
-        plans: FloatArray,
         assumed: Mapping[str, Any],
-        allowed: Mapping[str, float],
+        limits: Mapping[str, float],
+        envs: FMUVectorEnv,
+        plans: FloatArray,
     ) -> FloatArray:
         """The returns of plans; whatever goes beyond the limit of a cost counts far more."""
         found = envs.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
-        for name, paid in found.costs.items():
-            if name in allowed:
-                excess = np.maximum(paid.sum(axis=1) - allowed[name], 0.0)
+        for name, limit in limits.items():
+            if name in found.costs:
+                excess = np.maximum(found.costs[name].sum(axis=1) - limit, 0.0)
                 values = values - _PENALTY * excess
         return values
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
         """What costs may add up to until the horizon, from what the episode has left of them."""
-        steps = len(self._move_of)
-        left = (
-            max(1, self._step_limit - len(episode.rows))
-            if self._step_limit < sys.maxsize
-            else steps
-        )
+        steps, limit = len(self._move_of), self._prototype.inside.step_limit
+        left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
-            name: max(0.0, limit - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
-            for name, limit in self._cost_limits.items()
+            name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
+            for name, most in self._cost_limits.items()
         }
 
-    def _shifted(self, plan: FloatArray) -> FloatArray:
-        """A plan, one step later."""
-        actions = self._actions(plan[np.newaxis])[0].astype(np.float64)
-        return self._plan_of(np.append(actions[1:], actions[-1:], axis=0))
-
-    def _warm_actions(
-        self, warm: Controller, row: FloatArray, start: Snapshot, assumed: Mapping[str, Any]
+    def _first_plans(
+        self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
     ) -> FloatArray:
-        """The actions of another controller until the horizon."""
-        ahead, actions = copy.deepcopy(warm), list[Any]()
-        warm.act(row[np.newaxis])
+        """The plan of the step before, and those of the simple controllers."""
+        shifted = np.append(episode.plan[1:], episode.plan[-1:], axis=0)
+        if not episode.warm:
+            return shifted[np.newaxis]
+        ahead, actions = copy.deepcopy(episode.warm), list[Any]()
+        for controller in episode.warm:
+            controller.act(np.tile(row, (_COPIES, 1)))
 
         def policy(observations: Any) -> Any:
-            actions.append(ahead.act(observations))
+            chosen = np.array([one.act(observations) for one in ahead])
+            turn = np.arange(_COPIES) % len(ahead)
+            actions.append(chosen[turn, np.arange(_COPIES)])
             return actions[-1]
 
         self._envs[0].rollout(start, policy, horizon=len(self._move_of), **assumed)
-        return np.array(actions, np.float64)[:, 0]
+        chosen = np.array(actions, np.float64).reshape(*self._shape_of_plan[:1], _COPIES, -1)
+        plans = (chosen - self._low) / (self._high - self._low)
+        return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
 
 class _Episode:
     """What is known of the episode of one environment.
 
     Attributes:
-        snapshot: Where the copy is.
-        seen: What the copy observes, shape (k,).
-        has_ended: Whether the episode of the copy has ended; the last snapshot stays.
-        offsets: What is added to its outputs.
-        plan: The latest plan, flat, from 0 to 1.
-        action: The latest action, as the copy takes it.
-        rows: All observations.
-        costs: What the costs of the copy add up to, by name.
-        warm: The other controller, as if it had seen the same.
+        snapshot: Where the copies are.
+        seen: What they observe, shape (9, k).
+        errors: The sums of squared differences from what was observed, shape (9, k).
+        offsets: What is added to the outputs of each, shape (9, o).
+        have_ended: Whether their episodes have ended; the last snapshot stays.
+        plan: The latest plan, from 0 to 1, shape (steps, m).
+        action: The latest action, as the copies take it.
+        row: The latest observation.
+        steps: How many there were before.
+        told: The latest forecast of data for each step, by name.
+        cma: Finds moves.
+        rng: Draws candidates.
+        costs: What the costs of the best copy add up to, by name.
+        warm: The simple controllers, as if they had seen the same.
     """
 
     snapshot: Snapshot
     seen: FloatArray
+    errors: FloatArray
     offsets: FloatArray
     plan: FloatArray
     action: Any
-    warm: Controller | None
+    row: FloatArray
+    warm: list[Controller]
+    cma: CMA
+    rng: np.random.Generator
 
     def __init__(self) -> None:
-        self.rows: list[FloatArray] = []
+        self.told: dict[str, dict[int, float]] = {}
         self.costs: dict[str, float] = {}
-        self.has_ended = False
+        self.have_ended = False
+        self.steps = 0
+
+    @property
+    def best(self) -> int:
+        """The copy that fits best; each observation counts by what copies differ in it."""
+        totals = self.errors.sum(axis=0)
+        parts = self.errors / np.where(totals > 0.0, totals, 1.0)
+        return int(parts.sum(axis=1).argmin())
 
 
 class _Foresight:
@@ -421,56 +506,66 @@ class _Foresight:
     ) -> None:
         self._lookups, self._time_step, self._steps = future.lookups, time_step, steps
         self.is_present = np.array(["[" not in name for name in names])
-        self._known: dict[str, list[tuple[float, int]]] = {name: [] for name in future.lookups}
+        self._known: dict[str, list[tuple[int, int]]] = {name: [] for name in future.lookups}
         self._means = {n: one.mean(future.held_out) for n, one in future.lookups.items()}
         for place, name in enumerate(names):
             match = _FORECAST.fullmatch(name)
             of, ahead = (match[1], float(match[2])) if match else (name, 0.0)
             if of in self._known:
-                self._known[of].append((ahead, place))
+                self._known[of].append((round(ahead / time_step), place))
+                self._known[of].sort()
 
-    def ahead(self, rows: Sequence[FloatArray], now: float) -> dict[str, Any]:
+    def note(self, told: dict[str, dict[int, float]], row: FloatArray, step: int) -> None:
+        """Keep what is observed and forecast.
+
+        Args:
+            told: The latest value of each step by name.
+            row: The observation.
+            step: Its number.
+        """
+        for name, known in self._known.items():
+            values = told.setdefault(name, {})
+            values |= {step + ahead: float(row[place]) for ahead, place in known}
+
+    def ahead(
+        self, told: Mapping[str, Mapping[int, float]], step: int, now: float
+    ) -> dict[str, Any]:
         """Times and values from now on, by name.
 
         Args:
-            rows: The observations until now.
+            told: The latest value of each step by name.
+            step: The number of the present one.
             now: The time of the data.
         """
-        return {name: self._course(name, rows, now) for name in self._lookups}
+        return {name: self._course(name, told[name], step, now) for name in self._lookups}
 
-    def _course(self, name: str, rows: Sequence[FloatArray], now: float) -> tuple[Any, Any]:
-        lookup, known = self._lookups[name], sorted(self._known[name])
+    def _course(
+        self, name: str, told: Mapping[int, float], step: int, now: float
+    ) -> tuple[Any, Any]:
+        lookup, known = self._lookups[name], self._known[name]
         if not known:
             return [now], [self._means[name]]
         count = min(self._steps + 2, int(np.ceil(lookup.period / self._time_step)))
-        times = np.arange(count) * self._time_step
-        aheads = np.array([ahead for ahead, _ in known])
-        values = rows[-1][[place for _, place in known]]
+        aheads, places = np.array([ahead for ahead, _ in known]), np.arange(count)
+        values = np.array([told[step + ahead] for ahead in aheads.tolist()])
         if lookup.is_stepped:
-            places = np.searchsorted(aheads, times + 1e-6 * self._time_step, side="right") - 1
-            course = values[np.maximum(places, 0)]
+            course = values[np.maximum(np.searchsorted(aheads, places, side="right") - 1, 0)]
         else:
-            course = np.interp(times, aheads, values)
-        self._repeat_days(course, rows, known, float(aheads[-1]))
-        return now + times, course
-
-    def _repeat_days(
-        self, course: FloatArray, rows: Sequence[FloatArray], known: Any, last: float
-    ) -> None:
-        """Replace values beyond a forecast by those of a day before, if these are known."""
-        day, (ahead, place) = round(_DAY / self._time_step), known[0]
-        for step in range(int(last / self._time_step) + 1, len(course)):
-            before = step - day
-            if before >= 0:
-                course[step] = course[before]
-            elif ahead == 0.0 and len(rows) - 1 + before >= 0:
-                course[step] = rows[len(rows) - 1 + before][place]
+            course = np.interp(places, aheads, values)
+        day = round(_DAY / self._time_step)
+        for place in range(count):
+            if step + place in told:
+                course[place] = told[step + place]
+            elif place > aheads[-1]:
+                before = course[place - day] if place >= day else course[place]
+                course[place] = told.get(step + place - day, before)
+        return now + places * self._time_step, course
 
     def observed(self, before: FloatArray, row: FloatArray, now: float) -> dict[str, Any]:
         """Times and values of the step that has just ended, by name."""
         found = {}
         for name in self._lookups:
-            places = [place for ahead, place in self._known[name] if ahead == 0.0]
+            places = [place for ahead, place in self._known[name] if ahead == 0]
             values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
@@ -514,10 +609,16 @@ def _single(env: Any, index: int) -> Iterator[FMUEnv]:
         yield one
 
 
-def _nominal(env: FMUEnv) -> dict[str, float]:
-    """The nominal values of parameters that are drawn, by name."""
-    parameters = env.config.model_parameters.items()
-    return {name: _median(value) for name, value in parameters if is_distribution(value)}
+def _quantiles(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
+    """Values of the parameters that are drawn, by name, one for each copy; medians come first."""
+    rng, found = np.random.default_rng(seed), {}
+    others = np.delete(np.arange(_COPIES), _COPIES // 2)
+    for name, value in env.config.model_parameters.items():
+        if is_distribution(value):
+            drawn = [value.sample(rng) for _ in range(_SAMPLES)]
+            each = np.quantile(drawn, (np.arange(_COPIES) + 0.5) / _COPIES)
+            found[name] = each[[_COPIES // 2, *rng.permutation(others)]]
+    return found
 
 
 def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:
@@ -527,8 +628,3 @@ def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:
     if any(len(pair) != 2 for pair in pairs):
         raise ConfigError(f"states must be as in 'theta:theta_0,w:w_0', got {shown(states)}")
     return dict(pairs)
-
-
-def _median(distribution: Any) -> float:
-    rng = np.random.default_rng(0)
-    return float(np.median([distribution.sample(rng) for _ in range(_SAMPLES)]))

@@ -19,7 +19,15 @@ from fmugym.baselines.mpc import MPC
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Search", "controller_of", "has_range", "plans_ahead", "search_of"]
+__all__ = [
+    "Search",
+    "controller_of",
+    "has_range",
+    "plans_ahead",
+    "search_of",
+    "simple_controllers",
+    "warmed",
+]
 
 _KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "mpc": MPC, "pid": PID}
 
@@ -99,6 +107,16 @@ class Search:
         """Make the controller with some numbers, which are rounded as in ``text``."""
         return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
 
+    def middle(self) -> Controller:
+        """Make the controller with the middle of each range."""
+        middles = {
+            name: math.sqrt(one.low * one.high)
+            if isinstance(one, LogUniform)
+            else (one.low + one.high) / 2
+            for name, one in self.ranges.items()
+        }
+        return self.make(**middles)
+
     def text(self, numbers: Mapping[str, float]) -> str:
         """The controller with some numbers, as ``controller_of`` reads it."""
         found = self.numbers(numbers)
@@ -160,6 +178,18 @@ def search_of(text: str) -> Search:
 def plans_ahead(text: Any) -> bool:
     """Whether a text names a controller that plans with copies, and so takes its time."""
     return isinstance(text, str) and text.split()[:1] == ["mpc"]
+
+
+def simple_controllers(texts: Mapping[str, Any]) -> list[Controller]:
+    """The controllers of a task file that do not plan; ranges in them have their middle."""
+    given = [one for one in texts.values() if isinstance(one, str) and not plans_ahead(one)]
+    return [search_of(one).middle() if has_range(one) else controller_of(one) for one in given]
+
+
+def warmed(text: str, warm: str | None) -> str:
+    """A controller that plans ahead, and begins with the plan of another one if it names none."""
+    _, arguments = _parts(text)
+    return text if warm is None or "warm" in arguments else f"{text} {shlex.quote(f'warm={warm}')}"
 
 
 def has_range(text: Any) -> bool:
