@@ -156,7 +156,6 @@ SLOW_TESTS = (
     "test_cli_signals.py::TestEnd::test_while",
     "test_cloud_pendulum.py::TestExits",
     "test_declared.py::test_spawned",
-    "test_examples_mpc.py::test_a_cell",
     "test_examples_mpc.py::test_it_swings",
     "test_examples_mpc.py::test_the_program_draws",
     "test_executable.py::TestMissingLibraries::test_beside",
