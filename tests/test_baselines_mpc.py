@@ -110,8 +110,10 @@ class TestPlans:
         controller = bound(moves=3)
         controller.bind(opened(wheel()))
         plan = np.linspace(0.4, 0.6, 10)[:, None]
-        moved = controller._moved_by(plan, np.array([[0.0, 0.1, 0.5]]))[0] - plan
-        assert moved[:, 0] == pytest.approx([0.0] * 4 + [0.1] * 4 + [1 - plan[8, 0]] * 2, abs=0.06)
+        moves = np.array([[0.0, 0.1, 0.5, -0.1]])
+        at_first, later = (controller._moved_by(step, plan, moves)[0] - plan for step in (0, 5))
+        assert at_first[:, 0] == pytest.approx([0.0] * 4 + [0.1] * 4 + [0.5] * 2, abs=0.1)
+        assert later[:, 0] == pytest.approx([0.0] * 3 + [0.1] * 4 + [0.5] * 3, abs=0.11)
 
     def test_go_on_with_that_of_the_step_before(self, opened, bound):
         """A search that finds nothing keeps what it had, step by step."""

@@ -56,8 +56,9 @@ class MPC(Controller):
     and the first action of the best one is taken. The reward is that of the task, and plans that
     keep the limits of costs come first. The search begins with the better of the plan of the step
     before and what simple controllers would do. Candidates differ from that by a few moves, each of
-    which holds for the same number of steps. Half of them come from the adaptation of a covariance
-    matrix (``fmugym.baselines.cma``), the others change the best plan in some moves in a row.
+    which holds for the same number of steps and keeps its time. Most of them come from the
+    adaptation of a covariance matrix (``fmugym.baselines.cma``), the others change the best plan in
+    some moves in a row.
 
     The controller sees what an agent sees. Nine copies get the same actions as the environment.
     They differ in the parameters that the task draws, and the one whose observations fit best is
@@ -94,7 +95,7 @@ class MPC(Controller):
         horizon: Any,
         moves: float = 24,
         candidates: float = 256,
-        rounds: float = 8,
+        rounds: float = 4,
         warm: Controller | None = None,
         correction: float = 0.3,
         budget: float | None = 1.0,
@@ -143,8 +144,8 @@ class MPC(Controller):
                 f"the horizon of {self.horizon:g} s is shorter than the step of "
                 f"{self.time_step:g} s"
             )
-        self._move_of = np.arange(steps) // -(-steps // self.moves)
-        self._moves = int(self._move_of[-1]) + 1
+        self._hold = -(-steps // self.moves)
+        self._shape = steps, self._low.size
         make = self._model_of()
         for count in (_COPIES, self.candidates // self.rounds):
             self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
@@ -260,10 +261,10 @@ class MPC(Controller):
         episode.seen = np.asarray(observations, np.float64)
         episode.errors = np.zeros(episode.seen.shape)
         episode.snapshot = copied.save_state()
-        episode.plan = np.full(self._shape_of_plan, 0.5)
+        episode.plan = np.full(self._shape, 0.5)
         episode.rng = np.random.default_rng(self.seed)
-        size = self._moves * self._low.size
-        form = np.zeros(size), _SIGMA, self._envs[1].num_envs // 2, episode.rng, np.ones(size)
+        size = (-(-(self._shape[0] - 1) // self._hold) + 1) * self._low.size
+        form = np.zeros(size), _SIGMA, self._envs[1].num_envs * 3 // 4, episode.rng, np.ones(size)
         episode.cma = CMA(*form, largest_sigma=_SIGMA)
         episode.warm = copy.deepcopy(self._warm)
         if self._inverse is None:
@@ -298,7 +299,7 @@ class MPC(Controller):
     def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
         """How offsets of the outputs follow from differences of observations."""
         copied = self._envs[0]
-        action = self._actions(np.full((1, *self._shape_of_plan), 0.5))
+        action = self._actions(np.full((1, *self._shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
         columns = []
@@ -341,10 +342,6 @@ class MPC(Controller):
 
     # The search for a plan.
 
-    @property
-    def _shape_of_plan(self) -> tuple[int, int]:
-        return len(self._move_of), self._low.size
-
     def _actions(self, plans: FloatArray) -> Any:
         """The actions of plans of shape (n, steps, m), shape (n, steps, ...)."""
         values = self._low + plans * (self._high - self._low)
@@ -358,6 +355,7 @@ class MPC(Controller):
         """The best plan of all that play."""
         beside, many = self._envs
         value = partial(self._value, start, assumed, self._allowed(episode))
+        moved = partial(self._moved_by, episode.steps)
         plans = self._first_plans(episode, start, assumed, row)
         values = value(beside, plans)
         best = base = plans[values.argmax()]
@@ -365,29 +363,31 @@ class MPC(Controller):
         cma.mean = np.zeros_like(cma.mean)
         for _ in range(self.rounds):
             cma.sigma = max(cma.sigma, _LEAST_SIGMA)
-            near = self._moved_by(base, cma.ask())
-            pulses = self._pulses(episode.rng, many.num_envs - len(near))
-            plans = np.concatenate([near, self._moved_by(best, pulses)])
+            near = cma.ask()
+            pulses = self._pulses(episode.rng, many.num_envs - len(near), cma.mean.size)
+            plans = np.concatenate([moved(base, near), moved(best, pulses)])
             values = value(many, plans)
             cma.tell(np.argsort(-values[: len(near)], kind="stable"))
             if values.max() > most:
                 best, most = plans[values.argmax()], values.max()
-        mean = self._moved_by(base, cma.mean[np.newaxis])
+        mean = moved(base, cma.mean[np.newaxis])
         chosen: FloatArray = mean[0] if value(beside, mean)[0] > most else best
         return chosen
 
-    def _pulses(self, rng: np.random.Generator, count: int) -> FloatArray:
+    def _pulses(self, rng: np.random.Generator, count: int, size: int) -> FloatArray:
         """Changes of one number of the action in some moves in a row, shape (n, moves * m)."""
-        begins, lengths = rng.integers(self._moves, size=count), rng.integers(1, 5, count)
-        since = np.arange(self._moves)[:, np.newaxis] - begins
-        heights = rng.uniform(-1.0, 1.0, count) * ((since >= 0) & (since < lengths))
-        pulses = np.zeros((count, self._moves, self._low.size))
-        pulses[np.arange(count), :, rng.integers(self._low.size, size=count)] = heights.T
-        return pulses.reshape(count, -1)
+        width = self._low.size
+        moves = np.arange(size // width)[:, np.newaxis]
+        since = moves - rng.integers(len(moves), size=count)
+        heights = rng.uniform(-1.0, 1.0, count) * (since >= 0) * (since < rng.integers(1, 5, count))
+        pulses = np.zeros((count, len(moves), width))
+        pulses[np.arange(count), :, rng.integers(width, size=count)] = heights.T
+        return pulses.reshape(count, size)
 
-    def _moved_by(self, plan: FloatArray, moves: FloatArray) -> FloatArray:
-        """A plan with other moves, which have shape (n, moves * m)."""
-        changes = moves.reshape(len(moves), -1, self._low.size)[:, self._move_of]
+    def _moved_by(self, step: int, plan: FloatArray, moves: FloatArray) -> FloatArray:
+        """A plan with other moves, which have shape (n, moves * m); they keep their time."""
+        move_of = (np.arange(len(plan)) + step % self._hold) // self._hold
+        changes = moves.reshape(len(moves), -1, self._low.size)[:, move_of]
         return np.clip(plan + changes, 0.0, 1.0)
 
     def _value(
@@ -409,7 +409,7 @@ class MPC(Controller):
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
         """What costs may add up to until the horizon, from what the episode has left of them."""
-        steps, limit = len(self._move_of), self._prototype.inside.step_limit
+        steps, limit = self._shape[0], self._prototype.inside.step_limit
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
             name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
@@ -433,8 +433,8 @@ class MPC(Controller):
             actions.append(chosen[turn, np.arange(_COPIES)])
             return actions[-1]
 
-        self._envs[0].rollout(start, policy, horizon=len(self._move_of), **assumed)
-        chosen = np.array(actions, np.float64).reshape(*self._shape_of_plan[:1], _COPIES, -1)
+        self._envs[0].rollout(start, policy, horizon=self._shape[0], **assumed)
+        chosen = np.array(actions, np.float64).reshape(*self._shape[:1], _COPIES, -1)
         plans = (chosen - self._low) / (self._high - self._low)
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
