@@ -194,11 +194,10 @@ class MPC(Controller):
 
     def _bound_warm(self) -> list[Controller]:
         """The simple controllers, bound to the copies."""
-        from fmugym.baselines.parsing import simple_controllers
-
-        task = getattr(self._prototype, "task", None)
-        declared = {} if task is None else task.document.get("controllers", {})
-        found = simple_controllers(declared) if self.warm is None else [self.warm]
+        declared = self._prototype.inside.controllers
+        found = [] if self.warm is None else [self.warm]
+        if self.warm is None and declared is not None:
+            found = declared()
         return [one.bind(self._envs[0], self.names) for one in found]
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:

@@ -114,6 +114,12 @@ class ResolvedTask:
         held_out = held_out_times((self._task.outside or self._task).root)
         return Future(lookups, keys, clock, tuple((one.start, one.length) for one in held_out))
 
+    def controllers(self) -> list[Any]:
+        """Make the controllers that the task declares and that do not plan ahead."""
+        from fmugym.baselines.parsing import simple_controllers
+
+        return [*simple_controllers(self._root.child("controllers").value or {})]
+
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
         found = named_values(self._declared, self._naming)
