@@ -117,7 +117,7 @@ class TestPlans:
 
     def test_go_on_with_that_of_the_step_before(self, opened, bound):
         """A search that finds nothing keeps what it had, step by step."""
-        controller = bound(candidates=8, rounds=1)
+        controller = bound(candidates=8, rounds=2)
         env = opened(wheel())
         play(env, controller, 1)
         episode = controller._episodes[0]

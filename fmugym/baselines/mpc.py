@@ -58,7 +58,8 @@ class MPC(Controller):
     before and what simple controllers would do. Candidates differ from that by a few moves, each of
     which holds for the same number of steps and keeps its time. Most of them come from the
     adaptation of a covariance matrix (``fmugym.baselines.cma``), the others change the best plan in
-    some moves in a row.
+    some moves in a row. Those of the last round change the first moves only, since the next action
+    cannot be mended later.
 
     The controller sees what an agent sees. Nine copies get the same actions as the environment.
     They differ in the parameters that the task draws, and the one whose observations fit best is
@@ -105,7 +106,7 @@ class MPC(Controller):
         model: Callable[[], Any] | None = None,
     ) -> None:
         self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
-        self.moves, self.rounds = _whole("moves", moves, 1), _whole("rounds", rounds, 1)
+        self.moves, self.rounds = _whole("moves", moves, 1), _whole("rounds", rounds, 2)
         self.candidates = _whole("candidates", candidates, 4 * self.rounds)
         self.warm = warm
         self.correction = check_number("correction", correction, 0.0, 1.0)
@@ -145,7 +146,7 @@ class MPC(Controller):
                 f"{self.time_step:g} s"
             )
         self._hold = -(-steps // self.moves)
-        self._shape = steps, self._low.size
+        self._plan_shape = steps, self._low.size
         make = self._model_of()
         for count in (_COPIES, self.candidates // self.rounds):
             self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
@@ -260,9 +261,9 @@ class MPC(Controller):
         episode.seen = np.asarray(observations, np.float64)
         episode.errors = np.zeros(episode.seen.shape)
         episode.snapshot = copied.save_state()
-        episode.plan = np.full(self._shape, 0.5)
+        episode.plan = np.full(self._plan_shape, 0.5)
         episode.rng = np.random.default_rng(self.seed)
-        size = (-(-(self._shape[0] - 1) // self._hold) + 1) * self._low.size
+        size = (-(-(self._plan_shape[0] - 1) // self._hold) + 1) * self._low.size
         form = np.zeros(size), _SIGMA, self._envs[1].num_envs * 3 // 4, episode.rng, np.ones(size)
         episode.cma = CMA(*form, largest_sigma=_SIGMA)
         episode.warm = copy.deepcopy(self._warm)
@@ -298,7 +299,7 @@ class MPC(Controller):
     def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
         """How offsets of the outputs follow from differences of observations."""
         copied = self._envs[0]
-        action = self._actions(np.full((1, *self._shape), 0.5))
+        action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
         columns = []
@@ -360,25 +361,35 @@ class MPC(Controller):
         best = base = plans[values.argmax()]
         most, cma = values.max(), episode.cma
         cma.mean = np.zeros_like(cma.mean)
-        for _ in range(self.rounds):
+        for _ in range(self.rounds - 1):
             cma.sigma = max(cma.sigma, _LEAST_SIGMA)
             near = cma.ask()
-            pulses = self._pulses(episode.rng, many.num_envs - len(near), cma.mean.size)
+            pulses = self._pulses(episode, many.num_envs - len(near))
             plans = np.concatenate([moved(base, near), moved(best, pulses)])
             values = value(many, plans)
             cma.tell(np.argsort(-values[: len(near)], kind="stable"))
             if values.max() > most:
                 best, most = plans[values.argmax()], values.max()
-        mean = moved(base, cma.mean[np.newaxis])
-        chosen: FloatArray = mean[0] if value(beside, mean)[0] > most else best
+        plans = np.concatenate([best[np.newaxis], moved(base, cma.mean[np.newaxis])])
+        best = plans[value(beside, plans).argmax()]
+        last = moved(best, self._pulses(episode, many.num_envs, begin=0.0))
+        last[0] = best
+        chosen: FloatArray = last[value(many, last).argmax()]
         return chosen
 
-    def _pulses(self, rng: np.random.Generator, count: int, size: int) -> FloatArray:
-        """Changes of one number of the action in some moves in a row, shape (n, moves * m)."""
-        width = self._low.size
+    def _pulses(self, episode: _Episode, count: int, begin: float = 1.0) -> FloatArray:
+        """Changes of one number of the action in some moves in a row, shape (n, moves * m).
+
+        Args:
+            episode: Has what draws them.
+            count: The number n.
+            begin: How far away they may begin, as a part of the plan; most of them begin early.
+        """
+        rng, size, width = episode.rng, episode.cma.mean.size, self._low.size
         moves = np.arange(size // width)[:, np.newaxis]
-        since = moves - rng.integers(len(moves), size=count)
-        heights = rng.uniform(-1.0, 1.0, count) * (since >= 0) * (since < rng.integers(1, 5, count))
+        since = moves - np.floor(begin * len(moves) * rng.uniform(size=count) ** 2)
+        heights = rng.uniform(-1.0, 1.0, count) * 10.0 ** -rng.uniform(0.0, 1.5, count)
+        heights = heights * (since >= 0) * (since < rng.integers(1, 5, count))
         pulses = np.zeros((count, len(moves), width))
         pulses[np.arange(count), :, rng.integers(width, size=count)] = heights.T
         return pulses.reshape(count, size)
@@ -408,7 +419,7 @@ class MPC(Controller):
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
         """What costs may add up to until the horizon, from what the episode has left of them."""
-        steps, limit = self._shape[0], self._prototype.inside.step_limit
+        steps, limit = self._plan_shape[0], self._prototype.inside.step_limit
         left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
         return {
             name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
@@ -432,8 +443,8 @@ class MPC(Controller):
             actions.append(chosen[turn, np.arange(_COPIES)])
             return actions[-1]
 
-        self._envs[0].rollout(start, policy, horizon=self._shape[0], **assumed)
-        chosen = np.array(actions, np.float64).reshape(*self._shape[:1], _COPIES, -1)
+        self._envs[0].rollout(start, policy, horizon=self._plan_shape[0], **assumed)
+        chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], _COPIES, -1)
         plans = (chosen - self._low) / (self._high - self._low)
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
