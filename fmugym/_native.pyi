@@ -5,7 +5,7 @@ int8 for statuses. Those that are only read may have any strides.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, ParamSpec, TypedDict, TypeVar, final
+from typing import Any, Final, ParamSpec, TypeVar, final
 
 import numpy.typing as npt
 
@@ -80,13 +80,6 @@ def statistics() -> dict[str, int]:
 def initializations() -> int:
     """How many initializations the pools of this process have begun."""
 
-def echo_to(memory: Array, /) -> None:
-    """Write what FMUs say to memory as well, before they go on.
-
-    Args:
-        memory: Bytes that stay in use from now on; the latest lines, a text that ends with 0.
-    """
-
 def text_with(number: float, /) -> str | None:
     """The text that an FMU in this process has given and that has this number; see ``texts.h``."""
 
@@ -145,13 +138,6 @@ class Draws:
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""
 
-class Episodes(TypedDict):
-    """See ``NativePool.prepare_play``."""
-
-    step_counts: Array
-    ended: Array
-    limit: int
-
 @final
 class Pool:
     """N instances of one FMU.
@@ -200,21 +186,20 @@ class Pool:
     def prepare_play(
         self,
         *,
+        form: bytes,
+        rows: tuple[Array, ...],
         start: Access,
         start_values: Array,
-        inputs: Program,
-        judgement: Program,
-        actions: dict[str, Any],
+        shape: tuple[int, ...],
+        letter: str,
+        current: Array | None,
+        previous: Array | None,
         draws: Draws,
         states: Array,
-        episodes: Episodes,
+        step_counts: Array,
+        ended: Array,
         kept: Array,
         done: Array | None,
-        reads_kept: bool,
-        copies: tuple[tuple[Array, Array], ...],
-        variable_starts: tuple[tuple[Array, bytes], ...],
-        drawn_variables: tuple[tuple[Array, int], ...],
-        input_starts: tuple[tuple[int, float], ...],
         results: tuple[Any, ...] | None,
     ) -> None:
         """Take over what surrounds the steps of a vector environment; see ``NativePool``."""
@@ -261,36 +246,22 @@ class Pool:
             ValueError: If the snapshot is another pool's, or an instance was replaced since.
         """
 
-    def read(self, variables: Access, values: Array, /) -> int:
-        """Read variables of all; returns the instance that refuses, or -1."""
-
-    def differentiate(
-        self, adjoint: bool, part: int, seeded: Access, others: Access, derivatives: Array, /
-    ) -> int:
-        """Differentiate variables of all by others, with the inputs set.
+    def ask(
+        self, request: int, content: bytes, states: Sequence[bytes] = ..., /
+    ) -> tuple[int, Any]:
+        """Ask for something else; see ``fmugym.pool.requests``.
 
         Args:
-            adjoint: Whether the others are what is differentiated by.
-            part: The FMU of a system that the variables are of; otherwise 0.
-            seeded: One after the other.
-            others: All at once.
-            derivatives: To be filled, shape (seeded * others, N).
+            request: What for.
+            content: The content of the request; without the states to restore.
+            states: These, if there are any.
 
         Returns:
-            The instance that refuses, or -1.
+            The code and the content of the answer; the states that were saved as a list.
+
+        Raises:
+            ValueError: If there is no such request.
         """
-
-    def failure(self, index: int, /) -> tuple[str, bool, int, float, int, str, bytes | None] | None:
-        """Tell what failed last.
-
-        Returns:
-            The call (a whole sentence where the status is -1), whether in the warm-up, the status,
-            the time of a step (else NaN), the String that could not be set (else 2**32 - 1), what
-            the FMU logged, and the inputs or outputs where these are the reason.
-        """
-
-    def count_steps(self) -> None:
-        """Let ``health`` have all steps until now, which it otherwise gets at resets."""
 
     def close(self) -> None:
         """Free all instances; more than one call is fine."""
@@ -306,28 +277,3 @@ class Pool:
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""
-
-    def write(self, access: Access, values: Array, /) -> int:
-        """Set variables of all instances between two steps.
-
-        Returns:
-            The index of an instance that failed, or -1.
-        """
-
-    def save_states(self, indices: Array, records: bool, /) -> list[bytes] | int:
-        """Save the states of M instances, or the records of their episodes.
-
-        Args:
-            indices: The instances, int64, shape (M,).
-            records: Whether to save records.
-
-        Returns:
-            The states, or the index of an instance that failed.
-        """
-
-    def restore_states(self, states: Sequence[bytes], indices: Array, /) -> int:
-        """Restore a state in each of M instances; see ``SavingPool.restore_states``.
-
-        Returns:
-            How many of the instances have a status worse than a warning.
-        """

@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import re
+import shutil
 import stat
 import sys
 import tempfile
@@ -12,11 +14,21 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
-from fmugym.signals import Ignoring
+from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["cache_folder", "is_own", "lasting_folder", "read_file", "replace_file"]
+__all__ = [
+    "cache_folder",
+    "is_own",
+    "lasting_folder",
+    "own_prefix",
+    "read_file",
+    "replace_file",
+    "sweep",
+]
 
 logger = logging.getLogger(__name__)
+
+_NAME: Final = re.compile(r"fmugym-(?P<pid>\d+)-(?P<namespace>\d+)-\w+")
 
 _OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
 
@@ -79,7 +91,8 @@ def replace_file(path: Path, content: bytes) -> None:
     Raises:
         OSError: If the system refuses.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent)
+    sweep(path.parent)
+    handle, name = tempfile.mkstemp(prefix=own_prefix(), dir=path.parent)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
@@ -88,6 +101,50 @@ def replace_file(path: Path, content: bytes) -> None:
         with Ignoring(OSError):
             os.unlink(name)
         raise
+
+
+def own_prefix() -> str:
+    """How the names of temporary files and folders of this process begin."""
+    return f"fmugym-{os.getpid()}-{_namespace()}-"
+
+
+@functools.cache
+def sweep(folder: Path) -> None:
+    """Remove from a folder what killed processes of this user have left; once in a process."""
+    for path in folder.glob("fmugym-*"):
+        name = _NAME.fullmatch(path.name)
+        if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
+            with Ignoring(OSError):  # another process has removed it
+                if is_own(path):
+                    _remove(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink()
+
+
+@functools.cache
+def _namespace() -> int:
+    """Identify the numbering of processes: containers that share a folder may number them alike."""
+    try:
+        return os.stat("/proc/self/ns/pid").st_ino
+    except ordinary(OSError):
+        return 0
+
+
+def _is_alive(pid: int) -> bool:
+    if sys.platform == "win32":  # asking would end the process there
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):  # the number may be anybody's invention
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def is_own(path: Path) -> bool:

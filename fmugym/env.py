@@ -6,6 +6,7 @@ import copy
 import logging
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
 from typing import Any, ClassVar, Final, Never
 
@@ -520,8 +521,9 @@ class FMUEnv(Constructed):
                 self.inside.renderer = None
         super().close()
 
-    def __reduce__(self) -> tuple[Callable[..., FMUEnv], tuple[Any, ...]]:
-        return _rebuild, (type(self), *self._constructor_arguments)
+    def __reduce__(self) -> tuple[Callable[[], FMUEnv], tuple[()]]:
+        args, kwargs = self._constructor_arguments
+        return partial(type(self), *args, **kwargs), ()
 
 
 class FMI1CSEnv(FMUEnv):
@@ -573,7 +575,3 @@ class FMI3MEEnv(FMUEnv):
 
     fmi_version = 3
     fmi_interface = "model_exchange"
-
-
-def _rebuild(cls: type[FMUEnv], args: tuple[Any, ...], kwargs: dict[str, Any]) -> FMUEnv:
-    return cls(*args, **kwargs)

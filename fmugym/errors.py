@@ -173,11 +173,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:
     Returns:
         The error. It suggests the nearest known name, or lists known names if none is near.
     """
-    names = _in_order(known)
-    near = nearest_name(name, names)
-    if near is not None:
-        return ConfigError(f"unknown {kind} {shown(name)}; did you mean {near!r}?")
-    return ConfigError(f"unknown {kind} {shown(name)}; known are: {_listing(names)}")
+    return ConfigError(f"unknown {kind} {shown(name)}; {_hint(name, known)}")
 
 
 def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentError:
@@ -188,15 +184,18 @@ def unknown_argument(owner: str, name: str, known: Iterable[str]) -> ArgumentErr
         name: The argument as it was given.
         known: All arguments that the class has.
     """
-    names = _in_order(known)
+    text = f"{owner} got an unexpected keyword argument {shown(name)}"
+    return ArgumentError(f"{text}; {_hint(name, known)}")
+
+
+def _hint(name: object, known: Iterable[str]) -> str:
+    """Suggest the nearest name, or else list the first of them; sets have no order of their own."""
+    names = sorted(known) if isinstance(known, set | frozenset) else list(dict.fromkeys(known))
     near = nearest_name(name, names)
-    hint = f"known are: {_listing(names)}" if near is None else f"did you mean {near!r}?"
-    return ArgumentError(f"{owner} got an unexpected keyword argument {shown(name)}; {hint}")
-
-
-def _in_order(names: Iterable[str]) -> list[str]:
-    """The names as a list; sets have another order in each process."""
-    return sorted(names) if isinstance(names, set | frozenset) else list(dict.fromkeys(names))
+    if near is not None:
+        return f"did you mean {near!r}?"
+    listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
+    return f"known are: {listing or 'none'}"
 
 
 def nearest_name(name: object, known: Sequence[str]) -> str | None:
@@ -208,8 +207,3 @@ def nearest_name(name: object, known: Sequence[str]) -> str | None:
     lower = {one.lower(): one for one in reversed(known)}
     near = difflib.get_close_matches(text[:_LONGEST].lower(), lower, n=1)
     return lower[near[0]] if near else None
-
-
-def _listing(names: list[str]) -> str:
-    """The first of the names, as text."""
-    return ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "") or "none"

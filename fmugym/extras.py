@@ -1,13 +1,18 @@
-"""Libraries that an extra installs and that are imported when they are used."""
+"""Libraries that an extra installs and that are imported when they are used; a compiler for C."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from importlib import import_module
-from typing import Any
+from importlib.util import find_spec
+from typing import Any, Final
 
 from fmugym.errors import ConfigError
 
-__all__ = ["imported", "installation", "lacking"]
+__all__ = ["c_compiler", "imported", "installation", "lacking"]
+
+_COMPILERS: Final = ("cc", "gcc", "clang")
 
 
 def installation(extra: str) -> str:
@@ -37,3 +42,23 @@ def imported(module: str, extra: str) -> Any:
     except ImportError as error:
         needed = error.name or module.removeprefix("fmugym.")
         raise ConfigError(lacking("this", needed.partition(".")[0], extra)) from error
+
+
+def c_compiler(what: str, target: str | None = None, *, is_own: bool = True) -> list[str]:
+    """The command of a compiler for C: that of this system, or ziglang.
+
+    Args:
+        what: What is to be built, for the error.
+        target: The target triple that ziglang builds for; None for this processor.
+        is_own: Whether it is for this platform, so that the compiler of the system serves.
+
+    Raises:
+        ConfigError: If there is none; the text says how to get one.
+    """
+    found = next(filter(None, map(shutil.which, _COMPILERS if is_own else ())), None)
+    if found is not None:
+        return [found]
+    if find_spec("ziglang") is None:
+        gcc = "gcc (Debian: apt install gcc), or " if is_own else ""
+        raise ConfigError(f"{what} needs a C compiler: install {gcc}ziglang (pip install ziglang)")
+    return [sys.executable, "-m", "ziglang", "cc", *(("-target", target) if target else ())]

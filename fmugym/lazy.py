@@ -1,4 +1,4 @@
-"""Names of packages that are imported when they are first used, and SciPy, which is optional."""
+"""Names of packages that are imported when they are first used."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from importlib import import_module
 from types import MappingProxyType
 from typing import Any
 
-__all__ = ["lazily", "scipy_module"]
+__all__ = ["lazily"]
 
 
 def lazily(
@@ -40,18 +40,3 @@ def lazily(
         return value
 
     return get
-
-
-def scipy_module(name: str) -> Any:
-    """Import a module of SciPy.
-
-    Raises:
-        ImportError: If SciPy is not installed; the text names the extra that installs it.
-    """
-    try:
-        return import_module(f"scipy.{name}")
-    except ImportError:
-        raise ImportError(
-            "this needs SciPy, which cannot be imported; install the extra 'identification'; in a "
-            "clone of fmugym: pip install '.[identification]'"
-        ) from None

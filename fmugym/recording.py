@@ -34,7 +34,7 @@ from fmugym.checks import check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.signals import ordinary
-from fmugym.task.generators import row_of, state_of
+from fmugym.task.saving import generator_of, row_of, state_of
 from fmugym.task.snapshot import require_scope, scope_of
 
 _multiarray_umath: Any = import_module("numpy._core._multiarray_umath")
@@ -166,25 +166,18 @@ def _facts(header: dict[str, Any]) -> dict[str, Any]:
     if header["version"] != _VERSION:
         raise ValueError("it is of another version of the format")
     stream, seed = tuple(map(int, header["stream"])), header["seed"]
-    _generator_of(stream)
+    generator_of(state_of(list(stream)))  # which refuses what is none
     json.loads(header["options"])
     return {
         **{name: header[name] for name in FACTS},
-        **{name: _texts(header[name]) for name in ("scope", "surroundings")},
+        **{
+            name: {key: str(text) for key, text in header[name].items()}
+            for name in ("scope", "surroundings")
+        },
         "seed": None if seed is None else int(seed),
         "stream": stream,
         "drawn": {name: float(value) for name, value in header["drawn"].items()},
     }
-
-
-def _generator_of(stream: tuple[int, ...]) -> np.random.Generator:
-    generator = np.random.Generator(np.random.PCG64())
-    generator.bit_generator.state = state_of(list(stream))
-    return generator
-
-
-def _texts(texts: Mapping[str, Any]) -> dict[str, str]:
-    return {name: str(text) for name, text in texts.items()}
 
 
 class Recorder(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -293,7 +286,7 @@ def replay(recording: Recording, env: gymnasium.Env[Any, Any]) -> Report:
     require_scope(recording.scope, scope_of(inner), "recording")
     then = recording.surroundings
     others = {n: (then.get(n, ""), now[n]) for n in now if then.get(n) != now[n]}
-    inner.np_random = _generator_of(recording.stream)
+    inner.np_random = generator_of(state_of(list(recording.stream)))
     observation, info = env.reset(options=json.loads(recording.options))
     drawn = {name: float(value) for name, value in info["drawn"].items()}
     found = _difference_of_starts(

@@ -8,8 +8,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +16,7 @@ from typing import Any, Final
 import gymnasium
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
-from fmugym.caching import lasting_folder
+from fmugym.caching import lasting_folder, replace_file
 from fmugym.checks import check_text
 from fmugym.declared import Task
 from fmugym.env import FMUEnv
@@ -125,19 +123,9 @@ class _Files:
         for place, data in self.contents.items():
             file = root / place
             if not file.exists():
-                _write(file, data)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                replace_file(file, data)  # other runners of this machine may write the same
         return root
-
-
-def _write(file: Path, data: bytes) -> None:
-    """Write a file at once: other runners of this machine may be writing the same."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=file.parent))
-    try:
-        (folder / file.name).write_bytes(data)
-        (folder / file.name).replace(file)
-    finally:
-        shutil.rmtree(folder)
 
 
 @dataclass(frozen=True)

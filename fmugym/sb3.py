@@ -23,7 +23,7 @@ from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
 from fmugym.vector.env import require_open
-from fmugym.vector.libraries import make_vector_env
+from fmugym.vector.libraries import make_vector_env, require_vector_env
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor
@@ -107,23 +107,12 @@ class FMUVecEnv(VecEnv):
     def __init__(self, env: FMUVectorEnv | VectorWrapper, overlap: bool = False) -> None:
         self._outer: Any = env
         inner: Any = env.unwrapped if isinstance(env, VectorWrapper) else env
-        if not isinstance(inner, FMUVectorEnv):
-            raise ConfigError(f"expected a FMUVectorEnv, got {type(inner).__name__}")
-        self._take(inner, overlap)
-
-    def _take(self, env: FMUVectorEnv, overlap: bool) -> None:
-        mode = env.autoreset_mode
-        if mode is not AutoresetMode.SAME_STEP:
-            raise ConfigError(
-                f"the autoreset mode is {mode.name}, expected SAME_STEP: make the FMUVectorEnv "
-                "with autoreset_mode='same_step'"
-            )
-        self.vector_env = env
+        self.vector_env = inner = require_vector_env(inner, AutoresetMode.SAME_STEP)
         self._overlap = overlap
-        self.spec = env.spec
+        self.spec = inner.spec
         self._set_parameters: dict[str, list[Any]] = {}
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self.metadata = dict(env.metadata)
+        super().__init__(inner.num_envs, inner.single_observation_space, inner.single_action_space)
+        self.metadata = dict(inner.metadata)
 
     # Episodes and steps.
 

@@ -209,16 +209,7 @@ def _other_start(env: FMUEnv, actions: list[Any], seed: int) -> _Start:
         return start
 
 
-def _check_spaces(env: FMUEnv, actions: list[Any], seed: int) -> None:
-    with _fresh(env) as tried:
-        for transition in _rollout(tried, actions, seed):
-            if not tried.observation_space.contains(transition.observation):
-                raise ContractError(
-                    f"observation {transition.observation!r} is not in {tried.observation_space}"
-                )
-
-
-def _check_types(env: FMUEnv, actions: list[Any], seed: int) -> None:
+def _check_results(env: FMUEnv, actions: list[Any], seed: int) -> None:
     with _fresh(env) as tried:
         for transition in _rollout(tried, actions, seed):
             _require_type("reward", transition.reward, float)
@@ -226,6 +217,10 @@ def _check_types(env: FMUEnv, actions: list[Any], seed: int) -> None:
             _require_type("truncated", transition.truncated, bool)
             if not math.isfinite(transition.reward):
                 raise ContractError(f"a reward is {transition.reward}")
+            if not tried.observation_space.contains(transition.observation):
+                raise ContractError(
+                    f"observation {transition.observation!r} is not in {tried.observation_space}"
+                )
 
 
 def _require_type(what: str, value: Any, expected: type) -> None:
@@ -316,17 +311,11 @@ def _check_hooks(env: FMUEnv, actions: list[Any], seed: int) -> None:
                 raise ContractError("_get_observation has a side effect: called again it differs")
             if _shares_memory(observation, repeated):
                 raise ContractError("_get_observation returns the same array again, not a new one")
-            for hook, value in _hook_values(tried, terminated, reward):
+            for hook, value in ((tried._is_done, terminated), (tried._reward_policy, reward)):
                 if hook() != value:
                     raise ContractError(f"{hook.__name__} has a side effect: it was {value}")
             if not data_equivalence(before, _readable(tried), exact=True):
                 raise ContractError("a hook other than _get_inputs and _update changes values")
-
-
-def _hook_values(
-    env: FMUEnv, terminated: bool, reward: float
-) -> tuple[tuple[Callable[[], Any], Any], ...]:
-    return (env._is_done, terminated), (env._reward_policy, reward)
 
 
 def _readable(env: FMUEnv) -> dict[str, Any]:
@@ -356,8 +345,7 @@ def _check_close(env: FMUEnv, actions: list[Any], seed: int) -> None:
 
 
 _CHECKS = (
-    _check_types,
-    _check_spaces,
+    _check_results,
     _check_time,
     _check_determinism,
     _check_reset,

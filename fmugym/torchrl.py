@@ -18,7 +18,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.extras import lacking
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.libraries import make_vector_env
+from fmugym.vector.libraries import make_vector_env, require_vector_env
 
 try:
     import torch
@@ -96,13 +96,7 @@ class FMUTorchEnv(EnvBase):
     def __init__(
         self, env: FMUVectorEnv, *, infos: Sequence[str] = (), device: Any = "cpu"
     ) -> None:
-        if not isinstance(env, FMUVectorEnv):
-            raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
-        if env.autoreset_mode is not AutoresetMode.DISABLED:
-            raise ConfigError(
-                f"the autoreset mode is {env.autoreset_mode.name}, expected DISABLED: make the "
-                "FMUVectorEnv with autoreset_mode='disabled'"
-            )
+        require_vector_env(env, AutoresetMode.DISABLED)
         super().__init__(device=device, batch_size=[env.num_envs])
         self.vector_env = env
         self._infos = tuple(infos)

@@ -778,15 +778,6 @@ static void read_results(Reader *reader, Program *program) {
     }
 }
 
-static void read_rows(Reader *reader, ProgramForm *p, size_t limit) {
-    p->numbers = read_array(reader, sizeof *p->numbers, &p->program.number_of_rows);
-    p->rows = room_for(reader, p->program.number_of_rows, sizeof *p->rows);
-    for (size_t i = 0; i < p->program.number_of_rows && reader->fault == NULL; i++) {
-        require(reader, p->numbers[i] >= 0 && (uint64_t)p->numbers[i] < limit, UNSOUND);
-    }
-    p->program.rows = p->rows;
-}
-
 const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows) {
     Program *program = &p->program;
 
@@ -801,7 +792,8 @@ const char *program_take(ProgramForm *p, const void *form, size_t size, size_t n
     program->code = read_array(&reader, sizeof(Instruction), &program->length);
     program->constants = read_array(&reader, sizeof(Constant), &program->number_of_constants);
     program->slots = read_array(&reader, sizeof(Slot), &program->number_of_slots);
-    read_rows(&reader, p, number_of_rows);
+    program->rows = p->rows = room_for(&reader, number_of_rows, sizeof *p->rows);
+    program->number_of_rows = number_of_rows;
     read_results(&reader, program);
     read_tables(&reader, p);
     measure_seen(&reader, p);
@@ -834,9 +826,7 @@ static void note_changes(ProgramForm *p) {
 }
 
 const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements) {
-    for (size_t i = 0; i < p->program.number_of_rows; i++) {
-        p->rows[i] = rows[p->numbers[i]];
-    }
+    memcpy(p->rows, rows, p->program.number_of_rows * sizeof *rows);
     if (!program_is_sound(&p->program, action_elements)) {
         return UNSOUND;
     }
@@ -845,17 +835,6 @@ const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elemen
     }
     note_changes(p);
     return NULL;
-}
-
-void program_note_outputs(ProgramForm *p, const double *outputs, size_t number, size_t count) {
-    for (size_t i = 0; i < p->program.number_of_rows; i++) {
-        Row *row = &p->rows[i];
-        for (uint32_t k = 0; k < number && !row->changes; k++) {
-            if (row->data == (const char *)(outputs + k * count)) {
-                row->output = k + 1;
-            }
-        }
-    }
 }
 
 void program_drop(ProgramForm *p) {

@@ -60,22 +60,17 @@ void opening_drop(Opening *opening);
 typedef struct {
     Program program;
     char *form; /* a copy of it, which the program points to */
-    const int64_t *numbers; /* of its rows, among those that come with it */
     Row *rows;
     Table *tables;
     char *filled; /* the memory of the constants' registers */
     size_t seen_sizes[MOST_SEEN]; /* of each array of observations, for one instance */
 } ProgramForm;
 
-/* Reads the form of a program. Returns what is wrong with it, or NULL. The caller must drop it in any
- * case; settle it before it runs. */
+/* Reads the form of a program that so many rows come with. Returns what is wrong with it, or NULL. The
+ * caller must drop it in any case; settle it before it runs. */
 const char *program_take(ProgramForm *p, const void *form, size_t size, size_t number_of_rows);
-/* Takes the rows that come with the program, of which there are number_of_rows. Returns what is wrong,
- * or NULL. */
+/* Takes the rows that come with the program. Returns what is wrong, or NULL. */
 const char *program_settle(ProgramForm *p, const Row *rows, size_t action_elements);
-/* Notes which rows are those of the outputs, of count instances, as long as the program only reads
- * them. */
-void program_note_outputs(ProgramForm *p, const double *outputs, size_t number, size_t count);
 void program_drop(ProgramForm *p);
 
 #endif

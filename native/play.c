@@ -31,9 +31,9 @@ WIDE static bool is_any_outside(const int64_t *values, size_t count, int64_t low
 ANY_NAN(double, is_any_nan, int64_t)
 ANY_NAN(float, is_any_nan32, int32_t)
 
-bool play_has_bad_action(const Turn *turn) {
+bool play_has_bad_action(const Turn *turn, size_t steps) {
     const Actions *a = &turn->play->actions;
-    const size_t count = turn->play->count * a->elements;
+    const size_t count = steps * turn->play->count * a->elements;
     const void *actions = turn->actions;
 
     switch (a->check) {

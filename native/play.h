@@ -96,8 +96,8 @@ typedef struct {
     double *drawn; /* a row for each draw; only the values drawn in this step are written */
 } Turn;
 
-/* Whether an action is out of range or NaN. */
-bool play_has_bad_action(const Turn *turn);
+/* Whether an action of so many steps is out of range or NaN. */
+bool play_has_bad_action(const Turn *turn, size_t steps);
 
 /* Makes the inputs before anything else of a step, which then has them. If they are not finite, returns
  * false and leaves them as they were; there is memory for a copy of them. */

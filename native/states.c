@@ -10,29 +10,15 @@
 
 /* Saving */
 
-/* Returns the new bytes, or NULL if memory runs out. */
-static char *add(Bytes *all, size_t size) {
-    if (all->bytes == NULL || all->room - all->size < size) {
-        const size_t room = 2 * all->room + size;
-        char *bytes = realloc(all->bytes, room);
-        if (bytes == NULL) {
-            return NULL;
-        }
-        all->bytes = bytes;
-        all->room = room;
-    }
-    all->size += size;
-    return all->bytes + all->size - size;
-}
-
 static size_t size_of_outputs(const Pool *pool) {
     return pool->settings.outputs->count * sizeof(double);
 }
 
 /* Adds a head and the outputs. Returns the bytes of the rest, or NULL if memory runs out. */
-static char *add_state(const Pool *pool, size_t index, StateHead head, size_t rest, Bytes *all) {
+static char *add_state(const Pool *pool, size_t index, StateHead head, size_t rest,
+                       Writer *writer) {
     const Settings *s = &pool->settings;
-    char *to = add(all, sizeof head + size_of_outputs(pool) + rest);
+    char *to = write_room(writer, sizeof head + size_of_outputs(pool) + rest);
 
     if (to == NULL) {
         return NULL;
@@ -45,7 +31,7 @@ static char *add_state(const Pool *pool, size_t index, StateHead head, size_t re
     return to;
 }
 
-static Status save_record(Pool *pool, Instance *me, StateHead head, Bytes *all) {
+static Status save_record(Pool *pool, Instance *me, StateHead head, Writer *writer) {
     const size_t index = index_of(pool, me);
 
     if (!record_is_whole(pool, index)) {
@@ -54,7 +40,7 @@ static Status save_record(Pool *pool, Instance *me, StateHead head, Bytes *all) 
     }
     head.kind = KIND_RECORD;
     const size_t size = record_size(pool, index, &head.starts, &head.rows);
-    char *to = add_state(pool, index, head, size, all);
+    char *to = add_state(pool, index, head, size, writer);
     if (to == NULL) {
         return instance_refuse(me, "out of memory");
     }
@@ -62,7 +48,7 @@ static Status save_record(Pool *pool, Instance *me, StateHead head, Bytes *all) 
     return STATUS_OK;
 }
 
-static Status serialize(Pool *pool, Instance *me, void *state, StateHead head, Bytes *all) {
+static Status serialize(Pool *pool, Instance *me, void *state, StateHead head, Writer *writer) {
     const Fmi *fmi = pool->settings.fmi;
     const size_t size = fmi->state_size(me->library, me->component, state);
 
@@ -71,7 +57,7 @@ static Status serialize(Pool *pool, Instance *me, void *state, StateHead head, B
         return instance_refuse(me, "the FMU state has no bytes");
     }
     head.kind = KIND_STATE;
-    char *to = add_state(pool, index_of(pool, me), head, size, all);
+    char *to = add_state(pool, index_of(pool, me), head, size, writer);
     if (to == NULL) {
         return instance_refuse(me, "out of memory");
     }
@@ -81,12 +67,12 @@ static Status serialize(Pool *pool, Instance *me, void *state, StateHead head, B
                                    : status;
 }
 
-static Status save_state(Pool *pool, Instance *me, StateHead head, Bytes *all) {
+static Status save_state(Pool *pool, Instance *me, StateHead head, Writer *writer) {
     void *state;
     Status status = instance_save(pool, me, &state);
 
     if (status <= STATUS_WARNING) {
-        status = serialize(pool, me, state, head, all);
+        status = serialize(pool, me, state, head, writer);
         instance_free_state(pool, me, &state);
     }
     return status;
@@ -96,32 +82,31 @@ static bool serializes(const Pool *pool) {
     return pool->settings.can_save && pool->settings.fmi->serialize != NULL;
 }
 
-static Status save_instance(Pool *pool, Instance *me, bool records, Bytes *all) {
+static Status save_instance(Pool *pool, Instance *me, bool records, Writer *writer) {
     const size_t index = index_of(pool, me);
     const StateHead head = {KIND_ENDED, me->steps, me->start_time, 0, 0};
     const bool goes_on = records ? pool->settings.status[index] <= STATUS_WARNING
                                  : me->phase == PHASE_STEPPING;
 
     if (!goes_on) {
-        return add_state(pool, index, head, 0, all) == NULL ? instance_refuse(me, "out of memory")
+        return add_state(pool, index, head, 0, writer) == NULL ? instance_refuse(me, "out of memory")
                                                             : STATUS_OK;
     }
     if (records) {
-        return save_record(pool, me, head, all);
+        return save_record(pool, me, head, writer);
     }
-    return serializes(pool) ? save_state(pool, me, head, all)
+    return serializes(pool) ? save_state(pool, me, head, writer)
                             : instance_refuse(me, "the FMU cannot serialize its state");
 }
 
 ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, bool records,
-                           Bytes *all, int64_t *ends) {
+                           Writer *writer) {
     pool->no_return = false;
     for (size_t i = 0; i < count; i++) {
         Instance *me = &pool->instances[indices[i]];
-        if (save_instance(pool, me, records, all) > STATUS_WARNING) {
+        if (save_instance(pool, me, records, writer) > STATUS_WARNING) {
             return (ptrdiff_t)indices[i];
         }
-        ends[i] = (int64_t)all->size;
     }
     return -1;
 }

@@ -5,6 +5,7 @@
 #define FMUGYM_STATES_H
 
 #include "pool.h"
+#include "writer.h"
 
 typedef enum {
     KIND_ENDED, /* nothing: the instance could not be stepped any more */
@@ -25,16 +26,10 @@ typedef struct State {
     size_t size;
 } State;
 
-/* Bytes that grow; the caller frees them. */
-typedef struct {
-    char *bytes;
-    size_t size, room;
-} Bytes;
-
-/* Appends the states of instances, or their records, and sets where each of them ends. Returns the
- * index of the first instance that fails, or -1. */
+/* Writes the states of instances, or their records, a block for each. Returns the index of the first
+ * instance that fails, or -1. */
 ptrdiff_t pool_save_states(Pool *pool, const int64_t *indices, size_t count, bool records,
-                           Bytes *all, int64_t *ends);
+                           Writer *writer);
 
 /* Whether a state is whole, and of a kind that the pool can restore. */
 bool state_is_sound(const Pool *pool, State state);

@@ -4,8 +4,8 @@
 
 A case damages one of these:
 
-* The form of a pool, a list of variables, draws or a program, which goes to the C extension. It is
-  taken or refused with a ``ValueError``.
+* The form of a pool, a list of variables, draws, a play or a program, which goes to the C
+  extension. It is taken or refused with a ``ValueError``.
 * The requests to a worker. The worker answers, or it ends by itself without a fault.
 * The answers of a worker. Calls raise nothing but errors of the family, and a reset makes the pool
   whole again, unless a worker has been given up after many deaths in a row.
@@ -19,21 +19,25 @@ import logging
 import math
 import re
 import sys
+from unittest import mock
 
 import numpy as np
 from fuzz_driver import Case, main, require
-from program_tools import code, constants
+from program_tools import code, constants, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
-from fmugym.pool import PoolSpec
+from fmugym.pool import PoolSpec, native
 from fmugym.pool.form import (
     Files,
     form_of_draws,
     form_of_listing,
     form_of_pool,
     form_of_program,
+    form_of_programs,
 )
 from fmugym.pool.health import no_counts
+from fmugym.pool.native import prepare
+from fmugym.pool.play_form import form_of_play
 from fmugym.pool.process.channel import Channel
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.process.supervisor import Supervisor
@@ -193,7 +197,6 @@ def program_form(rng):
         code(*rows),
         constants(0.0),
         np.array([(0, 0, 1, 1)], SLOT).tobytes(),
-        (0, 1),
         (np.arange(4.0),),
         6,
         1,
@@ -209,6 +212,63 @@ def program_form(rng):
             _native.evaluate((form, arrays), n, 1, np.ones(n), np.ones(n), results, (seen,))
 
     return Case(play, "program")
+
+
+def play_of(inputs, outputs):
+    """The parts of a play: it passes the action on, and ends beyond an output of 1."""
+    push = code(("load_action", 0, 0), ("store_row", 0, 0, 0))
+    judge = code(("load_row", 0, 1), ("greater d", 0, 2, 1, 0))
+    programs = (
+        (form_of_program(push, b"", b"", (), 1, 0, ()), (inputs[0],)),
+        (form_of_program(judge, constants(1.0), b"", (), 3, 0, (2, 2, 1)), (outputs[0],)),
+    )
+    kept, variables = np.zeros_like(outputs), np.zeros((2, N))
+    surroundings = {
+        "kept": kept,
+        "done": None,
+        "reads_kept": True,
+        "copies": (tuple(variables),),
+        "drawn_variables": (),
+        "variable_starts": ((variables[0], np.float64(2.0).tobytes()),),
+        "input_starts": ((-1, 0.5),),
+        "results": None,
+    }
+    actions = {
+        "shape": (),
+        "letter": "d",
+        "size": 8,
+        "check": 2,
+        "lowest": 0,
+        "highest": 0,
+        "current": np.zeros(N),
+        "previous": np.zeros(N),
+        "none": np.zeros(1),
+    }
+    episodes = np.zeros(N, np.int64), np.zeros(N, np.bool_), 10
+    streams = uniform_draws(), np.zeros((N, 6), np.uint64)
+    return programs, actions, np.zeros((0, N)), streams, episodes, surroundings
+
+
+def rolled():
+    """The arrays of a rollout of three steps."""
+    flags = np.zeros((3, N), np.bool_), np.zeros((3, N), np.bool_)
+    return np.zeros((3, N)), np.zeros((3, N, 1), np.float32), np.zeros((3, N)), *flags
+
+
+def play_form(rng):
+    """Its instances are elsewhere, so that none steps."""
+    fmu, *_ = opened()[1]
+    spec = PoolSpec((fmu.variable("f"),), (fmu.variable("x"),), 0.05, num_observed=1)
+    own = np.zeros((1, N)), np.zeros((1, N)), np.zeros(N, np.int8), np.zeros((N, 1), np.float32)
+
+    def play():
+        pool = _native.Pool(form_of_programs(spec, N, 1), (*own, no_counts(N)), print)
+        parts, form = play_of(*own[:2]), lambda *a: damaged(rng, form_of_play(*a))
+        with mock.patch.object(native, "form_of_play", form), refusals():
+            prepare(pool, _native.Access(form_of_listing(())), *parts)
+            pool.rollout(*rolled())
+
+    return Case(play, "play")
 
 
 class Noise:
@@ -283,6 +343,12 @@ def restore_states(rng, pool, kept):
         pool.restore_states(kept["states"], np.arange(N))
 
 
+def roll_out(rng, pool, kept):
+    with refusals():
+        pool.prepare_play((), *play_of(pool.inputs, pool.outputs))
+        pool.roll_out(*rolled())
+
+
 def read(rng, pool, kept):
     pool.read((variable("x"),))
 
@@ -301,7 +367,7 @@ def ask(rng, pool, kept):
 
 
 ACTIONS = step, step, reset, save, restore, save_states, restore_states, read, write, ask
-ACTIONS += (differentiate,)
+ACTIONS += (differentiate, roll_out)
 FAULT = re.compile(r"ended with (signal (?!SIGKILL)|exit status [1-9])")
 
 
@@ -353,7 +419,7 @@ def program():
     """See ``fuzz_driver.run``."""
     noise = Noise()
     kinds = (
-        *(pool_form, listing_form, draws_form, program_form) * 2,
+        *(pool_form, listing_form, draws_form, program_form, play_form) * 2,
         functools.partial(conversation, "request", noise),
         functools.partial(conversation, "answer", noise),
     )

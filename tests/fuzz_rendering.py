@@ -36,7 +36,7 @@ SHAPES = {
     "arrow": {"start": HERE, "end": (0.5, 0.5), "thickness": 0.1},
     "arc_arrow": {"center": HERE, "radius": 0.5, "start": 0.0, "sweep": 1.0, "thickness": 0.1},
     "text": {"position": HERE, "text": "x", "size": 12, "anchor": "center"},
-    "caption": {"pixel": (1, 1), "text": "x", "size": 12, "anchor": "topleft"},
+    "caption": {"pixel": (1, 1), "text": "x", "size": 12},
 }
 RENDERER = {
     "scene": PendulumScene(1.0),
@@ -56,8 +56,7 @@ def shape(rng):
 
 
 def canvas(rng):
-    arguments = {"size": (40, 40), "world": World(**BOUNDS), "supersampling": 2}
-    spoiled = spoil(rng, arguments)
+    spoiled = spoil(rng, {"size": (40, 40), "world": World(**BOUNDS)})
     return lambda: Canvas(**spoiled)
 
 

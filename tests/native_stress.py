@@ -63,8 +63,8 @@ def programs(pool, variables):
         ("store_row", 1, 0, 4),
     )
     rows = pool.outputs[0], variables[0]
-    pushing = form_of_program(push, constants(3.0), b"", (0,), (), 4, 0, ())
-    judging = form_of_program(judge, constants(0.2, 0.0), b"", (0, 1), (), 7, 0, (5, 1, 4))
+    pushing = form_of_program(push, constants(3.0), b"", (), 4, 0, ())
+    judging = form_of_program(judge, constants(0.2, 0.0), b"", (), 7, 0, (5, 1, 4))
     return (pushing, (pool.inputs[0],)), (judging, rows)
 
 

@@ -7,3 +7,6 @@ PLANTS = {
     "House": ("u", ["T_m", "T_w", "T_air"], "T_w_0", 1.0),
 }
 """By model: its input, its outputs, a parameter for the start, and a size of inputs."""
+
+ONCE = (("CartPole", "1.0"), ("Pendulum", "3.0"), ("DoublePendulum", "2.0"), ("House", "3.0"))
+"""Each bundled model in one version of FMI, and each version, where not all pairs count."""

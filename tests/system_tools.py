@@ -43,11 +43,22 @@ def closing_pools(opened):
     return make
 
 
+def links_of(system):
+    return [(k.source, k.output, k.target, k.input, k.gain, k.offset) for k in system.links]
+
+
 def play(pool, steps, inputs=None):
     """Reset and step; the outputs, shape (steps + 1, k)."""
     rows = [start(pool).outputs[:, 0].copy()]
     given = [()] * steps if inputs is None else inputs
     return np.array(rows + [step(pool, *given[i])[:, 0] for i in range(steps)])
+
+
+@pytest.fixture(scope="module", name="fmus")
+def compiled(tmp_path_factory):
+    """The FMU of linear equations by FMI version."""
+    folder = tmp_path_factory.mktemp("linear")
+    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
 
 
 def linear_fmu(path, version=2):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import values_tools
+from combinations import in_turn
 from scipy.linalg import expm
 from values_tools import LARGER, STEP, Env
 
@@ -21,8 +22,7 @@ def made(folder, kind="Directional", **options):
     return values_tools.state_space_fmu(folder / f"{kind}.fmu", derivatives=kind, **options)
 
 
-@KINDS
-@pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+@in_turn({"kind": ["Directional", "Adjoint"], "interface": ["CoSimulation", "ModelExchange"]})
 def test_the_matrices_come_out(tmp_path, kind, interface):
     fmu = fmugym.FMU(made(tmp_path, kind, interfaces=(interface,)), sizes=SIZES)
     model = linearize(fmu, at=GIVEN | {"u": [1.0, -2.0]})
@@ -65,8 +65,7 @@ def discrete():
     return exact[:3, :3], exact[:3, 3:]
 
 
-@pytest.mark.parametrize("options", [{}, {"isolation": "process"}], ids=["here", "isolated"])
-@pytest.mark.parametrize("method", ["directional", "differences"])
+@in_turn({"method": ["directional", "differences"], "options": [{}, {"isolation": "process"}]})
 def test_along_a_trajectory(tmp_path, method, options):
     path = made(tmp_path)
 

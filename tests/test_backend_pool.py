@@ -9,6 +9,7 @@ import time
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import RecordVideo
 from vector_tools import run_side_by_side
@@ -103,8 +104,7 @@ def push(torque):
     return np.array([torque], np.float32)
 
 
-@pytest.mark.parametrize("kind", [Oscillator, Held])
-@pytest.mark.parametrize("as_list", [False, True])
+@in_turn({"kind": [Oscillator, Held], "as_list": [False, True]})
 def test_a_rig_stands_in_for_the_fmu(make, kind, as_list):
     """A free oscillation is a cosine, whichever way the rig gives its outputs."""
     env = make(kind(as_list))
@@ -479,8 +479,7 @@ def test_hooks_of_a_single_real_plant_are_not_compiled():
         env.reset()
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-@pytest.mark.parametrize("mode", AutoresetMode)
+@in_turn({"hooks": ["compiled", "array", "per_env"], "mode": list(AutoresetMode)})
 def test_hooks_of_several_real_plants(hooks, mode):
     """Programs run around the steps of the rigs; each way gives what single environments do."""
     config = {"model_parameters": {"q_0": fmugym.Uniform(0.5, 2.0)}, "max_episode_steps": 7}

@@ -14,7 +14,7 @@ from fmugym.baselines import MPC, PID, controller_of
 from fmugym.baselines.mpc import _Foresight
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
-from fmugym.task.future import Future, Lookup, Table
+from fmugym.task.future import Future, Lookup
 from fmugym.tools.cli import main
 
 HOUR, DT = 3600.0, 600.0
@@ -58,6 +58,11 @@ def play(env, controller, steps, seed=0):
         if terminated or truncated:
             break
     return np.array(actions), np.array(rewards)
+
+
+def lookup(period, times, values):
+    """That of a series of its own."""
+    return Lookup({"wind": np.array([*times, *values, 0.0, values[-1]])}, "wind", 0.0, period, False)
 
 
 def mpc(horizon="1h 40min", **arguments):
@@ -210,9 +215,9 @@ class TestFuture:
         assert rewards["2h"] > rewards[None] + 0.05
 
     def test_of_a_forecast(self):
-        lookup = Lookup(0, 0.0, 365 * 86400.0, False, Table(np.array([0.0, 1.0]), np.zeros(2)))
+        future = Future({"wind": lookup(365 * 86400.0, [0.0, 1.0], [0.0, 0.0])}, (), float)
         names = ("x", "wind", "wind[+10800 s]", "wind[+7200 s]")
-        foresight = _Foresight(names, Future({"wind": lookup}, (), float), HOUR, 30)
+        foresight = _Foresight(names, future, HOUR, 30)
         now, told = np.array([0.0, 5.0, 8.0, 6.0]), {}
         foresight.note(told, now, 0)
         times, values = foresight.ahead(told, 0, 1e6)["wind"]
@@ -230,8 +235,8 @@ class TestFuture:
         assert foresight.is_present.tolist() == [True, True, False, False]
 
     def test_of_data_that_are_not_observed_is_their_mean(self):
-        rows = Table(np.array([0.0, 1.0, 3.0, 4.0]), np.array([0.0, 2.0, 2.0, 0.0]))
-        future = Future({"wind": Lookup(0, 0.0, 4.0, False, rows)}, (), float)
+        rows = [0.0, 1.0, 3.0, 4.0], [0.0, 2.0, 2.0, 0.0]
+        future = Future({"wind": lookup(4.0, *rows)}, (), float)
         foresight = _Foresight(("x",), future, 1.0, 3)
         told = {}
         foresight.note(told, np.zeros(1), 0)
@@ -274,8 +279,8 @@ class TestFuture:
         assert future.lookups["wind"].mean(future.held_out) == pytest.approx(1.0, abs=0.01)
 
     def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
-        rows = Table(np.array([0.0, 43200.0, 86400.0]), np.array([1.0, 5.0, 1.0]))
-        assert Lookup(0, 0.0, 86400.0, False, rows).mean([(0.0, 1e6)]) == 3.0
+        daily = lookup(86400.0, [0.0, 43200.0, 86400.0], [1.0, 5.0, 1.0])
+        assert daily.mean([(0.0, 1e6)]) == 3.0
 
 
 class TestModel:

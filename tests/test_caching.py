@@ -2,14 +2,15 @@
 
 import logging
 import os
+import signal
 import tempfile
 from pathlib import Path
 
 import pytest
+from process_tools import run_python
 
 import fmugym
-from fmugym.archive import temporary
-from fmugym.caching import cache_folder, lasting_folder
+from fmugym.caching import cache_folder, lasting_folder, own_prefix, sweep
 from fmugym.envs import CartPoleEnv
 from fmugym.trial.known import recall, remember
 from fmugym.wine.windows_worker import wine_folder
@@ -30,6 +31,9 @@ def temp(tmp_path, monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temp"))
     (tmp_path / "temp").mkdir()
     return tmp_path / "temp"
+
+
+OF_A_DEAD_PROCESS = own_prefix().replace(f"-{os.getpid()}-", "-99999999999-") + "ab"
 
 
 def pretend_another_user(monkeypatch):
@@ -78,12 +82,28 @@ class TestCache:
             lasting_folder("ray")
 
 
+KILLED = """
+import os, signal
+from fmugym.trial.known import remember
+os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
+remember("key", "text")
+"""
+
+
+def test_what_a_killed_process_has_not_kept_goes(cache):
+    """It was killed after it had written a file, and before it had given it its name."""
+    assert run_python("-c", KILLED).returncode == -signal.SIGKILL
+    assert len(list(cache.iterdir())) == 1
+    remember("other", "text")
+    assert [path.name for path in cache.iterdir()] == ["other"]
+
+
 class TestFoldersOfDeadProcesses:
     @pytest.fixture
     def planted(self, temp):
-        folder = temp / f"fmugym-99999999999-{temporary._namespace()}-ab"
+        folder = temp / OF_A_DEAD_PROCESS
         folder.mkdir()
-        temporary.sweep.cache_clear()
+        sweep.cache_clear()
         return folder
 
     def test_a_number_that_no_process_has_stops_nobody(self, planted):
@@ -92,7 +112,7 @@ class TestFoldersOfDeadProcesses:
 
     def test_those_of_others_stay(self, planted, monkeypatch):
         pretend_another_user(monkeypatch)
-        temporary.sweep()
+        sweep(planted.parent)
         assert planted.exists()
 
     def test_a_file_or_a_link_of_such_a_name_stops_nobody(self, planted, temp):

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -16,10 +17,11 @@ import pytest
 import quirk_table
 import zoo_tools
 from fmu_tools import HERE, library_name, probe_fmu, read_fmu
+from plants import ONCE
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.tools.cli import _parser, main
 from fmugym.tools.options import EXAMPLES, speaking
 
@@ -92,7 +94,7 @@ def skeleton(capsys):
 
 
 class TestInfo:
-    @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
+    @pytest.mark.parametrize(("model", "fmi_version"), ONCE)
     def test_says_what_the_fmu_is(self, info, model, fmi_version):
         text = info(fmugym.bundled_fmu(model, fmi_version))
         assert text.startswith(f"{model} (FMI {fmi_version})\n")
@@ -216,7 +218,7 @@ class TestInfo:
 
 
 class TestSkeleton:
-    @pytest.mark.parametrize(("model", "fmi_version"), BUNDLED)
+    @pytest.mark.parametrize(("model", "fmi_version"), ONCE)
     def test_runs_and_keeps_the_contract(self, tmp_path, model, fmi_version):
         assert_skeleton_runs(fmugym.bundled_fmu(model, fmi_version), tmp_path, "-W", "error")
 
@@ -448,6 +450,29 @@ class TestCommand:
         assert main(["new", fmu, "--output", str(file), "--force"]) == 0
         assert "time_step" in file.read_text()
         assert sorted(tmp_path.iterdir()) == [file, tmp_path / "fmugym.schema.json"]
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            "new wrong.fmu --output out.toml",
+            "new --class wrong.fmu --output out.py",
+            "info wrong.fmu --plot out.svg",
+            "simulate wrong.toml --output out.csv --output out.html",
+            "evaluate wrong.toml --plot out.png",
+            "tune wrong.toml 'pid of=q setpoint=1 kp=0..1' --output out.toml",
+            "train wrong.toml --output out",
+            "export wrong.toml --task wrong.toml --output out.c",
+        ],
+    )
+    def test_what_is_refused_leaves_no_file_behind(self, arguments, tmp_path, monkeypatch, cli):
+        monkeypatch.chdir(tmp_path)
+        wrong = {tmp_path / name for name in ("wrong.fmu", "wrong.toml")}
+        for path in wrong:
+            path.write_text('fmu = { bundled = "Pendulum" }\nreward = "-abs(p)"\n')
+        code, out, err = cli(*shlex.split(arguments))
+        assert (code, out) == (1, "")
+        assert err.startswith("fmugym: error: ")
+        assert set(tmp_path.iterdir()) == wrong
 
     def test_a_file_that_exists_is_found_before_the_fmu_is_opened(self, tmp_path, capsys):
         file = tmp_path / "run.csv"

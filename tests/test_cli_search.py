@@ -488,6 +488,7 @@ class TestVerdict:
             ([0, 0, 0], [-5, -4, -6], ["5 better than old (2.52 to 7.48)"], ["%", "chance"]),
             ([-5, 5, 0], [-1, -1, -1], ["1 better than old", "chance"], ["%"]),
             ([3], [2], ["50 % better than old in"], ["(", "chance"]),
+            ([500], [9], ["491 better than old in"], ["%"]),
         ],
     )
     def test_its_line(self, new, old, facts, missing):

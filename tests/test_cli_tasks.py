@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 from fmu_tools import edited_fmu
+from plants import ONCE
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED
 from fmugym.tools.validation import validate
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
 class TestNew:
-    @pytest.mark.parametrize(("model", "version"), BUNDLED)
+    @pytest.mark.parametrize(("model", "version"), ONCE)
     def test_what_it_writes_passes_validate(self, model, version, tmp_path, cli):
         path = tmp_path / "task.toml"
         fmu = fmugym.bundled_fmu(model, version)

@@ -198,7 +198,7 @@ def test_a_reward_that_never_changes_is_warned_of(reward, terminated, told):
     task = {k: v for k, v in SCENARIOS.items() if k != "costs"}
     task |= {"reward": reward, "terminated": terminated}
     make_env, player = partial(fmugym.load, task), Player(partial(action_of, text="random"), False)
-    scores = evaluate(make_env, {"a": player, "b": player}, range(4), 100)
+    scores = list(evaluate(make_env, {"a": player, "b": player}, range(4), 100))
     warning = warning_of_one_reward(scores)
     assert (told is None) == (warning is None)
     assert told is None or told in warning

@@ -12,59 +12,52 @@ import pytest
 import fmugym
 from fmugym.baselines import PID
 from fmugym.baselines.parsing import search_of
-from fmugym.tools.cli import main
 
 HOUSE = "fmugym/House-v0"
 RANGES = "pid of=T setpoint=20..22 kp=0.05..5 ti=14400"
 FEW = "--rounds", "2", "--candidates", "8", "--episodes", "2", "--steps", "100"
 
 
-def run(capsys, *arguments):
-    code = main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
-
-
-def rewards(capsys, *arguments):
+def rewards(cli, *arguments):
     """Those of single environments."""
-    code, out, _ = run(capsys, "simulate", *arguments, "--json")
+    code, out, _ = cli("simulate", *arguments, "--json")
     assert code == 0
     return [one["total_reward"] for one in json.loads(out)["episodes"]]
 
 
 class TestTune:
-    def test_its_reward_is_that_of_the_controller_it_prints(self, capsys):
-        code, out, err = run(capsys, "tune", HOUSE, RANGES, *FEW, "--seed", "5", "--json")
+    def test_its_reward_is_that_of_the_controller_it_prints(self, cli):
+        code, out, err = cli("tune", HOUSE, RANGES, *FEW, "--seed", "5", "--json")
         found = json.loads(out)
         assert code == 0
         assert len(found["rewards_of_rounds"]) == 2 == err.count("round ")
         assert found["mean_reward"] == max(found["rewards_of_rounds"])
         options = "--episodes", "2", "--seed", "5", "--steps", "100"
-        played = rewards(capsys, HOUSE, "--controller", found["controller"], *options)
+        played = rewards(cli, HOUSE, "--controller", found["controller"], *options)
         assert found["mean_reward"] == pytest.approx(sum(played) / 2, rel=1e-12)
         assert found["controller"].endswith("ti=14400")
         numbers = [float(word.partition("=")[2]) for word in found["controller"].split()[2:4]]
         assert list(found["parameters"].values()) == numbers
 
-    def test_the_file_that_it_writes_is_a_task_with_the_controller(self, tmp_path, capsys):
+    def test_the_file_that_it_writes_is_a_task_with_the_controller(self, tmp_path, cli):
         base, output = tmp_path / "house.toml", tmp_path / "more" / "tuned.toml"
         output.parent.mkdir()
         fmugym.Task.read(Path(fmugym.__file__).parent / "envs" / "house.toml").write(base)
         options = "--scenario", "frost", "--output", output, "--name", "best"
-        code, out, _ = run(capsys, "tune", base, RANGES, *FEW, *options)
+        code, out, _ = cli("tune", base, RANGES, *FEW, *options)
         assert code == 0
         written = tomllib.loads(output.read_text())
         assert written == {"extends": "../house.toml", "controllers": {"best": out.strip()}}
         frost = "--scenario", "frost", "--steps", "50"
-        named = rewards(capsys, output, "--controller", "best", *frost)
-        assert named == rewards(capsys, base, "--controller", out.strip(), *frost)
-        code, _, err = run(capsys, "evaluate", output, "--controller", "bset")
+        named = rewards(cli, output, "--controller", "best", *frost)
+        assert named == rewards(cli, base, "--controller", out.strip(), *frost)
+        code, _, err = cli("evaluate", output, "--controller", "bset")
         assert code == 1
         assert "'best'" in err
 
-    def test_an_end_of_a_range_is_told(self, capsys):
+    def test_an_end_of_a_range_is_told(self, cli):
         pid = "pid of=T setpoint=10..11 kp=1"
-        _, _, err = run(capsys, "tune", HOUSE, pid, *FEW, "--rounds", "6")
+        _, _, err = cli("tune", HOUSE, pid, *FEW, "--rounds", "6")
         assert "setpoint" in err.splitlines()[-1]
 
     @pytest.mark.parametrize(
@@ -86,15 +79,15 @@ class TestTune:
             ([RANGES, "--scenario", "frst"], "'frost'"),
         ],
     )
-    def test_mistakes(self, arguments, fact, capsys):
-        code, out, err = run(capsys, "tune", HOUSE, *arguments)
+    def test_mistakes(self, arguments, fact, cli):
+        code, out, err = cli("tune", HOUSE, *arguments)
         assert (code, out) == (1, "")
         assert fact in err
 
-    def test_a_file_that_exists_is_kept(self, tmp_path, capsys):
+    def test_a_file_that_exists_is_kept(self, tmp_path, cli):
         path = tmp_path / "a.toml"
         path.write_text("mine")
-        assert run(capsys, "tune", HOUSE, RANGES, "--output", path)[0] == 1
+        assert cli("tune", HOUSE, RANGES, "--output", path)[0] == 1
         assert path.read_text() == "mine"
 
     @pytest.mark.skipif(sys.platform == "win32", reason="needs the signal of Ctrl-C")

@@ -2,12 +2,13 @@
 
 import ctypes
 from fractions import Fraction
-from itertools import takewhile
+from itertools import product, takewhile
 
 import clocks_tools
 import fmpy
 import fmu_tools
 import pytest
+from combinations import in_turn
 from fmpy.fmi3 import FMU3Model
 from pool_tools import KINDS, open_pool, reset, start, step
 
@@ -15,8 +16,8 @@ from fmugym import FMU, FMULoadError
 from fmugym.archive.variable import Interval
 
 TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
-all_kinds = pytest.mark.parametrize("kind", list(KINDS))
-both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
+INTERFACES = ("CoSimulation", "ModelExchange")
+both_interfaces = pytest.mark.parametrize("interface", INTERFACES)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def fmu_path(tmp_path_factory):
         interface: clocks_tools.clocks_fmu(
             folder / f"{interface}.fmu", interface, clocks=clocks_tools.FRACTIONS
         )
-        for interface in ("CoSimulation", "ModelExchange")
+        for interface in INTERFACES
     }
 
 
@@ -73,9 +74,7 @@ def check(pool, until, exact=True):
 OUTPUTS = tuple(f"{what} {name}" for what in ("count of", "last") for name in TIMED)
 
 
-@all_kinds
-@both_interfaces
-@pytest.mark.parametrize("size", [0.1, 0.77, 5.0])
+@in_turn({"kind,interface": list(product(KINDS, INTERFACES)), "size": [0.1, 0.77, 5.0]})
 def test_each_ticks_at_its_exact_times(fmu_path, make_pool, kind, interface, size):
     pool = start(make_pool(fmu_path[interface], size, kind))
     for index in range(int(5 / size)):

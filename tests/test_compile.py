@@ -10,6 +10,7 @@ import fmpy
 import fmu_tools
 import numpy as np
 import pytest
+from combinations import in_turn
 from source_tools import BOTH, build_description, write_source_fmu
 
 from fmugym import FMU, FMULoadError
@@ -34,8 +35,7 @@ def simulated(path, interface):
 
 
 class TestCompile:
-    @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
-    @pytest.mark.parametrize("version", [2, 3])
+    @in_turn({"version": [2, 3], "interface": ["co_simulation", "model_exchange"]})
     def test_the_library_computes_the_same(self, tmp_path, source_fmu, version, interface):
         made = compile_fmu(source_fmu(version))
         assert made.parent == tmp_path

@@ -5,12 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS, probe_config, probe_fmu
 
 from fmugym import FMU, Choice, ConfigError, Uniform
+from fmugym.archive.variable import checked_value
 from fmugym.config import EnvConfig
 from fmugym.task.interface import resolve
-from fmugym.task.starting import checked_value
 
 
 def resolved(path, **changes):
@@ -201,34 +202,56 @@ class TestRefused:
         with pytest.raises(ConfigError, match=f"config key '{key}' is missing"):
             EnvConfig.from_dict(config)
 
-    @pytest.mark.parametrize("version", MAJOR_VERSIONS)
-    @pytest.mark.parametrize(
-        ("changes", "match"),
-        [
-            ({"model_input_names": "aa"}, "unknown variable of Probe 'aa'"),
-            ({"model_output_names": "mixx"}, "'mixx'; did you mean 'mix'"),
-            ({"monitor_names": "stepss"}, "did you mean 'steps'"),
-            ({"model_parameters": {"gian": 1}}, "did you mean 'gain'"),
-            ({"bounds": {"sun": (0, 1)}}, "'sun'; did you mean 'sum'"),
-            (
-                {"bounds": {"seven": (0, 1)}},
-                "unknown input, output or parameter in 'bounds' 'seven'",
-            ),
-            ({"model_input_names": "mix"}, "'mix' cannot be an input: it is a continuous output"),
-            ({"model_input_names": "gain"}, "'gain' cannot be an input: it is a fixed parameter"),
-            ({"model_input_names": "seven"}, "'seven' cannot be an input: it is a constant"),
-            ({"model_input_names": "double_gain"}, "cannot be an input: it is a fixed"),
-            ({"model_input_names": "label"}, "'label' cannot be an input: it is of type String"),
-            ({"model_output_names": "label"}, "'label' cannot be an output: it is of type String"),
-            ({"model_parameters": {"mix": 1}}, "'mix' cannot be set: it is a continuous output"),
-            ({"model_parameters": {"seven": 8}}, "'seven' cannot be set: it is a constant"),
-            ({"model_parameters": {"double_gain": 8}}, "'double_gain' cannot be set"),
-            ({"model_parameters": {"label": 8}}, "'label' is a String, got 8"),
-            ({"model_parameters": {"leaky": 0.5}}, "'leaky' is a Boolean"),
-            ({"model_parameters": {"fault": 1.5}}, "'fault' is of type Int"),
-            ({"time_step": None}, "config key 'time_step' is missing, and Probe has no default"),
-            ({"warm_up": 0.15}, "warm_up must be a multiple of the time step of 0.1 s, got 0.15"),
-        ],
+    @in_turn(
+        {
+            "changes,match": [
+                ({"model_input_names": "aa"}, "unknown variable of Probe 'aa'"),
+                ({"model_output_names": "mixx"}, "'mixx'; did you mean 'mix'"),
+                ({"monitor_names": "stepss"}, "did you mean 'steps'"),
+                ({"model_parameters": {"gian": 1}}, "did you mean 'gain'"),
+                ({"bounds": {"sun": (0, 1)}}, "'sun'; did you mean 'sum'"),
+                (
+                    {"bounds": {"seven": (0, 1)}},
+                    "unknown input, output or parameter in 'bounds' 'seven'",
+                ),
+                (
+                    {"model_input_names": "mix"},
+                    "'mix' cannot be an input: it is a continuous output",
+                ),
+                (
+                    {"model_input_names": "gain"},
+                    "'gain' cannot be an input: it is a fixed parameter",
+                ),
+                ({"model_input_names": "seven"}, "'seven' cannot be an input: it is a constant"),
+                ({"model_input_names": "double_gain"}, "cannot be an input: it is a fixed"),
+                (
+                    {"model_input_names": "label"},
+                    "'label' cannot be an input: it is of type String",
+                ),
+                (
+                    {"model_output_names": "label"},
+                    "'label' cannot be an output: it is of type String",
+                ),
+                (
+                    {"model_parameters": {"mix": 1}},
+                    "'mix' cannot be set: it is a continuous output",
+                ),
+                ({"model_parameters": {"seven": 8}}, "'seven' cannot be set: it is a constant"),
+                ({"model_parameters": {"double_gain": 8}}, "'double_gain' cannot be set"),
+                ({"model_parameters": {"label": 8}}, "'label' is a String, got 8"),
+                ({"model_parameters": {"leaky": 0.5}}, "'leaky' is a Boolean"),
+                ({"model_parameters": {"fault": 1.5}}, "'fault' is of type Int"),
+                (
+                    {"time_step": None},
+                    "config key 'time_step' is missing, and Probe has no default",
+                ),
+                (
+                    {"warm_up": 0.15},
+                    "warm_up must be a multiple of the time step of 0.1 s, got 0.15",
+                ),
+            ],
+            "version": MAJOR_VERSIONS,
+        }
     )
     def test_what_does_not_fit_the_fmu(self, probe, version, changes, match):
         with pytest.raises(ConfigError, match=match):

@@ -11,6 +11,7 @@ from pathlib import Path
 import fmu_tools
 import numpy as np
 import pytest
+from combinations import in_turn
 from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 from test_snapshot_machine import Machine
@@ -70,8 +71,7 @@ def steps_of(env):
     return int(np.sum(env.health["steps"]))
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize("pool", POOLS)
+@in_turn({"version": VERSIONS, "pool": list(POOLS)})
 def test_restored_episodes_are_equal(copying, pool, version):
     options = POOLS[pool]
     with copying(version, **options) as env:

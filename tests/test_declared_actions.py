@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from vector_tools import require_same_alone
 
 import fmugym
@@ -146,9 +147,13 @@ REWARDS = {
 }
 
 
-@pytest.mark.parametrize("kind", REWARDS)
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@in_turn(
+    {
+        "kind": list(REWARDS),
+        "hooks": ["compiled", "array", "per_env"],
+        "mode": ["next_step", "same_step"],
+    }
+)
 def test_a_failed_step_costs_no_less_than(kind, hooks, mode):
     reward, expected = REWARDS[kind]
     own = {"config": {"fault_reward": -7}} if kind == "the file" else {}

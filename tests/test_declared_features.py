@@ -337,7 +337,7 @@ def test_a_schedule_holds_over_midnight(load):
 
 MISTAKES = {
     "forecast of a memory": ({"forecast": {"of": "total", "horizon": 1}}, "'total'"),
-    "horizon": ({"forecast": {"of": "price", "horizon": 0.3}}, r"0\.3 s.*0\.25"),
+    "horizon": ({"forecast": {"of": "price", "horizon": 0.3}}, r"0\.25 s.*0\.3 s"),
     "history of an expression": ({"history": {"of": "total", "length": 1}}, "'total'"),
     "length": ({"history": {"of": "q", "length": "99d"}}, "at most 2000"),
     "no limits": ({"observations": ["unlimited"]}, "'unlimited'.*min"),

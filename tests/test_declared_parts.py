@@ -10,8 +10,10 @@ from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
 from fmugym.checks import duration
-from fmugym.declared.expressions import Code, Expression, Names, function_of
+from fmugym.declared.computed import Value, function_of
+from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import FUNCTIONS
+from fmugym.vector.hooks.graph import Graph
 
 
 class Env:
@@ -19,11 +21,14 @@ class Env:
         self.a, self.b = a, b
 
 
-NAMES = Names(
-    {"a": Code("env.a"), "b": Code("env.b"), "flag": Code("(env.a > 0.0)", True)}.get,
-    lambda name: None,
-    lambda: ["a", "b", "flag"],
-)
+def function_of_text(text):
+    graph = Graph()
+    a, b = (Value.read(graph, name) for name in "ab")
+    found = {"a": a, "b": b, "flag": a > 0.0}
+    names = Names(graph, found.get, known=lambda: list(found))
+    value = Expression.parse(text).value(names)
+    return function_of(value)
+
 
 VALUES = np.array([0.0, -0.0, 0.3, -0.7, 1.5, -2.5, 3.0, 1e-300, -1e300, 5.0, math.pi, 80.0])
 PAIRS = np.array(np.meshgrid(VALUES, VALUES)).reshape(2, -1)
@@ -51,7 +56,7 @@ EXPRESSIONS = {
 
 @pytest.mark.parametrize("text", EXPRESSIONS)
 def test_an_expression_has_the_value_of_numpy(text):
-    function = function_of(Expression.parse(text).code(NAMES).text, {}, "test")
+    function = function_of_text(text)
     with np.errstate(all="ignore"):
         expected = EXPRESSIONS[text](*PAIRS)
     np.testing.assert_array_equal(function(Env(*PAIRS)), expected)
@@ -65,7 +70,7 @@ def calls():
 
 @pytest.mark.parametrize("text", [*EXPRESSIONS, *calls()])
 def test_one_number_has_the_same_value_as_an_element(text):
-    function = function_of(Expression.parse(text).code(NAMES).text, {}, "test")
+    function = function_of_text(text)
     together = function(Env(*PAIRS))
     alone = [float(function(Env(a, b))) for a, b in PAIRS.T.tolist()]
     same = np.asarray(together, float)
@@ -109,7 +114,7 @@ REFUSED = {
 @pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
 def test_what_is_not_in_the_grammar_is_refused(text):
     with pytest.raises(ConfigError, match=REFUSED[text]):
-        Expression.parse(text).code(NAMES)
+        function_of_text(text)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +122,7 @@ def test_what_is_not_in_the_grammar_is_refused(text):
 )
 def test_an_error_tells_the_column(text, column):
     with pytest.raises(ConfigError, match=rf"column {column} of"):
-        Expression.parse(text).code(NAMES)
+        function_of_text(text)
 
 
 METRE = Unit((0, 1, 0, 0, 0, 0, 0, 0), display_units={"mm": (1000.0, 0.0)})

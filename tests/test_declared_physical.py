@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from combinations import in_turn
 
 import fmugym
 from fmugym import FMUVectorEnv, Task, TaskEnv
@@ -58,8 +59,7 @@ def played(env, controller, steps=STEPS):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
-@pytest.mark.parametrize("kind", TASKS)
+@in_turn({"controller": list(CONTROLLERS), "kind": list(TASKS)})
 def test_the_form_for_agents_leaves_controllers_as_they_are(kind, controller):
     make = CONTROLLERS[controller]
     plain = played(fmugym.load(formed(TASKS[kind]), physical=True), make())

@@ -1,9 +1,11 @@
 """Warm-ups of declared tasks: controllers and data before an episode, and states that are kept."""
 
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from vector_tools import require_same_alone
 from zoo_tools import parameters, zoo_fmu
 
@@ -119,11 +121,12 @@ ACTIONS = {
 CLOCKS = {"distribution": "choice", "values": [0, 864000.0]}
 
 
-@pytest.mark.parametrize(
-    ("mode", "caches"), [("next_step", False), ("same_step", True)], ids=["", "cached"]
+@in_turn(
+    {
+        "hooks,kind": list(product(["compiled", "array", "per_env"], ACTIONS)),
+        "mode,caches": {"new": ("next_step", False), "cached": ("same_step", True)},
+    }
 )
-@pytest.mark.parametrize("kind", ACTIONS)
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
 def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
     agent, action = ACTIONS[kind]
     task = house(PID, agent, action, clock=CLOCKS)

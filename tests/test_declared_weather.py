@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from test_declared_features import AT_REST, BASE
 
 import fmugym
@@ -172,18 +173,17 @@ class TestYears:
 
 
 class TestMissing:
-    @pytest.mark.parametrize(
-        ("number", "code"), [(n, code) for n, (_, _, code) in FIELDS.items() if code]
-    )
-    def test_lines_lead_across_a_code(self, tmp_path, number, code):
-        _, value, _ = FIELDS[number]
-        values = [value] * 48
-        values[5], values[10:12] = code, [code, code]
-        values[47] = ""  # at the end, and blank
-        path = epw(tmp_path / "gaps.epw", days_of(1999, count=2), {number: values})
-        series = read(path, number)
-        assert set(series.values) == {float(value)}
-        assert (series.low, series.high, series.period) == (float(value), float(value), 172800)
+    def test_lines_lead_across_a_code(self, tmp_path):
+        coded = {n: (value, code) for n, (_, value, code) in FIELDS.items() if code}
+        columns = {n: [value] * 48 for n, (value, _) in coded.items()}
+        for number, (_, code) in coded.items():
+            columns[number][5], columns[number][10:12] = code, [code, code]
+            columns[number][47] = ""  # at the end, and blank
+        path = epw(tmp_path / "gaps.epw", days_of(1999, count=2), columns)
+        for number, (text, _) in coded.items():
+            series, value = read(path, number), float(text)
+            assert set(series.values) == {value}
+            assert (series.low, series.high, series.period) == (value, value, 172800)
 
     def test_a_gap_in_a_slope(self, tmp_path):
         values = [*range(1, 10), 99.9, 99.9, *range(12, 25)]
@@ -200,12 +200,11 @@ class TestMissing:
 
 
 class TestColumns:
-    @pytest.mark.parametrize("number", FIELDS)
-    def test_names_are_those_of_the_data_dictionary(self, tmp_path, number):
-        name, value, _ = FIELDS[number]
+    def test_names_are_those_of_the_data_dictionary(self, tmp_path):
         path = epw(tmp_path / "x.epw", days_of(1999, count=1), {})
-        np.testing.assert_array_equal(read(path, name).values, float(value))
-        np.testing.assert_array_equal(read(path, number).values, float(value))
+        for number, (name, value, _) in FIELDS.items():
+            np.testing.assert_array_equal(read(path, name).values, float(value))
+            np.testing.assert_array_equal(read(path, number).values, float(value))
 
     def test_any_encoding_of_the_place(self, tmp_path):
         head = [line.replace("Somewhere", "S\xe3o Paulo \x85") for line in HEAD]
@@ -363,8 +362,7 @@ class TestWeatherInModelica:
         table = self.write(tmp_path / "weather.mos", ends)
         return epw(tmp_path / "weather.epw", days_of(1999, count=2), columns), table
 
-    @pytest.mark.parametrize("interpolation", ["linear", "previous"])
-    @pytest.mark.parametrize("number", [7, 13, 14, 15, 22, 33])
+    @in_turn({"number": [7, 13, 14, 15, 22, 33], "interpolation": ["linear", "previous"]})
     def test_it_is_the_same_weather(self, both, number, interpolation):
         name, (weather, table) = FIELDS[number][0], both
         hours = np.linspace(0, 96, 4 * 97)[1:] - 0.01

@@ -41,9 +41,6 @@ def name_of(document):
     return "index" if document == INDEX else document.name
 
 
-each_document = pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
-
-
 def blocks(document, *languages):
     return [
         fence for fence in FENCE.finditer(document.read_text()) if fence["language"] in languages
@@ -61,11 +58,12 @@ def program(document):
     return "\n".join(lines) + "\n"
 
 
-@each_document
-def test_every_block_names_its_language(document):
-    for fence in FENCE.finditer(document.read_text()):
-        assert fence["language"] in NOT_PYTHON | {"python"}, fence["code"]
-    assert document.read_text().count("```") == 2 * len(FENCE.findall(document.read_text()))
+def test_every_block_names_its_language():
+    for document in DOCUMENTS:
+        text = document.read_text()
+        for fence in FENCE.finditer(text):
+            assert fence["language"] in NOT_PYTHON | {"python"}, f"{document}: {fence['code']}"
+        assert text.count("```") == 2 * len(FENCE.findall(text)), document
 
 
 @pytest.mark.parametrize("document", [d for d in DOCUMENTS if blocks(d, "python")], ids=name_of)
@@ -82,13 +80,13 @@ def test_python_runs(document, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-@each_document
-def test_links_within_the_repository_exist(document):
-    for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", document.read_text()):
-        path = document.parent / target if target else document
-        assert path.exists(), target
-        if anchor:
-            assert anchor in anchors(path), f"{target}#{anchor}"
+def test_links_within_the_repository_exist():
+    for document in DOCUMENTS:
+        for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", document.read_text()):
+            path = document.parent / target if target else document
+            assert path.exists(), f"{document}: {target}"
+            if anchor:
+                assert anchor in anchors(path), f"{document}: {target}#{anchor}"
 
 
 def anchors(document):

@@ -7,11 +7,12 @@ import fmpy
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import probe_fmu
 from vector_tools import ABSURD, IDS, Cart, Reaching
 
 import fmugym
-from fmugym import Choice, ConfigError, Normal, SimulationError, Uniform
+from fmugym import Choice, ConfigError, Normal, Uniform
 from fmugym.archive.bundled import FMI_VERSIONS
 from fmugym.testing import check_fmu_env
 
@@ -34,8 +35,7 @@ class Swing(fmugym.FMUEnv):
         return self.out["q"] > 2.0
 
 
-@pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
-@pytest.mark.parametrize("env_id", IDS)
+@in_turn({"env_id": IDS, "fmi_version": FMI_VERSIONS})
 def test_contract(env_id, fmi_version):
     env = gym.make(env_id, fmi_version=fmi_version)
     check_fmu_env(env)
@@ -103,15 +103,6 @@ def test_warm_up_runs_before_the_first_observation():
         assert warm.reset()[0].tolist() == first.tolist()
     warm.close()
     cold.close()
-
-
-def test_max_episode_steps_truncates():
-    env = Swing(max_episode_steps=3)
-    env.reset()
-    assert [env.step(0.0)[3] for _ in range(3)] == [False, False, True]
-    with pytest.raises(SimulationError, match="after the end of the episode"):
-        env.step(0.0)
-    env.close()
 
 
 def test_terminated_and_truncated_may_both_be_true():
@@ -278,38 +269,6 @@ def test_enumeration_parameters_by_name_and_value():
         env.close()
 
 
-@pytest.mark.parametrize("action", [0.01, np.float32(0.01), [0.01], np.array([0.01])])
-def test_forms_of_an_action(action):
-    env = Swing()
-    env.reset()
-    env.step(action)
-    assert env.inputs == (float(np.ravel(action)[0]),)
-    env.close()
-
-
-def test_a_refused_action_leaves_the_episode_as_it_was():
-    env, twin = Swing(), Swing()
-    env.reset()
-    twin.reset()
-    env.step(0.01)
-    twin.step(0.01)
-    with pytest.raises(ConfigError, match="must be finite"):
-        env.step(math.nan)
-    assert env.action == 0.01
-    assert env.step(0.02)[0].tolist() == twin.step(0.02)[0].tolist()
-    env.close()
-    twin.close()
-
-
-def test_observations_are_new_arrays():
-    env = Swing()
-    first, _ = env.reset()
-    kept = first.copy()
-    second, *_ = env.step(0.0)
-    assert first.tolist() == kept.tolist() != second.tolist()
-    env.close()
-
-
 def test_a_fault_truncates_with_the_last_good_observation():
     env = Cart(fault_reward=-7.0)
     env.reset()
@@ -321,20 +280,6 @@ def test_a_fault_truncates_with_the_last_good_observation():
     assert "t = 0.02 s" in info["fault"]
     assert np.isfinite(env.reset()[0]).all()  # mended
     assert np.isfinite(env.step(1.0)[0]).all()
-    env.close()
-
-
-def test_a_fault_may_terminate_or_raise():
-    env = Cart(on_fault="terminate")
-    env.reset()
-    assert env.step(ABSURD)[2:4] == (True, False)
-    env.close()
-    env = Cart(on_fault="raise")
-    env.reset()
-    with pytest.raises(SimulationError, match=r"returned Discard; the FMU said: .*finite"):
-        env.step(ABSURD)
-    env.reset()
-    env.step(0.0)
     env.close()
 
 

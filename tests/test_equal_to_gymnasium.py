@@ -6,6 +6,7 @@ import warnings
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.utils.env_checker import check_env
 
 import fmugym
@@ -182,8 +183,7 @@ def test_gravity_argument():
     ours.close()
 
 
-@pytest.mark.parametrize("fmi_version", FMI_VERSIONS)
-@pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "ModelicaCartPole"])
+@in_turn({"env_id": ["CartPole", "Pendulum", "ModelicaCartPole"], "fmi_version": FMI_VERSIONS})
 def test_gymnasiums_own_checker(env_id, fmi_version):
     """What it warns of is part of Gymnasium's own environments, or of the published task."""
     env = gym.make(f"fmugym/{env_id}-v0", fmi_version=fmi_version)

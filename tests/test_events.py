@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+from itertools import product
 
 import clocks_tools
 import exchange_tools
@@ -9,6 +10,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
+from combinations import in_turn
 from pool_tools import KINDS, open_pool, reset, start, step
 from vector_tools import require_same_alone
 
@@ -19,6 +21,11 @@ TIMED = ("constant", "fixed", "calculated", "tunable", "changing", "countdown")
 COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
 all_kinds = pytest.mark.parametrize("kind", [*KINDS, "wine"])
+PAIRS = [
+    *(("native", "CoSimulation"), ("native", "ModelExchange")),
+    *(("process", "ModelExchange"), ("wine", "CoSimulation")),
+]
+each_pair = pytest.mark.parametrize(("kind", "interface"), PAIRS)
 both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
@@ -65,9 +72,7 @@ def ticks_of(period=0.2, pace=0.5, until=10.0):
 
 
 class TestTimedClocks:
-    @all_kinds
-    @both_interfaces
-    @pytest.mark.parametrize("size", [0.1, 0.37, 1.3])
+    @in_turn({"kind,interface": PAIRS, "size": [0.1, 0.37, 1.3]})
     def test_each_ticks_at_its_times_within_steps(self, make_pool, kind, interface, size):
         pool = start(make_pool(kind, interface, outputs=COUNTS + LASTS, step=size))
         for index in range(int(5 / size)):
@@ -85,8 +90,7 @@ class TestTimedClocks:
             last = step(pool)[0, 0]
             assert last == pytest.approx(10.0 * (index + 1) - 0.05, abs=1e-10)
 
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_each_instance_has_its_own_clocks(self, make_pool, kind, interface):
         periods, paces = np.array([0.2, 0.3, 0.7]), np.array([0.5, 0.11, 1.3])
         pool = start(make_pool(kind, interface, n=3), {"period": periods, "pace": paces})
@@ -96,8 +100,7 @@ class TestTimedClocks:
             for name, times in ticks_of(periods[i], paces[i], until=2.3).items():
                 assert found[COUNTS.index(f"count of {name}"), i] == len(times)
 
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_a_new_interval_of_a_tunable_clock_begins_with_its_next_tick(
         self, make_pool, kind, interface
     ):
@@ -119,9 +122,7 @@ class TestTimedClocks:
 class TestEarlyReturn:
     """Without event mode: FMI 3.0 by a flag, FMI 2.0 by Discard and the last successful time."""
 
-    @all_kinds
-    @pytest.mark.parametrize("version", [2, 3])
-    @pytest.mark.parametrize("size", [0.1, 0.37])
+    @in_turn({"kind,version": list(product(KINDS, (2, 3))), "size": [0.1, 0.37]})
     def test_the_rest_of_the_step_follows(self, tmp_path, opened, kind, version, size):
         ends = {}
         for options in ((), ("-DEARLY=0.03",)):
@@ -129,26 +130,24 @@ class TestEarlyReturn:
                 tmp_path / "model.fmu", "dahlquist", version, ("CoSimulation",), "", options
             )
             fmu = FMU(path, probe_timeout=None)
-            pool = opened(open_pool(fmu, ["u"], ["x"], size, 2, KINDS.get(kind, {})))
+            pool = opened(open_pool(fmu, ["u"], ["x"], size, 2, KINDS[kind]))
             start(pool)
             ends[options] = [step(pool, 0.5)[0] for _ in range(10)]
         plain, early = ends.values()
         np.testing.assert_allclose(early, plain, rtol=2e-3)  # its Euler steps end elsewhere
 
-    @all_kinds
-    @pytest.mark.parametrize("name", ["constant", "fixed"])
+    @in_turn({"kind": list(KINDS), "name": ["constant", "fixed"]})
     def test_a_clock_without_interval_is_named(self, fmu_path, tmp_path, opened, kind, name):
         given = {"constant": ' intervalDecimal="0.1"', "fixed": ' intervalCounter="1"'}[name]
         fmu = FMU(fmu_tools.edited_fmu(fmu_path(), tmp_path, {given: ""}), probe_timeout=None)
-        pool = opened(open_pool(fmu, (), ["x"], options=KINDS.get(kind, {})))
+        pool = opened(open_pool(fmu, (), ["x"], options=KINDS[kind]))
         reset(pool)
         reference = list(clocks_tools.CLOCKS).index(name)
         assert f"value reference {reference} has an interval of nan" in pool.failure(0)
 
 
 class TestTriggeredClocks:
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_an_input_clock_ticks_when_it_is_set(self, make_pool, kind, interface):
         outputs = ("count of strike", "last strike", "strike")
         pool = start(make_pool(kind, interface, inputs=("strike",), outputs=outputs))
@@ -157,8 +156,7 @@ class TestTriggeredClocks:
         np.testing.assert_allclose(found[:, 1], [-1, 0.1, 0.2, 0.2, 0.4, 0.4], atol=1e-12)
         np.testing.assert_array_equal(found[:, 2], [0, 1, 1, 0, 1, 0])
 
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_an_output_clock_tells_whether_it_ticked_in_the_step(self, make_pool, kind, interface):
         pool = start(make_pool(kind, interface, outputs=("bell", "count of bell", "countdown")))
         found = np.array([step(pool)[:, 0] for _ in range(7)])
@@ -168,8 +166,7 @@ class TestTriggeredClocks:
 
 
 class TestClockedInputs:
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_a_value_takes_effect_with_the_next_tick(self, make_pool, kind, interface):
         pool = make_pool(
             kind, interface, inputs=("command", "plain"), outputs=("sample",), step=0.04
@@ -182,8 +179,7 @@ class TestClockedInputs:
         held = [max([values[int(t // 0.04)] for t in ticks if t <= e], default=0) for e in ends]
         np.testing.assert_array_equal(found, held)
 
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_so_do_those_of_arrays(self, make_pool, kind, interface):
         """Scalars and arrays, with and without clocks, in any order."""
         inputs = ("plains[2]", "command", "commands[1]", "plain", "plains[1]", "commands[2]")
@@ -201,8 +197,7 @@ class TestClockedInputs:
 
 
 class TestStates:
-    @all_kinds
-    @both_interfaces
+    @each_pair
     def test_a_restored_state_goes_on_with_the_same_ticks(self, make_pool, kind, interface):
         inputs = ("strike", "command")
         pool = make_pool(kind, interface, 2, inputs, COUNTS + LASTS + ("sample", "bell"))

@@ -8,6 +8,7 @@ import sys
 
 import fmpy
 import pytest
+from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name, probe_config, read_fmu
 
 from fmugym import FMU, FMULoadError, bundled_fmu
@@ -63,16 +64,14 @@ class TestHeaders:
         cut = library(folder)[:20]
         refused(cut, FOLDERS[folder], folder.split("-")[0], r"is cut short \(20 bytes\)")
 
-    @pytest.mark.parametrize("folder", ["x86_64-linux", "aarch64-linux"])
-    @pytest.mark.parametrize("part", [0.01, 0.2, 0.9])
+    @in_turn({"part": [0.01, 0.2, 0.9], "folder": ["x86_64-linux", "aarch64-linux"]})
     def test_cut_short(self, folder, part):
         """Linux would end the process with SIGBUS; other systems refuse such a library."""
         content = library(folder)
         cut = content[: int(part * len(content))]
         refused(cut, FOLDERS[folder], folder.split("-")[0], "is cut short")
 
-    @pytest.mark.parametrize("suffix", [".so", ".dll", ".dylib"])
-    @pytest.mark.parametrize("content", [b"", b"#!/bin/sh", bytes(1000)])
+    @in_turn({"suffix": [".so", ".dll", ".dylib"], "content": [b"", b"#!/bin/sh", bytes(1000)]})
     def test_none_at_all(self, suffix, content):
         refused(content, suffix, "x86_64", "is not a shared library")
 

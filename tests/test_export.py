@@ -5,6 +5,7 @@ import ctypes
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from export_tools import (
     ACTIVATIONS,
     FUNCTIONS,
@@ -451,8 +452,7 @@ class TestFunctions:
 
 
 class TestNetworks:
-    @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda one: one.name)
-    @pytest.mark.parametrize("squashed", [False, True])
+    @in_turn({"activation": {one.name: one for one in ACTIVATIONS}, "squashed": [False, True]})
     def test_activations(self, activation, squashed, tmp_path):
         env = made("Pendulum")
         self._compare(env, network_with(activation, env, squashed), tmp_path)

@@ -13,6 +13,7 @@ import fmpy
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from export_tools import (
     TIMED,
     TIMES,
@@ -155,7 +156,7 @@ def sampling(controller, logic):
 class TestClosedLoop:
     """The environment with its agent, and two FMUs in FMPy."""
 
-    @pytest.mark.parametrize("env_id", ["CartPole", "Pendulum", "House"])
+    @in_turn({"env_id": ["CartPole", "Pendulum", "House"], "version": VERSIONS}, ["version"])
     def test_the_exported_agent_controls_the_plant(self, env_id, version, tmp_path):
         env = made(env_id)
         network = network_for(env)
@@ -170,7 +171,7 @@ class TestClosedLoop:
         assert worst <= 1e-5
         env.close()
 
-    @pytest.mark.parametrize("times", ["drawn", "after a warm-up"])
+    @in_turn({"times": ["drawn", "after a warm-up"], "version": VERSIONS}, ["version"])
     def test_from_several_start_times(self, times, version, tmp_path, load):
         env = load(TIMED | TIMES[times])
         network = network_for(env, scaled=False)
@@ -211,7 +212,7 @@ class TestClosedLoop:
 class TestSystems:
     """The exported agent and the plant as components of a system."""
 
-    @pytest.mark.parametrize("task", ["history", "memory", "levels"])
+    @in_turn({"task": ["history", "memory", "levels"], "version": VERSIONS}, ["version"])
     def test_the_agent_controls_the_plant(self, task, version, tmp_path):
         env = heating(task)
         network = network_for(env, scaled=False)
@@ -361,7 +362,7 @@ class TestMistakes:
             write_fmu(agent, tmp_path / "agent.fmu")
 
 
-@pytest.mark.parametrize("name", ["get", "agent", "controller"])
+@in_turn({"name": ["get", "agent", "controller"], "version": VERSIONS}, ["version"])
 def test_names_of_agents_meet_no_others(name, version, tmp_path):
     env = made("CartPole")
     agent = agent_of(env, network_for(env), name=name)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import test_export
 import test_export_search
+from combinations import in_turn
 from export_tools import (
     ACTIVATIONS,
     FUNCTIONS,
@@ -157,8 +158,7 @@ class TestModel:
         assert facts["memory"].keys() == {"count", "clock"}
         onnx.checker.check_model(str(path), full_check=True)
 
-    @pytest.mark.parametrize("activation", ACTIVATIONS, ids=lambda one: one.name)
-    @pytest.mark.parametrize("squashed", [False, True])
+    @in_turn({"activation": {one.name: one for one in ACTIVATIONS}, "squashed": [False, True]})
     def test_activations(self, activation, squashed, tmp_path):
         env = made("Pendulum")
         network = network_with(activation, env, squashed)

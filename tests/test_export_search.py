@@ -2,10 +2,12 @@
 
 import shutil
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from export_tools import compiled, drawn_in, exported
 from fmpy.validation import validate_fmu
 from test_export import HEATING, PRESENT, TASKS, Filtered
@@ -19,7 +21,8 @@ from fmugym.search.agent import Agent
 from fmugym.search.policy import Form, Policy
 from fmugym.tools.cli import main
 
-LINEAR, HISTORY = Form("linear"), Form("linear with history", history=True)
+LINEAR = Form("linear", 0, 0)  # each task replaces the sizes
+HISTORY = Form("linear with history", 0, 0, history=True)
 PAIR = {
     "variables": HEATING["variables"] | {"gains": {"name": "Q_int", "min": 0, "max": 500}},
     "agent": PRESENT | {"actions": ["u", "gains"]},
@@ -34,8 +37,8 @@ HEATERS = {
     "a change": (TASKS["change"], PID, HISTORY),
     "a rate": (TASKS["rate"], None, HISTORY),
     "levels": (TASKS["levels"], PID, LINEAR),
-    "memory": (TASKS["memory"], None, Form("network", hidden=(8, 4))),
-    "two actions": (PAIR, None, Form("network", hidden=(16,), history=True)),
+    "memory": (TASKS["memory"], None, Form("network", 0, 0, hidden=(8, 4))),
+    "two actions": (PAIR, None, Form("network", 0, 0, hidden=(16,), history=True)),
 }  # fmt: skip
 
 
@@ -47,14 +50,14 @@ def heater(task):
 def agent_for(env, text, form, seed=0):
     """An agent with random weights, which sees values around those at the beginning."""
     known, rng = Policy(None).bind(env), np.random.default_rng(seed)
-    sizes = len(known.names), known.acting
     if form is None:
         return Agent("by hand", text)
+    form = replace(form, observed=len(known.names), acting=known.acting)
     values = gymnasium.spaces.flatten(env.observation_space, env.reset(seed=seed)[0])
-    count = form.features(*sizes)
-    mean = np.concatenate([values, 0 * values, values, np.zeros(sizes[1])])[:count]
+    count = form.features
+    mean = np.concatenate([values, 0 * values, values, np.zeros(form.acting)])[:count]
     scale = mean + rng.normal(size=count), rng.uniform(0.5, 2, count)
-    weights = rng.normal(size=form.size(*sizes)) / 2
+    weights = rng.normal(size=form.size) / 2
     return Agent("by hand", text, form, weights, scale, known.names, str(env.action_space))
 
 
@@ -107,7 +110,7 @@ class Agents:
         ("text", "form"),
         [
             (None, HISTORY),
-            (None, Form("network", hidden=(8,))),
+            (None, Form("network", 0, 0, hidden=(8,))),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", None),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", HISTORY),
         ],
@@ -128,7 +131,7 @@ class Agents:
     @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
     def test_of_a_constant(self, text, tmp_path):
         env = heater({"agent": PRESENT})
-        agent = agent_for(env, text, Form("constant", blind=True))
+        agent = agent_for(env, text, Form("constant", 0, 0, blind=True))
         made = agent_of(env, agent)
         assert made.network is None
         assert [one.name for one in made.logic.measurements] == ["T_op"] * (text is not None)
@@ -176,8 +179,7 @@ class TestInC(Agents):
 
 
 @pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
-@pytest.mark.parametrize("version", ["2.0", "3.0"])
-@pytest.mark.parametrize("task", ["a controller", "a controller and a history"])
+@in_turn({"version": ["2.0", "3.0"], "task": ["a controller", "a controller and a history"]})
 def test_as_an_fmu(version, task, tmp_path):
     document, text, form = HEATERS[task]
     env = heater(document)

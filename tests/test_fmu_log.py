@@ -5,6 +5,7 @@ import logging
 import threading
 
 import pytest
+from combinations import in_turn
 from fmu_tools import (
     MAJOR_VERSIONS,
     PlainEnv,
@@ -27,8 +28,7 @@ def records(caplog, name="fmugym.PlainEnv"):
     return [(r.levelname, r.getMessage()) for r in caplog.records if r.name == name]
 
 
-@pytest.mark.parametrize("version", MAJOR_VERSIONS)
-@pytest.mark.parametrize(("status", "level"), LEVELS.items())
+@in_turn({"status,level": LEVELS.items(), "version": MAJOR_VERSIONS})
 def test_level_and_text(probe, caplog, version, status, level):
     config = probe_config(model_parameters={"log_status": status, "label": "Träger"})
     env = PlainEnv(probe(version), config, logging.INFO)

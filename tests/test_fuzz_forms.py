@@ -13,7 +13,7 @@ def test_damaged_forms_and_messages():
     tally = fuzz_driver.run(fuzz_forms.program, 120, seed="tests")
     assert tally.failures == []
     kinds = {kind for kind, _ in tally.counts}
-    assert kinds == {"pool", "listing", "draws", "program", "request", "answer"}
+    assert kinds == {"pool", "listing", "draws", "play", "program", "request", "answer"}
 
 
 def test_a_parent_that_believes_everything_is_reported(monkeypatch):

@@ -36,12 +36,12 @@ def test_is_as_it_was(name, folder):
     require_same(name, CASES[name](folder))
 
 
-@pytest.mark.parametrize("name", [n for n in RESULTS if re.match("bundled|exchange|sys|way", n)])
-def test_is_that_of_fmi_2(name):
+def test_all_are_those_of_fmi_2():
     """So what others compute for FMI 2.0 is a reference for all versions."""
-    found, expected = numbers(name), numbers(re.sub(r" [13](?=[. ]|$)", " 2", name))
-    both = min(len(found), len(expected))  # a state of FMI 1.0 is not restored
-    np.testing.assert_array_equal(found[:both], expected[:both])
+    for name in (name for name in RESULTS if re.match("bundled|exchange|sys|way", name)):
+        found, expected = numbers(name), numbers(re.sub(r" [13](?=[. ]|$)", " 2", name))
+        both = min(len(found), len(expected))  # a state of FMI 1.0 is not restored
+        np.testing.assert_array_equal(found[:both], expected[:both], name)
 
 
 def test_texts_of_mistakes_are_as_they_were(tmp_path):

@@ -9,6 +9,7 @@ import gymnasium as gym
 import lawful_tools
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped, probe_config
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
@@ -198,8 +199,7 @@ class TestHealth:
         pool.forget_health()
         assert not any(counts.any() for counts in pool.health().values())
 
-    @every_version
-    @pytest.mark.parametrize(("code", "kind"), [(3, "errors"), (4, "fatals")])
+    @in_turn({"version": MAJOR_VERSIONS, "code,kind": [(3, "errors"), (4, "fatals")]})
     def test_recovery(self, make_env, version, code, kind):
         """After Error by a reset, after Fatal by a new instance."""
         env = make_env(version, model_parameters={"fault": code, "fault_step": 2})
@@ -267,8 +267,7 @@ class TestLeaks:
             between()
         return grown_bytes() - before
 
-    @pytest.mark.parametrize("version", [1, 2])
-    @pytest.mark.parametrize("leak", [LEAK, -LEAK], ids=["until the end", "for ever"])
+    @in_turn({"version": [1, 2], "leak": {"until the end": LEAK, "for ever": -LEAK}})
     def test_the_log_says_so_once(self, make, version, leak, caplog):
         pool = make(version, 1, leak_limit=self.LIMIT)
         assert self.play(pool, leak=leak) > self.RESETS * self.LEAK / 2

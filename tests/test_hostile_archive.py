@@ -11,6 +11,7 @@ import time
 import zipfile
 
 import pytest
+from combinations import in_turn
 from fmu_tools import PlainEnv, edited_fmu, probe_config, probe_fmu, probe_xml, write_fmu
 
 from fmugym import FMU, FMULoadError, SimulationError
@@ -145,8 +146,7 @@ class TestTime:
 
 
 class TestNumbers:
-    @pytest.mark.parametrize("reference", [-1, 2**32, 2**63, 10**30])
-    @pytest.mark.parametrize("version", [1, 2, 3])
+    @in_turn({"reference": [-1, 2**32, 2**63, 10**30], "version": [1, 2, 3]})
     def test_references_beyond_32_bits(self, tmp_path, reference, version):
         edits = {'valueReference="0"': f'valueReference="{reference}"'}
         path = probe_fmu(tmp_path, version, edits)

@@ -131,10 +131,10 @@ class TestSwing:
         ("arguments", "match"),
         [
             ((0.01, np.zeros(50), np.zeros(50)), "is there motion"),
-            ((0.01, np.zeros(50), np.zeros(49)), "same shapes"),
+            ((0.01, np.zeros(50), np.zeros(49)), r"shape \(50,\)"),
             ((0.01, [0.0, 1.0], [1.0, 0.0]), "three samples"),
             ((0.01, np.arange(5.0), np.full(5, np.nan)), "finite"),
-            ((np.array([0.0, 2.0, 1.0, 3.0]), np.arange(4.0), np.arange(4.0)), "increasing"),
+            ((np.array([0.0, 2.0, 1.0, 3.0]), np.arange(4.0), np.arange(4.0)), "increase"),
         ],
     )
     def test_mistakes(self, arguments, match):
@@ -368,7 +368,7 @@ def simulate(torques):
 
 def test_scipy_is_named_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy.optimize", None)
-    with pytest.raises(ImportError, match="'identification'"):
+    with pytest.raises(fmugym.ConfigError, match="'identification'"):
         fit_parameters(PENDULUM, {"b": 1e-3}, noisy(0, 1.0))
 
 

@@ -6,6 +6,8 @@ import signal
 import exchange_tools
 import numpy as np
 import pytest
+from combinations import in_turn
+from gymnasium.vector import AutoresetMode
 from process_tools import FaultyEnv, faulty_fmu, start_values
 from test_vector_tasks import Delayed, Goal, Tables, Tracking
 from vector_tools import (
@@ -22,6 +24,7 @@ from fmugym import ConfigError, FMUVectorEnv, SimulationError, _native
 from fmugym.pool.around import PlayAround
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
+from fmugym.pool.requests import Answer, Request, request_listing
 
 
 @pytest.fixture(name="make")
@@ -83,9 +86,11 @@ class TwoPendulums(fmugym.FMUEnv):
         return np.abs(self.state[0]) > 3.0
 
 
-@each_mode
-@pytest.mark.parametrize(
-    "cls", [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables]
+@in_turn(
+    {
+        "cls": [Short, CART_POLE, Sampled, TwoPendulums, Tracking, Delayed, Goal, Tables],
+        "mode": list(AutoresetMode),
+    }
 )
 def test_results_are_those_of_one_process(make, cls, mode):
     """To the last bit, with episodes that start in every way."""
@@ -219,7 +224,9 @@ def test_a_pool_without_a_library_steps_nothing(make):
     assert around._pool.step_own() == 3
     nothing = _native.Access(form_of_listing(()))
     assert around._pool.reset(nothing, np.zeros((0, 3)), None, None) == 3
-    assert around._pool.read(nothing, np.zeros((0, 3))) == 0
+    code, answer = around._pool.ask(Request.READ, request_listing((), 2))
+    assert code == Answer.FAILURE
+    assert answer[:8] == bytes(8)
     np.testing.assert_array_equal(envs.inside.pool.outputs, before)
     around._pool.close()
     with pytest.raises(SimulationError, match="closed"):

@@ -2,9 +2,11 @@
 
 import os
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
+from process_tools import linux_only, wait_until
 from test_isolated_hooks import Sampled, TwoPendulums
 from test_single_compiled import (
     TASKS,
@@ -84,6 +86,22 @@ def test_a_process_that_is_killed(cart):
         env.reset(seed=3)
     require_same_steps(cart, other, 1, 0, 0, 1)
     assert cart.health["deaths"] == 1
+
+
+@linux_only
+def test_a_worker_that_sleeps_is_woken(cart):
+    """It watches for the next message for 40 us only."""
+    (pid,) = cart.inside.pool.processes()
+
+    def sleeps():
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "S"
+
+    with fmugym.envs.CartPoleEnv(hooks="python") as other:
+        other.reset(seed=0)
+        other.step(0)
+        for _ in range(3):
+            wait_until(sleeps)
+            require_same_steps(cart, other, 1)
 
 
 def test_interrupts_in_a_step_end_the_episode(cart):

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from lab_tools import (
-    TOKEN,
     experiment,
     fixture_lab,  # noqa: F401  # the fixture "lab"
     track,
@@ -13,7 +12,7 @@ from lab_tools import (
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError
-from fmugym.lab import HARDWARE, IDEAL, CellType, Client, Lab, LabError, ManualClock
+from fmugym.lab import HARDWARE, CellType, Lab, LabError, ManualClock
 
 WEIGHT = 0.06 * 9.81 * 0.1  # N m
 INERTIA = 0.06 * 0.1**2  # kg m^2
@@ -53,14 +52,6 @@ class TestMotion:
             lab.clock.advance(0.01)
             often.get_velocity(first)
         assert often.get_position(first) == seldom.get_position(second)
-
-    def test_cells_are_independent(self, lab):
-        pushed, first = experiment(lab)
-        resting, second = experiment(lab)
-        pushed.set_torque(0.05, first)
-        lab.clock.advance(0.1)
-        assert pushed.get_position(first) > 0.1
-        assert resting.get_position(second) == pytest.approx(0.0, abs=1e-12)
 
     def test_double_integrator_has_no_weight(self, lab):
         client, token = experiment(lab, "DoubleIntegrator", initial_position=[1.0])
@@ -140,11 +131,6 @@ class TestDrive:
 
 
 class TestStartPosition:
-    def test_ideal_cells_start_where_they_are_told(self, lab):
-        client, token = experiment(lab, initial_position=[-2.5])
-        assert client.get_position(token) == pytest.approx(-2.5, abs=1e-12)
-        assert client.get_velocity(token) == 0.0
-
     @pytest.mark.parametrize(
         ("asked", "measured"),
         [(0.6, 0.468), (1.0, 0.787), (1.4, 1.119), (1.9, 1.587), (2.4, 2.133)],
@@ -234,18 +220,8 @@ class TestReadings:
         reference = 0.006 / 4e-4 * (1 - math.exp(-4e-4 / INERTIA * (0.2 - LAG)))
         assert velocity == pytest.approx(reference, abs=0.003)  # 0.038 less than it is
 
-    def test_ideal_readings_are_the_truth(self, lab):
-        client, token = experiment(lab, initial_position=[1.0])
-        track(lab, client, token, 0.4)
-        cell = lab._bookings.cells[0]
-        readings = [getattr(client, f"get_{what}")(token) for what in NAMES]
-        assert readings == [*cell.position, *cell.velocity, *cell.torque]
-
 
 class TestFriction:
-    def test_ideal_cells_have_none_but_the_viscous(self):
-        assert IDEAL.coulomb_friction == (0.0, 0.0)
-
     def test_each_hardware_cell_draws_its_own(self):
         with make_lab("hardware") as lab:
             drawn = [cell._parameters["c"] for cell in lab._bookings.cells[:4]]
@@ -298,6 +274,3 @@ class TestSeeds:
             readings.setdefault(seed, []).append(swing)
         assert readings[1][0] == readings[1][1]
         assert readings[1][0] != readings[2][0]
-
-    def test_token_of_a_user_does_not_matter(self, lab):
-        Client(lab).start_experiment(TOKEN * 2, "SimplePendulum", 1)

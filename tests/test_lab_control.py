@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from lab_tools import (
     experiment,
     fixture_double,  # noqa: F401  # the fixture "double"
@@ -81,8 +82,12 @@ class TestSetters:
         client.set_impedance_controller_params([0.1, None], [None, 0.01], token)
         assert "kp [0.1, 0.0] N m/rad, kd [0.0, 0.01]" in client.get_logs(token)
 
-    @pytest.mark.parametrize("setter", ["set_position", "set_velocity", "set_torque"])
-    @pytest.mark.parametrize("value", [0.1, [0.1], [0.1, 0.1, 0.1], []])
+    @in_turn(
+        {
+            "value": [0.1, [0.1], [0.1, 0.1, 0.1], []],
+            "setter": ["set_position", "set_velocity", "set_torque"],
+        }
+    )
     def test_wrong_length_for_two(self, double, setter, value):
         client, token = double
         with pytest.raises(RuntimeError, match=r"has \d entries.* 2 joints"):

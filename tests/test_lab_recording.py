@@ -17,7 +17,7 @@ from lab_tools import (
 )
 
 from fmugym import ConfigError
-from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, video_files
+from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, videos
 from fmugym.rendering import palette
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="writes and reads the videos")
@@ -32,7 +32,7 @@ def fixture_no_ffmpeg(monkeypatch):
 def hide(monkeypatch, *hidden):
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        video_files.importlib.util, "find_spec", lambda name: None if name in hidden else find(name)
+        videos.importlib.util, "find_spec", lambda name: None if name in hidden else find(name)
     )
 
 

@@ -1,8 +1,10 @@
 """The leak watch in simulated processes: whatever their heap does, it judges the FMU alone."""
 
 import logging
+from itertools import product
 
 import pytest
+from combinations import in_turn
 
 from fmugym.pool import leaks
 from fmugym.pool.health import Column, no_counts
@@ -69,15 +71,10 @@ def sometimes(number):
     return {0: 16 * MB, 50: -16 * MB}.get(number % 100, 0)
 
 
-callers = pytest.mark.parametrize("caller", [nothing, keeps, sometimes])
-heaps = pytest.mark.parametrize("heap_is_known", [True, False])
-trims = pytest.mark.parametrize("trims", [True, False])
+CALLERS = list(product([nothing, keeps, sometimes], [True, False]))
 
 
-@callers
-@heaps
-@trims
-@pytest.mark.parametrize("free", [0, 20 * MB])
+@in_turn({"caller,trims": CALLERS, "heap_is_known": [True, False], "free": [0, 20 * MB]})
 def test_a_leak_is_told_once(process, caller, free, trims, heap_is_known):
     one = process(leak=LEAK, free=free, trims=trims, heap_is_known=heap_is_known)
     one.play(20_000, caller)
@@ -93,9 +90,7 @@ def test_soon(process):
     assert len(one.text) == 1
 
 
-@callers
-@heaps
-@trims
+@in_turn({"caller,trims": CALLERS, "heap_is_known": [True, False]})
 def test_what_the_caller_takes_is_not_the_fmus(process, caller, trims, heap_is_known):
     one = process(trims=trims, heap_is_known=heap_is_known)
     one.play(20_000, caller)

@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from demanding_tools import STEP, DemandingEnv, expected_outputs, make_fmu
 
 import fmugym
@@ -204,8 +205,7 @@ class TestRefusal:
 
 
 class TestWaiting:
-    @pytest.mark.parametrize("token", TOKENS)
-    @pytest.mark.parametrize("config", [{}, {"isolation": "process"}, {"probe_timeout": None}])
+    @in_turn({"config": [{}, {"isolation": "process"}, {"probe_timeout": None}], "token": TOKENS})
     def test_ends_when_another_program_returns_its_seat(
         self, folder, seats, other_program, token, config, caplog
     ):

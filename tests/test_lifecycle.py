@@ -11,6 +11,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, library_name, probe_config, probe_fmu
 from gymnasium import spaces
 from process_tools import run_python
@@ -40,9 +41,8 @@ for _ in range(4):
 
 
 class TestTemporaryFolders:
-    @every_version
-    def test_gone_after_close(self, make_env, version, temp_root):
-        env = make_env(version)
+    def test_gone_after_close(self, make_env, temp_root):
+        env = make_env()
         env.reset()
         env.step(0.0)
         assert len(list(temp_root.iterdir())) == 1
@@ -50,18 +50,19 @@ class TestTemporaryFolders:
         assert list(temp_root.iterdir()) == []
         env.close()
 
-    @every_version
-    def test_gone_at_garbage_collection(self, probe, version, temp_root):
-        env = PlainEnv(probe(version), probe_config())
+    def test_gone_at_garbage_collection(self, probe, temp_root):
+        env = PlainEnv(probe(), probe_config())
         for _ in range(3):
             env.reset()
         del env
         gc.collect()
         assert list(temp_root.iterdir()) == []
 
-    @every_version
-    @pytest.mark.parametrize(
-        "ending", ["", "del env", "env.close()", "raise SystemExit", "globals().clear()"]
+    @in_turn(
+        {
+            "ending": ["", "del env", "env.close()", "raise SystemExit", "globals().clear()"],
+            "version": MAJOR_VERSIONS,
+        }
     )
     def test_gone_at_the_end_of_the_interpreter(self, probe, version, temp_root, ending):
         run(OPEN_AND_STEP + ending, probe(version))
@@ -72,8 +73,7 @@ class TestTemporaryFolders:
         run(code + "\nfinally:\n    raise SystemExit", probe(2))
         assert list(temp_root.iterdir()) == []
 
-    @every_version
-    @pytest.mark.parametrize("stage", ["token", "library", "hook"])
+    @in_turn({"stage": ["token", "library", "hook"], "version": MAJOR_VERSIONS})
     def test_gone_after_a_failed_construction(
         self, probe, tmp_path, version, temp_root, same_working_directory, stage
     ):

@@ -6,6 +6,7 @@ import exchange_tools
 import foreign_tank
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import CLAIMING_DERIVATIVES, edited_fmu, probe_fmu
 from pool_tools import open_pool, start, step
 from pythonfmu.builder import FmuBuilder
@@ -46,9 +47,13 @@ def test_an_fmu_with_arguments_of_its_own():
         linearize(preloading)
 
 
-@each_version
-@pytest.mark.parametrize("angle", [0.0, 1.0, np.pi, -2.5])
-@pytest.mark.parametrize(("velocity", "coulomb"), [(0.0, 0.0), (0.03, 2e-3), (-4.0, 3e-3)])
+@in_turn(
+    {
+        "angle": [0.0, 1.0, np.pi, -2.5],
+        "velocity,coulomb": [(0.0, 0.0), (0.03, 2e-3), (-4.0, 3e-3)],
+        "version": ["2.0", "3.0"],
+    }
+)
 def test_the_pendulum_against_the_closed_form(version, angle, velocity, coulomb):
     at = {"theta_0": angle, "theta_dot_0": velocity, "c": coulomb, "tau": 0.01}
     model = linearize_bundled("Pendulum", version, at=at)

@@ -5,6 +5,7 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 
 import fmugym
 from fmugym import ConfigError
@@ -45,8 +46,7 @@ def played(env, episodes=3, steps=30):
     return found
 
 
-@pytest.mark.parametrize("data_format", ["hdf5", "parquet"])
-@pytest.mark.parametrize("env_id", IDS)
+@in_turn({"env_id": IDS, "data_format": ["hdf5", "parquet"]})
 def test_recordings_come_back_to_the_last_bit(env_id, data_format):
     if data_format == "parquet":
         pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")

@@ -5,6 +5,7 @@ import math
 import fmpy
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import ITEMS, MAJOR_VERSIONS, edited_fmu, probe_fmu, read_fmu, write_fmu
 
 from fmugym import FMU, ConfigError, FMULoadError, bundled_fmu
@@ -78,24 +79,14 @@ class TestSettability:
     """The rules of the standard by causality and variability, the same in all versions."""
 
     @pytest.mark.parametrize("version", MAJOR_VERSIONS)
-    @pytest.mark.parametrize(
-        ("name", "at_start", "in_step"),
-        [
-            ("a", True, True),
-            ("gain", True, False),
-            ("trim", True, True),
-            ("seven", False, False),
-            ("double_gain", False, False),
-            ("mix", False, False),
-            ("stop", False, False),
-            ("label", True, False),
-        ],
-    )
-    def test_when_a_variable_may_be_set(self, probe, version, name, at_start, in_step):
-        variable = describe(probe(version)).variable(name)
-        assert variable.settable_at_start is at_start
-        fixed_in_fmi1 = version == 1 and name == "trim"  # FMI 1.0 has no tunable parameters
-        assert variable.settable_in_step is (in_step and not fixed_in_fmi1)
+    def test_when_a_variable_may_be_set(self, probe, version):
+        """FMI 1.0 has no tunable parameters."""
+        names = ("a", "gain", "trim", "label", "seven", "double_gain", "mix", "stop")
+        found = {name: describe(probe(version)).variable(name) for name in names}
+        at_start = [name for name in names if found[name].settable_at_start]
+        assert at_start == ["a", "gain", "trim", "label"]
+        in_step = [name for name in names if found[name].settable_in_step]
+        assert in_step == (["a"] if version == 1 else ["a", "trim"])
 
     def test_an_output_with_a_start_value_may_be_set_at_the_start_in_fmi_1(self, tmp_path):
         old = 'causality="output" variability="continuous"><Real >'
@@ -227,6 +218,9 @@ class TestOtherFacts:
         assert describe(path).fmi_major_version == 3
 
 
+PATHS = ("../../x", "/tmp/x", "a\\b", "c:x", "", ".", "..", "a\nb", "x" * 300)
+
+
 class TestRefused:
     @pytest.mark.parametrize("count", ["-1", "99999999999"])
     def test_a_number_of_equations_that_cannot_be(self, tmp_path, count):
@@ -238,10 +232,7 @@ class TestRefused:
         path = probe_fmu(tmp_path, 3, {"CoSimulation": "ScheduledExecution"})
         refused(path, "co-simulation or model exchange.*scheduled execution")
 
-    @pytest.mark.parametrize("version", MAJOR_VERSIONS)
-    @pytest.mark.parametrize(
-        "identifier", ["../../x", "/tmp/x", "a\\b", "c:x", "", ".", "..", "a\nb", "x" * 300]
-    )
+    @in_turn({"identifier": PATHS, "version": MAJOR_VERSIONS})
     def test_a_model_identifier_that_is_a_path(self, tmp_path, identifier, version):
         text = identifier.replace("\n", "&#10;")
         edits = {'modelIdentifier="Probe"': f'modelIdentifier="{text}"'}

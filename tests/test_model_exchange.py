@@ -10,6 +10,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import wine_tools
+from combinations import in_turn
 from pool_tools import KINDS, open_pool, start, step
 from scipy.integrate import solve_ivp
 
@@ -25,6 +26,15 @@ from fmugym.tools.skeleton import Skeleton
 DERIVATIVES = 'providesDirectionalDerivative="true"'
 all_solvers = pytest.mark.parametrize("solver", SOLVERS)
 all_versions = pytest.mark.parametrize("version", [1, 2, 3])
+each_solver_and_version = in_turn(
+    {
+        "kind,version": [
+            *(("native", version) for version in (1, 2, 3, 2)),
+            *(("wine", version) for version in (1, 3)),
+        ],
+        "solver": SOLVERS,
+    }
+)
 with_states = pytest.mark.parametrize("version", [2, 3])
 
 
@@ -62,8 +72,7 @@ def run(pool, steps, values=None):
 
 
 class TestSolvers:
-    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
-    @pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
+    @in_turn({"tolerance": [1e-4, 1e-6, 1e-8], "solver": ["dormand_prince", "rosenbrock"]})
     def test_adaptive_steps_keep_the_tolerance(self, make_pool, solver, tolerance):
         pool = make_pool("van_der_pol", 0.5, solver=solver, tolerance=tolerance)
         found = run(pool, 20)
@@ -104,8 +113,10 @@ class TestSolvers:
             x = u + (x - u) * math.exp(-0.1)
             assert step(pool, u)[0, 0] == pytest.approx(x, abs=2e-4 if solver == "euler" else 1e-6)
 
-    @pytest.mark.parametrize("solver", ["dormand_prince", "rosenbrock"])
-    @pytest.mark.parametrize("kind", ["native", "wine"])
+    @pytest.mark.parametrize(
+        ("kind", "solver"),
+        [("native", "dormand_prince"), ("native", "rosenbrock"), ("wine", "rosenbrock")],
+    )
     def test_adaptive_steps_get_shorter_where_the_fmu_discards(self, make_pool, solver, kind):
         outputs = ["x", "discards"]
         pool = make_pool("tank", 0.19, kind, outputs=outputs, solver=solver, tolerance=0.01)
@@ -146,9 +157,7 @@ class TestEvents:
                 return v * t - g * t * t / 2
             t -= 2 * v / g
 
-    @all_solvers
-    @all_versions
-    @pytest.mark.parametrize("kind", ["native", "wine"])
+    @each_solver_and_version
     def test_bounces_are_where_the_closed_form_has_them(self, make_pool, solver, version, kind):
         spec = {"solver": solver, "max_step": 1e-3}
         pool = make_pool("ball", 0.05, kind, outputs=["h"], version=version, **spec)
@@ -174,9 +183,7 @@ class TestEvents:
         assert "100000 events" in pool.failure(0)
         assert "t = 2.558" in pool.failure(0)
 
-    @all_solvers
-    @all_versions
-    @pytest.mark.parametrize("kind", ["native", "wine"])
+    @each_solver_and_version
     def test_time_events_and_the_wish_to_stop(self, make_pool, solver, version, kind):
         pool = make_pool("stair", 0.3, kind, outputs=["count"], solver=solver, version=version)
         start(pool)
@@ -187,8 +194,7 @@ class TestEvents:
         outputs, statuses = pool.step()
         assert (outputs[0, 0], statuses[0]) == (10, Status.TERMINATED)
 
-    @all_solvers
-    @all_versions
+    @in_turn({"solver": SOLVERS, "version": [1, 2, 3]})
     def test_events_after_complete_steps(self, make_pool, solver, version):
         outputs = ["x", "turns"]
         spec = {"solver": solver, "max_step": 0.1, "version": version}
@@ -197,8 +203,7 @@ class TestEvents:
         expected = [[0, 0], [0.5, 0], [1, 1], [0.5, 1], [0, 2], [0.5, 2], [1, 3], [0.5, 3]]
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
-    @with_states
-    @pytest.mark.parametrize("kind", ["native", "wine"])
+    @pytest.mark.parametrize(("kind", "version"), [("native", 2), ("native", 3), ("wine", 3)])
     def test_the_wish_to_stop_after_a_step(self, make_pool, version, kind):
         pool = make_pool("relay", 0.5, kind, outputs=["x", "turns"], max_step=0.1, version=version)
         start(pool, {"last": 2})
@@ -349,6 +354,8 @@ class TestPools:
     """The contract of ``fmugym.pool.base`` for pools of model exchange."""
 
     every_kind = pytest.mark.parametrize("kind", [*KINDS, "wine"])
+    PAIRS = (("native", 3), ("native", 1), ("process", 2), ("wine", 1), ("wine", 3))
+    STATES = (("native", 2), ("native", 3), ("process", 3), ("wine", 2))
     CASES = (
         ("ball", [], ["h", "v", "bounces"], "h", "dormand_prince"),
         ("circuit", ["duty"], ["voltage", "discharges"], "limit", "rk4"),
@@ -356,7 +363,8 @@ class TestPools:
         ("robertson", [], ["y1", "y2", "y3"], "y1", "rosenbrock"),
         ("van_der_pol", [], ["x1", "x2"], "mu", "euler"),
     )
-    every_case = pytest.mark.parametrize("case", CASES, ids=[f"{c[0]}-{c[4]}" for c in CASES])
+    NAMED = {f"{case[0]}-{case[4]}": case for case in CASES}  # noqa: RUF012  (nothing changes it)
+    every_case = pytest.mark.parametrize("case", CASES, ids=NAMED)
 
     MANY = 70
 
@@ -374,9 +382,7 @@ class TestPools:
         pool = make_pool(model, step, kind, n, inputs, outputs, version, **spec)
         return start(pool, {name: np.linspace(0.4, 1.0, n)})
 
-    @every_case
-    @all_versions
-    @pytest.mark.parametrize("kind", ["native", "process", "wine"])
+    @in_turn({"case": NAMED, "kind,version": PAIRS})
     def test_all_pools_give_the_same_bits(self, make_pool, case, version, kind):
         native = self.episode(self.pool_of(make_pool, case, "native", 3), 60)
         other = self.episode(self.pool_of(make_pool, case, kind, 3, version), 60)
@@ -392,9 +398,7 @@ class TestPools:
             start(alone, {case[3]: value})
             assert self.episode(alone, 10, column=i)[..., 0].tobytes() == many[..., i].tobytes()
 
-    @every_case
-    @with_states
-    @every_kind
+    @in_turn({"case": NAMED, "kind,version": STATES})
     def test_a_restored_state_goes_on_in_the_same_way(self, make_pool, case, version, kind):
         pool = self.pool_of(make_pool, case, kind, 2, version)
         self.episode(pool, 17)
@@ -403,9 +407,13 @@ class TestPools:
         pool.restore(snapshot)
         assert self.episode(pool, 30, first=17).tobytes() == went_on.tobytes()
 
-    @every_case
-    @with_states
-    @pytest.mark.parametrize("kinds", [("native", "process"), ("process", "native")])
+    @in_turn(
+        {
+            "case": NAMED,
+            "version": [2, 3],
+            "kinds": [("native", "process"), ("process", "native")],
+        }
+    )
     def test_states_pass_from_pool_to_pool(self, make_pool, case, version, kinds):
         first, second = (self.pool_of(make_pool, case, kind, 1, version) for kind in kinds)
         for pool in (first, second):
@@ -416,8 +424,7 @@ class TestPools:
         went_on = self.episode(first, 30, first=17)
         assert self.episode(second, 30, first=17).tobytes() == went_on.tobytes()
 
-    @all_versions
-    @every_kind
+    @pytest.mark.parametrize(("kind", "version"), PAIRS)
     def test_a_reset_forgets_the_solver(self, make_pool, version, kind):
         case = self.CASES[0]
         pool = self.pool_of(make_pool, case, kind, 2, version)
@@ -492,8 +499,8 @@ class TestEnvironments:
         assert steps == math.ceil(last / 0.05)
         env.close()
 
-    @all_versions  # episodes of FMI 1.0, which has no FMU states, are played again
-    @pytest.mark.parametrize("isolation", ["none", "process"])
+    # Episodes of FMI 1.0, which has no FMU states, are played again.
+    @in_turn({"version": [1, 2, 3], "isolation": ["none", "process"]})
     def test_a_snapshot(self, fmu_path, version, isolation):
         env = AnyBallEnv(fmu_path("ball", version), isolation=isolation)
         env.reset(seed=1)

@@ -31,13 +31,18 @@ TARGETS = {
 }
 
 
-@pytest.mark.parametrize("source", CORE, ids=lambda path: path.stem)
+def require_compiled(command, sources, folder):
+    """Each for itself: zig cannot make one object of many for Windows."""
+    for source in sources:
+        given = [*command, "-c", str(source), "-o", str(folder / "object.o")]
+        done = subprocess.run(given, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("target", TARGETS)
-def test_core_compiles(target, source, tmp_path):
+def test_core_compiles(target, tmp_path):
     command = [sys.executable, "-m", "ziglang", "cc", "-target", *TARGETS[target], *OPTIONS]
-    command += ["-c", str(source), "-o", str(tmp_path / "object.o")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    require_compiled(command, CORE, tmp_path)
 
 
 def test_core_needs_no_python():
@@ -50,14 +55,11 @@ def included(path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Python's headers are for another compiler there")
-@pytest.mark.parametrize("source", sorted(NATIVE.glob("python/*.c")), ids=lambda path: path.stem)
-def test_what_presents_it_to_python_compiles(source, tmp_path):
+def test_what_presents_it_to_python_compiles(tmp_path):
     """Against the stable ABI, and numpy's C interface without what is deprecated."""
     folders = [f"-I{NATIVE}", "-isystem", np.get_include(), f"-I{sysconfig.get_path('include')}"]
     command = [sys.executable, "-m", "ziglang", "cc", *OPTIONS, "-DPy_LIMITED_API=0x030B0000"]
-    command += [*folders, "-c", str(source), "-o", str(tmp_path / "object.o")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    require_compiled([*command, *folders], NATIVE.glob("python/*.c"), tmp_path)
 
 
 def test_no_object_of_others_is_looked_into():

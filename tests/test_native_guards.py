@@ -3,11 +3,13 @@
 import json
 import struct
 import sys
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zoo_tools
+from combinations import in_turn
 from process_tools import run_python
 from program_tools import DISCRETE, code, uniform_draws
 from test_native_pool import LOG, make, on_linux
@@ -151,9 +153,9 @@ class TestStates:
     @pytest.mark.parametrize("index", [2, -1, 2**40])
     def test_of_instances_that_do_not_exist(self, pool, index):
         (state,) = pool.save_states(np.zeros(1, np.int64), False)
-        with pytest.raises(IndexError, match=str(index)):
+        with pytest.raises(SimulationError, match="a list of instances is damaged"):
             pool.save_states(np.array([index]), False)
-        with pytest.raises(IndexError, match=str(index)):
+        with pytest.raises(SimulationError, match="a list of instances is damaged"):
             pool.restore_states([state], np.array([index]))
 
     @pytest.mark.parametrize("records", [False, True])
@@ -163,7 +165,7 @@ class TestStates:
         is_whole = {len(state)} if records else set(range(49, len(state) + 1))
         for size in range(len(state) + 1):
             if size not in is_whole:
-                with pytest.raises(ValueError, match="damaged"):
+                with pytest.raises(SimulationError, match="damaged"):
                     pool.restore_states([state[:size]], np.zeros(1, np.int64))
         pool.restore_states([state], np.zeros(1, np.int64))
         assert pool.save_states(np.zeros(1, np.int64), records) == [state]
@@ -176,7 +178,7 @@ class TestStates:
         (state,) = pool.save_states(np.zeros(1, np.int64), True)
         kind, starts, rows = head
         damaged = struct.pack("<qqdqq", kind, 1, 0.0, starts, rows) + state[40:]
-        with pytest.raises(ValueError, match="damaged"):
+        with pytest.raises(SimulationError, match="damaged"):
             pool.restore_states([damaged], np.zeros(1, np.int64))
 
     def test_of_the_wrong_kind(self, pool):
@@ -184,9 +186,9 @@ class TestStates:
             with pytest.raises(TypeError):
                 pool.restore_states(states, np.zeros(1, np.int64))
         states = pool.save_states(np.arange(2), False)
-        with pytest.raises(ValueError, match="twice"):
+        with pytest.raises(SimulationError, match="a list of instances is damaged"):
             pool.restore_states(states, np.zeros(2, np.int64))
-        with pytest.raises(ValueError, match="indices"):
+        with pytest.raises(SimulationError, match="the states differ in number"):
             pool.restore_states(states, np.zeros(1, np.int64))
 
 
@@ -199,7 +201,6 @@ def program(*rows, numbers=(), results=(), registers=4, seen=0, slots=(), tables
         "code": code(*rows),
         "constants": b"",
         "slots": np.array(list(slots), SLOT).tobytes(),
-        "rows": range(len(numbers)),
         "tables": tables,
         "registers": registers,
         "seen": seen,
@@ -263,7 +264,7 @@ class TestPrograms:
         ids=str,
     )
     def test_operands_that_an_operation_does_not_have(self, cart_poles, row):
-        with pytest.raises(ValueError, match="a program is not sound"):
+        with pytest.raises(ValueError, match="the form of a play is damaged"):
             prepare(cart_poles, program(ACTION, row))
 
     @pytest.mark.parametrize(
@@ -287,14 +288,14 @@ class TestPrograms:
         ids=str,
     )
     def test_parts_that_do_not_fit(self, cart_poles, changes):
-        with pytest.raises(ValueError, match="a program is not sound"):
+        with pytest.raises(ValueError, match="the form of a play is damaged"):
             prepare(cart_poles, program(ACTION, **changes))
 
     @pytest.mark.parametrize(
         ("table", "name"), [(np.zeros(0), "take"), (np.zeros(5), "interpolate")]
     )
     def test_tables_that_are_too_short(self, cart_poles, table, name):
-        with pytest.raises(ValueError, match="a program is not sound"):
+        with pytest.raises(ValueError, match="the form of a play is damaged"):
             prepare(cart_poles, program(ACTION, (name, 0, 1), tables=(table,)))
 
     def test_rows_of_another_length(self, cart_poles):
@@ -337,7 +338,7 @@ class TestPrograms:
     def test_rows_beyond_the_start_values(self, cart_poles, row):
         """They say where in memory draws are written."""
         prepare(cart_poles, program(ACTION), rows=(0, -1))
-        with pytest.raises(ValueError, match="a program does not fit the pool"):
+        with pytest.raises(ValueError, match="a draw is for no start value"):
             prepare(cart_poles, program(ACTION), rows=(row,))
 
     def test_what_does_not_hold_draws(self, cart_poles):
@@ -439,10 +440,13 @@ def test_what_an_instantiation_changes_does_not_stay(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the zoo's faults are those of Linux")
-@pytest.mark.parametrize("threads", [1, 3])
-@pytest.mark.parametrize("substeps", [1, 2])
-@pytest.mark.parametrize("fault", ["round_up", "flush_denormals"])
-@pytest.mark.parametrize("version", [1, 2, 3])
+@in_turn(
+    {
+        "version,fault": list(product((1, 2, 3), ("round_up", "flush_denormals"))),
+        "substeps": [1, 2],
+        "threads": [1, 3],
+    }
+)
 def test_an_instance_that_changes_it_changes_no_other(tmp_path, version, fault, substeps, threads):
     """The sums of steps of 0.1 and of denormal numbers depend on it."""
     path = zoo_tools.zoo_fmu(tmp_path, version)

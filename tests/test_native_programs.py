@@ -24,7 +24,6 @@ def evaluate(lines, rows, actions, results=(), seen=(), kept=(), slots=(), table
         code(*lines),
         constants(*kept),
         np.array(list(slots), SLOT).tobytes(),
-        range(len(rows)),
         tables,
         16,
         len(seen),

@@ -14,6 +14,7 @@ from pathlib import Path
 import foreign_tank
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import PlainEnv, probe_config
 from gymnasium import spaces
 from process_tools import run_python
@@ -336,8 +337,7 @@ class Talkative(PlainEnv):
         return 0.5 * self.action
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array"])
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("!")], ids=repr)
+@in_turn({"hooks": ["compiled", "array"], "error": [KeyboardInterrupt(), ValueError("!")]})
 def test_an_exception_does_not_repeat_a_step_of_a_vector_environment(probe, hooks, error):
     with contextlib.closing(FMUVectorEnv(lambda: Talkative(probe()), 2, hooks=hooks)) as envs:
         envs.reset()

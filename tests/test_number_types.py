@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium import spaces
 
 import fmugym
@@ -85,14 +86,12 @@ def together(envs):
     return rows
 
 
-@types
-@pytest.mark.parametrize("distribution", [Uniform, LogUniform, Normal])
+@in_turn({"number": TYPES, "distribution": [Uniform, LogUniform, Normal]})
 def test_a_single_environment(number, distribution):
     assert alone(Cart(number, distribution)) == alone(Cart(number, distribution, exact=True))
 
 
-@types
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+@in_turn({"number": TYPES, "hooks": ["auto", "array", "per_env"]})
 def test_vector_environments(number, hooks):
     for distribution in (Uniform, Normal):
         expected = alone(Cart(number, distribution))

@@ -6,6 +6,7 @@ import fresh
 import makers
 import numpy as np
 import pytest
+from combinations import in_turn
 
 import fmugym
 
@@ -60,8 +61,7 @@ def expected(path, name, drawn, length, index=0):
     return fresh.play(path, one.outputs, rows, one.step, drawn)
 
 
-@made
-@pytest.mark.parametrize("isolation", ["none", "process"])
+@in_turn({"name": list(makers.MADE), "isolation": ["none", "process"]})
 def test_single(make_fmu, name, isolation):
     path = make_fmu(name)
     env = MadeEnv(path, name, isolation=isolation)
@@ -76,8 +76,7 @@ def test_single(make_fmu, name, isolation):
     env.close()
 
 
-@made
-@pytest.mark.parametrize("way", WAYS)
+@in_turn({"name": list(makers.MADE), "way": list(WAYS)})
 def test_vector(make_fmu, name, way):
     path = make_fmu(name)
     envs = fmugym.FMUVectorEnv(

@@ -1,28 +1,26 @@
 """The contract of ``fmugym.pool.base``, for every implementation of it."""
 
 import pickle
+from functools import partial
 
 import fmpy
 import numpy as np
 import pytest
 import zoo_tools
-from fmu_tools import MAJOR_VERSIONS, edited_fmu
+from combinations import in_turn
+from fmu_tools import edited_fmu
 from plants import PLANTS
 from pool_tools import LOG, open_pool, reset
 from wine_tools import for_windows
 
 from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
-from fmugym.archive.bundled import BUNDLED, MODELS, is_bundled
+from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, is_bundled
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import Component, Group, SystemPlan
 from fmugym.trial import opening
-
-all_versions = pytest.mark.parametrize("version", MAJOR_VERSIONS)
-with_state = pytest.mark.parametrize("version", [2, 3])
-
 
 OPTIONS = {
     "fmpy": {"backend": "fmpy"},
@@ -35,31 +33,58 @@ OPTIONS = {
 OPTIONS |= {f"system in {name}": OPTIONS[name] for name in ("native", "process")}
 """With the FMU as a component of a system."""
 
-engine_only = pytest.mark.parametrize(
-    "make_pool", [name for name in OPTIONS if name != "fmpy"], indirect=True
-)
+PAIRS = [
+    *(("native", 2), ("system in native", 3), ("native", 3), ("system in process", 2)),
+    *(("native", 1), ("process", 3), ("wine", 1), ("fmpy", 2)),
+]
+"""Implementations with versions of FMI, which differ in the native one above all."""
 
 
-@pytest.fixture(params=OPTIONS)
-def make_pool(request, tmp_path, opened):
-    """Make pools of one implementation that are closed after the test."""
-    in_wine = request.param == "wine"
-    if in_wine:
-        request.getfixturevalue("wine")
-        monkeypatch = request.getfixturevalue("monkeypatch")
-        monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
+def all_plants():
+    """Each implementation with each version of FMI, whose models take turns."""
+    for shift, version in enumerate(FMI_VERSIONS):
+        models = [one for one in BUNDLED if one[1] == version]
+        for index, name in enumerate(OPTIONS):
+            yield name, *models[(index + shift) % len(models)]
 
-    def make(path, inputs, outputs, num_instances=1, time_step=0.1, reset_method=None, **spec):
-        fmu = FMU(for_windows(path, tmp_path) if in_wine else path)
-        if "system" in request.param:
-            fmu = system_of(path)
-        options = OPTIONS[request.param] | {"reset_method": reset_method}
-        options["private_libraries"] = False
-        pool = open_pool(fmu, inputs, outputs, time_step, num_instances, options, **spec)
-        pool.is_system = "system" in request.param
+
+def of_pairs(pairs, others=None):
+    """Pools with versions, and values of other parameters in turn."""
+    return in_turn({"make_pool,version": pairs} | (others or {}), indirect=["make_pool"])
+
+
+ENGINES = [pair for pair in PAIRS if pair[0] != "fmpy"]
+engines = pytest.mark.parametrize("make_pool", list(OPTIONS)[1:], indirect=True)
+each_pool = of_pairs(PAIRS)
+each_engine = of_pairs(ENGINES)
+with_state = of_pairs([pair for pair in PAIRS if pair[1] > 1])
+engine_with_state = of_pairs([pair for pair in ENGINES if pair[1] > 1])
+
+
+@pytest.fixture
+def pools_of(request, tmp_path, opened):
+    """Make pools of an implementation that are closed after the test."""
+
+    def make(name, path, inputs, outputs, n=1, time_step=0.1, reset_method=None, **spec):
+        if name == "wine":
+            request.getfixturevalue("wine")
+            monkeypatch = request.getfixturevalue("monkeypatch")
+            monkeypatch.setattr("fmugym.archive.loadable.is_bundled", is_bundled_or_copy)
+            path = for_windows(path, tmp_path)
+        is_system = "system" in name
+        options = OPTIONS[name] | {"reset_method": reset_method, "private_libraries": False}
+        fmu = system_of(path) if is_system else FMU(path)
+        pool = open_pool(fmu, inputs, outputs, time_step, n, options, **spec)
+        pool.is_system = is_system
         return opened(pool)
 
     return make
+
+
+@pytest.fixture(params=OPTIONS)
+def make_pool(request, pools_of):
+    """Make pools of each implementation."""
+    return partial(pools_of, request.param)
 
 
 def system_of(path):
@@ -76,10 +101,21 @@ def is_bundled_or_copy(path):
     return is_bundled(path) or path.stem.removeprefix("Windows") in MODELS
 
 
-@pytest.fixture(params=BUNDLED, ids="-".join)
-def plant(request, make_pool):
-    """Make pools over each of the bundled FMUs."""
-    return Plant(*request.param, make_pool)
+def plants_where(condition):
+    """Some of the plants."""
+    some = [one for one in all_plants() if condition(*one)]
+    return pytest.mark.parametrize("plant", some, ids="-".join, indirect=True)
+
+
+plants_in_engines = plants_where(lambda name, *_: name != "fmpy")
+plants_with_state = plants_where(lambda name, _, version: name != "fmpy" and version != "1.0")
+
+
+@pytest.fixture(params=list(all_plants()), ids="-".join)
+def plant(request, pools_of):
+    """Make pools of an implementation over a bundled FMU."""
+    name, model, version = request.param
+    return Plant(model, version, partial(pools_of, name))
 
 
 class Plant:
@@ -224,7 +260,7 @@ class TestDynamics:
         outputs, _ = pool.step(plant.inputs(8, 1, 3)[0], observations=observations)
         np.testing.assert_array_equal(observations, outputs[:2].T.astype(np.float32))
 
-    @engine_only
+    @plants_in_engines
     def test_read(self, plant):
         pool = plant.pool(3)
         values = plant.start_values(9, 3)
@@ -241,7 +277,7 @@ class TestDynamics:
 
 
 class TestArrays:
-    @all_versions
+    @each_pool
     def test_inputs_may_be_written_in_place(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["b", "a"], ["mix", "sum"], 3)
         set_up(pool)
@@ -264,7 +300,7 @@ class TestArrays:
 
 
 class TestConstruction:
-    @all_versions
+    @each_pool
     def test_that_fails_leaves_nothing(self, make_pool, probe, tmp_path, temp_root, version):
         path = edited_fmu(probe(version), tmp_path, {"{probe-": "{other-"})
         with pytest.raises(FMULoadError, match=r"refused to be instantiated.*the FMU said: step 0"):
@@ -277,12 +313,9 @@ class TestConstruction:
             opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG, backend="natvie")
 
 
-@engine_only
 class TestSnapshots:
-    @pytest.mark.parametrize("model", MODELS)
-    @pytest.mark.parametrize("version", ["2.0", "3.0"])
-    def test_restored_instances_go_on_as_before(self, make_pool, model, version):
-        plant = Plant(model, version, make_pool)
+    @plants_with_state
+    def test_restored_instances_go_on_as_before(self, plant):
         pool = plant.pool(3)
         values, inputs = plant.start_values(1, 3), plant.inputs(1, 10, 3)
         expected = plant.rollout(pool, values, inputs)
@@ -299,7 +332,7 @@ class TestSnapshots:
             outputs, _ = pool.step(row)
         np.testing.assert_array_equal(outputs, expected[-1])
 
-    @with_state
+    @engine_with_state
     def test_time_is_part_of_it(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["a"], ["end"])
         set_up(pool)
@@ -310,7 +343,7 @@ class TestSnapshots:
         outputs, _ = step(pool)
         assert outputs[0, 0] == pytest.approx(0.2, abs=1e-15)
 
-    @with_state
+    @engine_with_state
     def test_snapshots_are_freed(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["a"], ["live"])
         set_up(pool)
@@ -319,7 +352,7 @@ class TestSnapshots:
         del snapshots[1:]
         assert step(pool)[0].tolist() == [[1]]
 
-    @with_state
+    @engine_with_state
     def test_only_into_the_same_instances(self, make_pool, probe, version):
         pool, twin = (make_pool(probe(version), ["a"], ["sum"], 2) for _ in range(2))
         alone = make_pool(probe(version), ["a"], ["sum"])
@@ -329,6 +362,7 @@ class TestSnapshots:
             with pytest.raises(SimulationError, match="snapshot"):
                 pool.restore(other)
 
+    @engines
     def test_not_in_fmi_1(self, make_pool, probe):
         pool = make_pool(probe(1), ["a"], ["sum"])
         set_up(pool)
@@ -336,7 +370,7 @@ class TestSnapshots:
             pool.save()
 
 
-@engine_only
+@plants_in_engines
 class TestSavedInstances:
     """``save_instances`` and ``restore_instances``, whether states are serialized or replayed."""
 
@@ -384,6 +418,13 @@ class TestSavedInstances:
         assert np.array_equal(plant.rollout(pool, values, inputs), expected)
 
 
+STATUSES = [
+    *((2, Status.DISCARD), (3, Status.ERROR), (4, Status.FATAL), (5, Status.ERROR)),
+    (7, Status.NOT_FINITE),
+]
+"""Faults of the probe, and what is told."""
+
+
 class TestFaults:
     """What goes wrong with one instance is told by its status and mended by the next reset."""
 
@@ -407,17 +448,7 @@ class TestFaults:
         assert (outputs[0] == 0.5).all()
         assert (outputs[3] == 0).all()
 
-    @all_versions
-    @pytest.mark.parametrize(
-        ("fault", "expected"),
-        [
-            (2, Status.DISCARD),
-            (3, Status.ERROR),
-            (4, Status.FATAL),
-            (5, Status.ERROR),
-            (7, Status.NOT_FINITE),
-        ],
-    )
+    @of_pairs(PAIRS, {"fault,expected": STATUSES})
     def test_of_one_instance_in_a_step(self, pool, version, fault, expected):
         pool = pool(version, 3)
         set_up(pool, fault=[0, fault, 0], fault_step=2)
@@ -430,9 +461,7 @@ class TestFaults:
         assert said in pool.failure(1)
         self.assert_sound(pool)
 
-    @engine_only
-    @all_versions
-    @pytest.mark.parametrize("fault", [3, 4])
+    @of_pairs(ENGINES, {"fault": [3, 4]})
     def test_stepping_on_does_not_reach_a_failed_instance(self, pool, version, fault):
         pool = pool(version, 2)
         set_up(pool, fault=[fault, 0], fault_step=1)
@@ -452,8 +481,7 @@ class TestFaults:
         assert outputs[0].tolist() == [1.0]  # its outputs are valid
         self.assert_sound(pool)
 
-    @all_versions
-    @pytest.mark.parametrize("name", ["set_status", "get_status"])
+    @of_pairs(PAIRS, {"name": ["set_status", "get_status"]})
     def test_in_setting_and_getting(self, pool, version, name):
         pool = pool(version)
         set_up(pool, **{name: 3})
@@ -465,8 +493,7 @@ class TestFaults:
             assert f"{doing} returned Error" in pool.failure(0)
         self.assert_sound(pool)
 
-    @all_versions
-    @pytest.mark.parametrize("status", [2, 3, 4])
+    @of_pairs(PAIRS, {"status": [2, 3, 4]})
     def test_in_a_reset(self, pool, version, status):
         pool = pool(version, 2)
         _, statuses = set_up(pool, init_status=[0, status])
@@ -475,14 +502,14 @@ class TestFaults:
         assert "initialization returned" in pool.failure(1)
         self.assert_sound(pool)
 
-    @all_versions
+    @each_pool
     def test_in_a_substep(self, pool, version):
         pool = pool(version, substeps=5)
         set_up(pool, fault=3, fault_step=3)
         assert step(pool, 1.0)[1].tolist() == [Status.ERROR]
         assert "t = 0.2 s" in pool.failure(0)
 
-    @all_versions
+    @each_pool
     def test_in_the_warm_up(self, pool, version):
         pool = pool(version, warm_up_steps=2)
         _, status = set_up(pool, fault=3, fault_step=2)
@@ -490,9 +517,7 @@ class TestFaults:
         assert "the warm-up failed: " in pool.failure(0)
         assert set_up(pool)[1].tolist() == [Status.OK]
 
-    @engine_only
-    @all_versions
-    @pytest.mark.parametrize("parameters", [{"reset_status": 3}, {"fault": 4, "fault_step": 1}])
+    @of_pairs(ENGINES, {"parameters": [{"reset_status": 3}, {"fault": 4, "fault_step": 1}]})
     def test_an_instance_past_mending_is_replaced(self, pool, version, parameters):
         pool = pool(version)
         set_up(pool, **parameters)
@@ -501,8 +526,7 @@ class TestFaults:
         self.assert_sound(pool)
         assert set_up(pool)[0][2, 0] == 2
 
-    @engine_only
-    @all_versions
+    @each_engine
     def test_an_fmu_that_refuses_to_be_replaced_for_a_while(self, pool, version):
         """Each refusal without a message is repeated once, to hear a reason."""
         pool = pool(version)
@@ -514,8 +538,7 @@ class TestFaults:
             assert step(pool)[1].tolist() == [Status.FATAL]
         self.assert_sound(pool)
 
-    @with_state
-    @engine_only
+    @engine_with_state
     def test_a_state_that_cannot_be_restored(self, pool, version):
         pool = pool(version, reset_method="restore")
         for _ in range(4):
@@ -525,11 +548,10 @@ class TestFaults:
             step(pool)
         self.assert_sound(pool)
 
-    @with_state
-    @pytest.mark.parametrize(
-        "make_pool", [n for n in OPTIONS if n not in ("fmpy", "wine")], indirect=True
+    @of_pairs(
+        [("native", 2), ("native", 3), ("process", 2), ("system in native", 3)],
+        {"status": [Status.DISCARD, Status.ERROR, Status.FATAL]},
     )
-    @pytest.mark.parametrize("status", [Status.DISCARD, Status.ERROR, Status.FATAL])
     def test_a_state_that_cannot_be_saved(self, make_pool, tmp_path, version, status):
         path = zoo_tools.zoo_fmu(tmp_path, version)
         values = zoo_tools.parameters("status", "get_state", at=0, status=status)
@@ -542,8 +564,7 @@ class TestFaults:
             assert statuses.tolist() == [Status.OK]
             assert outputs.tolist() == [[0.5]]
 
-    @with_state
-    @engine_only
+    @engine_with_state
     def test_a_snapshot_that_cannot_be_restored(self, pool, version):
         pool = pool(version)
         set_up(pool, restore_status=3)
@@ -554,8 +575,7 @@ class TestFaults:
         assert "needs a reset" in pool.failure(0)
         self.assert_sound(pool)
 
-    @with_state
-    @engine_only
+    @engine_with_state
     def test_a_snapshot_of_a_replaced_instance(self, pool, version):
         pool = pool(version)
         set_up(pool, fault=4, fault_step=1)
@@ -565,7 +585,7 @@ class TestFaults:
         with pytest.raises(SimulationError, match="snapshot"):
             pool.restore(snapshot)
 
-    @all_versions
+    @each_pool
     def test_a_step_before_the_first_reset(self, pool, version):
         pool = pool(version, 2)
         assert step(pool)[1].tolist() == [Status.ERROR] * 2
@@ -574,7 +594,7 @@ class TestFaults:
 
 
 class TestStartValues:
-    @all_versions
+    @each_pool
     def test_other_variables_at_each_reset(self, make_pool, probe, version):
         """What is not given is at the FMU's own start value again."""
         pool = make_pool(probe(version), ["a"], ["sum", "mix"])
@@ -585,7 +605,7 @@ class TestStartValues:
         set_up(pool)
         assert step(pool, 1.0)[0].tolist() == [[0.1], [1.0]]
 
-    @all_versions
+    @each_pool
     def test_strings_and_integers(self, make_pool, probe, version, caplog):
         pool = make_pool(probe(version), ["a"], ["steps"], 2)
         label = with_texts(pool.variable("label"), ["here", "there", "nowhere"])
@@ -605,14 +625,14 @@ class TestStartValues:
             set_up(pool, gain=index // 4)
         assert step(pool)[0][0, 0] <= 1
 
-    @all_versions
+    @each_pool
     def test_only_the_columns_in_the_mask_are_used(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["a"], ["sum"], 2)
         set_up(pool, gain=[1.0, 2.0])
         set_up(pool, np.array([True, False]), gain=[3.0, np.nan])
         assert step(pool, 1.0)[0].tolist() == [[pytest.approx(0.3), 0.2]]
 
-    @all_versions
+    @each_pool
     def test_inputs_do_not_survive_a_reset(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["a"], ["mix"])
         for _ in range(4):

@@ -14,8 +14,8 @@ from process_tools import linux_only
 from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.pool import PoolSpec
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.process.requests import Answer
 from fmugym.pool.process.shared_memory import Memory
+from fmugym.pool.requests import Answer
 
 LOG = logging.getLogger("fmugym.test")
 HEAD = struct.Struct("=QQ")

@@ -22,7 +22,8 @@ from process_tools import (
 )
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
-from fmugym.archive.temporary import folder_name, make_folder, sweep
+from fmugym.archive.temporary import folder_name, make_folder
+from fmugym.caching import sweep
 
 HERE = Path(__file__).parent
 
@@ -194,7 +195,7 @@ class TestKilledInTheConstructor:
             assert program.wait() == -signal.SIGKILL
             wait_until(lambda: not processes_of_session(program.pid))
             sweep.cache_clear()
-            sweep()  # as the next process does that needs a folder
+            sweep(temp_root)  # as the next process does that needs a folder
             assert list(temp_root.iterdir()) == []
 
         return is_clean_after
@@ -276,7 +277,7 @@ class TestEndOfParent:
         make_folder(made)
         assert not left.exists()
         sweep.cache_clear()
-        sweep()
+        sweep(temp_root)
         assert made.exists()
 
     @posix_only

@@ -167,6 +167,23 @@ class TestSingle:
         assert step(pool)[1].tolist() == [Status.FATAL]
         assert pool.failure(0).endswith("; the FMU said: [last words] this is fault 1")
 
+    @pytest.mark.parametrize("size", [8, 48, 152, 400, 4096])
+    def test_the_latest_bytes_of_last_words_are_kept(self, opened, monkeypatch, size):
+        for module in ("setup", "shared_memory"):
+            monkeypatch.setattr(f"fmugym.pool.process.{module}.ECHO_SIZE", size)
+        fmu = FMU(bundled_fmu("CartPole"))
+        pool = opened(ProcessPool(fmu, PoolSpec((), (fmu.variable("x"),), 0.05), 1, LOG))
+        for _ in range(5):
+            pool.reset((fmu.variable("m_cart"),), np.array([[-1.0]]))
+        memory = pool._group.supervisors[0]._echo.tobytes()
+        text, _, rest = memory.partition(b"\0")
+        message = (
+            "[logStatusError] fmi2ExitInitializationMode: m_cart, m_pole and pole_length must be "
+        )
+        everything = 5 * f"{message}positive\n"
+        assert text.decode() == everything[-size + 1 :]
+        assert set(rest) <= {0}
+
     @pytest.mark.parametrize("stage", ["terminate", "free"])
     def test_the_end_of_an_instance(self, make_env, stage, caplog):
         env = make_env("crash", stage)

@@ -9,7 +9,7 @@ from makers import MADE
 from test_cli import INPUT, OUTPUT, variable
 
 import fmugym
-from fmugym.archive.bundled import BUNDLED
+from fmugym.archive.bundled import MODELS
 from fmugym.tools.cli import main
 
 make_fmu = test_cli.make_fmu
@@ -49,7 +49,7 @@ def test_types_of_every_kind_train_without_editing(version, tmp_path, capsys):
     assert trained(tmp_path, capsys, probe_fmu(tmp_path, version))["rounds"] == 30
 
 
-@pytest.mark.parametrize("model", sorted({model for model, _ in BUNDLED}))
+@pytest.mark.parametrize("model", MODELS)
 def test_bundled_fmus_train_without_editing(model, tmp_path, capsys):
     assert trained(tmp_path, capsys, fmugym.bundled_fmu(model))["rounds"] == 30
 

@@ -17,6 +17,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import quirk_table
+from combinations import in_turn
 from fmu_tools import grouped
 from quirk_table import OUTPUTS, QUIRKS
 
@@ -41,6 +42,7 @@ NUM_ENVS = 3
 WAYS = {"default": {}, "one": {"threads": 1}, "two": {"threads": 2}}
 WAYS["process"] = {"isolation": "process"}
 CASES = [(version, quirk) for quirk in QUIRKS for version in quirk.versions]
+ONCE = [(quirk.versions[i % len(quirk.versions)], quirk) for i, quirk in enumerate(QUIRKS)]
 cases = pytest.mark.parametrize(("version", "quirk"), CASES, ids=str)
 
 
@@ -133,8 +135,8 @@ def assert_vector_right(envs, path, gains=None):
     envs.close()
 
 
-@cases
 class TestEpisodes:
+    @cases
     def test_single(self, make_fmu, version, quirk):
         path = make_fmu(quirk.token, version)
         env = QuirkEnv(path, probe_timeout=quirk.probe_timeout)
@@ -142,19 +144,20 @@ class TestEpisodes:
         env.reset(seed=5)
         assert_right(env, path)
 
+    @in_turn({"version,quirk": ONCE})
     def test_with_the_same_start_values(self, make_fmu, version, quirk):
         """So that states are restored."""
         path = make_fmu(quirk.token, version)
         assert_right(QuirkEnv(path, gain=1.5, probe_timeout=quirk.probe_timeout), path)
 
-    @pytest.mark.parametrize("way", WAYS)
+    @in_turn({"version,quirk": ONCE, "way": ["one", "two"]})
     def test_vector(self, make_fmu, version, quirk, way):
         path = make_fmu(quirk.token, version)
         envs = make_vector(path, probe_timeout=quirk.probe_timeout, **WAYS[way])
         envs.reset(seed=3)
         assert_vector_right(envs, path)
 
-    @pytest.mark.parametrize("way", ["default", "process"])
+    @in_turn({"version,quirk": ONCE, "way": ["default", "process"]})
     def test_vector_with_the_same_start_values(self, make_fmu, version, quirk, way):
         """Each environment has its own, in all episodes."""
         path, gains = make_fmu(quirk.token, version), [0.5, 1.0, 2.0]
@@ -264,8 +267,7 @@ BAD_RESETS = [
 ]
 
 
-@pytest.mark.parametrize("gain", [1.5, fmugym.Uniform(0.5, 2.0)], ids=["fixed", "drawn"])
-@pytest.mark.parametrize(("version", "quirk"), BAD_RESETS, ids=str)
+@in_turn({"version,quirk": BAD_RESETS, "gain": [1.5, fmugym.Uniform(0.5, 2.0)]})
 def test_the_check_finds_bad_resets(make_fmu, version, quirk, gain):
     """Also where the observation hides them, or where the parameters never change."""
     path = make_fmu(quirk.token, version)

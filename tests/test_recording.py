@@ -7,6 +7,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from test_snapshots import Track
 
 import fmugym
@@ -41,8 +42,7 @@ def record(env, steps=8, **arguments):
     return recorder
 
 
-@pytest.mark.parametrize("make", [Track, CartPoleEnv, Named], ids=lambda cls: cls.__name__)
-@pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
+@in_turn({"make": [Track, CartPoleEnv, Named], "version": ["1.0", "2.0", "3.0"]})
 def test_a_file_is_replayed_to_the_last_bit(make, version, tmp_path):
     with make(fmi_version=version) as env:
         recording = record(env, seed=5).recording
@@ -216,8 +216,7 @@ class TestRefusals:
         with pytest.raises(ConfigError, match="no recording"):
             Recording.load(recorded)
 
-    @pytest.mark.parametrize("make", [Track, CartPoleEnv, Named], ids=lambda cls: cls.__name__)
-    @pytest.mark.parametrize("shape", [(8, 2), (8, 0)])
+    @in_turn({"make": [Track, CartPoleEnv, Named], "shape": [(8, 2), (8, 0)]})
     def test_of_actions_of_another_shape(self, make, shape):
         with make() as env:
             recording = replace(record(env, seed=0).recording, actions=np.zeros(shape))

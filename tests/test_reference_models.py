@@ -6,10 +6,12 @@ closed forms or scipy. ``test_events`` has the clocks.
 
 import math
 from contextlib import closing
+from itertools import product
 
 import exchange_tools
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium import spaces
 from scipy.integrate import solve_ivp
 
@@ -20,9 +22,7 @@ STEPS = 12
 TIMES = STEP * np.arange(1, STEPS + 1)
 PARAMETERS = {"stair": {"last": 0.9, "period": 0.3}, "van_der_pol": {"mu": 2.0}}
 OUTPUTS = {"ball": ["h", "v"], "dahlquist": ["x"], "stair": ["count"], "van_der_pol": ["x1", "x2"]}
-interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
-versions = pytest.mark.parametrize("version", [1, 2, 3])
-models = pytest.mark.parametrize("model", list(OUTPUTS))
+CASES = list(product(OUTPUTS, (1, 2, 3), ("CoSimulation", "ModelExchange")))
 
 
 class Env(fmugym.FMUEnv):
@@ -98,10 +98,7 @@ def tolerance(model, interface):
     return 0.1 if model == "ball" else 5e-3
 
 
-@models
-@versions
-@interfaces
-@pytest.mark.parametrize("isolation", ["none", "process"])
+@in_turn({"model,version,interface": CASES, "isolation": ["none", "process"]})
 def test_single(make_env, model, version, interface, isolation):
     exact = EXACT[model](TIMES)
     with closing(make_env(model, version, interface, isolation)) as env:
@@ -119,10 +116,7 @@ def test_single(make_env, model, version, interface, isolation):
                 np.testing.assert_allclose(row, exact[index], atol=tolerance(model, interface))
 
 
-@models
-@versions
-@interfaces
-@pytest.mark.parametrize("isolation", ["none", "process"])
+@in_turn({"model,version,interface": CASES, "isolation": ["process", "none"]})
 def test_vector(make_env, model, version, interface, isolation):
     exact = EXACT[model](TIMES)
     count = 8 if model == "stair" else STEPS  # before it ends

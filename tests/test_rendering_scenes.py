@@ -10,6 +10,7 @@ import sys
 import numpy as np
 import pygame
 import pytest
+from combinations import in_turn
 
 from fmugym.errors import ConfigError
 from fmugym.rendering import (
@@ -173,15 +174,18 @@ class TestCartPole:
         ]
         assert areas[1] == pytest.approx(areas[0], rel=0.1)
 
-    @pytest.mark.parametrize("value", FAR_VALUES)
-    @pytest.mark.parametrize("name", ["x", "angle", "force"])
+    @in_turn({"value": FAR_VALUES, "name": ["x", "angle", "force"]})
     def test_values_out_of_range_leave_the_track(self, name, value):
         frame = CartPoleFrame(**{"x": 0.0, "angle": 0.0, "force": 0.0, name: value})
         picture = cart_pole_picture(frame, Overlay(value, "", value, value))
         assert area(picture, palette.FAINT) > 100
 
-    @pytest.mark.parametrize("name", ["x_threshold", "pole_length", "angle_threshold"])
-    @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
+    @in_turn(
+        {
+            "value": [0.0, -1.0, math.inf, math.nan],
+            "name": ["x_threshold", "pole_length", "angle_threshold"],
+        }
+    )
     def test_impossible_measures_are_refused_by_name(self, name, value):
         measures = {"x_threshold": 2.4, "pole_length": 1.0, "angle_threshold": 0.2, name: value}
         with pytest.raises(ConfigError, match=name):
@@ -212,8 +216,7 @@ class TestPendulum:
         ]
         assert 0 < areas[0] < areas[1] < areas[2] == areas[3]
 
-    @pytest.mark.parametrize("value", FAR_VALUES)
-    @pytest.mark.parametrize("name", ["angle", "torque"])
+    @in_turn({"value": FAR_VALUES, "name": ["angle", "torque"]})
     def test_values_out_of_range_leave_the_circle(self, name, value):
         frame = PendulumFrame(**{"angle": 0.0, "torque": 0.0, name: value})
         assert area(pendulum_picture(frame), palette.FAINT) > 100

@@ -8,8 +8,8 @@ import pytest
 import fmugym
 from fmugym.archive import ArchiveLimits
 from fmugym.config import FOREIGN, EnvConfig
-from fmugym.declared.systems import system_of
 from fmugym.declared.task import Task
+from fmugym.declared.task_fmu import system_of
 from fmugym.retired import RETIRED
 
 every_retired_key = pytest.mark.parametrize("key", RETIRED)

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import PlainEnv, probe_config
 from test_snapshots import Track, vector_of
 
@@ -58,16 +59,12 @@ def rows_of(rollout):
 
 
 class TestValues:
-    @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-    @pytest.mark.parametrize(
-        ("version", "mode"),
-        [
-            ("1.0", "Disabled"),
-            ("2.0", "Disabled"),
-            ("2.0", "NextStep"),
-            ("2.0", "SameStep"),
-            ("3.0", "Disabled"),
-        ],
+    @in_turn(
+        {
+            "way": WAYS,
+            "version": ["2.0", "1.0", "3.0"],
+            "mode": ["Disabled", "NextStep", "SameStep"],
+        }
     )
     def test_are_those_of_single_environments(self, way, version, mode):
         env = halfway(fmi_version=version)
@@ -82,8 +79,7 @@ class TestValues:
         env.close()
         envs.close()
 
-    @pytest.mark.parametrize("threads", [1, 2])
-    @pytest.mark.parametrize("cls", [CartPoleEnv, PendulumEnv])
+    @in_turn({"threads": [1, 2], "cls": [CartPoleEnv, PendulumEnv]})
     def test_of_many_candidates_in_several_rounds(self, cls, threads):
         env = halfway(cls)
         envs = vector_of(cls, 67, hooks="compiled", threads=threads)
@@ -176,8 +172,7 @@ def test_from_one_root_no_state_is_serialized(monkeypatch):
 
 
 class TestParameters:
-    @pytest.mark.parametrize("way", WAYS.values(), ids=WAYS)
-    @pytest.mark.parametrize("version", ["2.0", "3.0"])
+    @in_turn({"way": WAYS, "version": ["2.0", "3.0"]})
     def test_of_each_candidate(self, way, version):
         """A tunable friction, also read by a hook; the same values set before the reset."""
 
@@ -223,8 +218,7 @@ class TestParameters:
 
 
 class TestFaults:
-    @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-    @pytest.mark.parametrize("policy", ["truncate", "terminate"])
+    @in_turn({"hooks": ["compiled", "array", "per_env"], "policy": ["truncate", "terminate"]})
     def test_end_a_candidate(self, probe, hooks, policy):
         faults = {"fault": 3, "fault_step": 4}
         config = probe_config(model_parameters=faults, fault_reward=-7.0, on_fault=policy)

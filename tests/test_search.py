@@ -22,7 +22,7 @@ from fmugym.baselines.parsing import search_of
 from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.export.decisions import decision_of
 from fmugym.search.agent import AGENT, Agent
-from fmugym.search.flattening import require_numbers, rows_of, width_of
+from fmugym.search.flattening import require_numbers, rows_of
 from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
 from fmugym.search.probe import MOST_PROBED, Probe
@@ -406,7 +406,7 @@ def test_rows_are_those_of_gymnasium(space):
     expected = [spaces.flatten(space, one).astype(float).tolist() for one in singles]
     assert rows_of(space, observations, 5).tolist() == expected
     assert [rows_of(space, one, 1)[0].tolist() for one in singles] == expected
-    assert {len(row) for row in expected} == {width_of(space)}
+    assert {len(row) for row in expected} == {spaces.flatdim(space)}
     require_numbers(space, NUMBERS)
 
 
@@ -430,12 +430,12 @@ def test_spaces_without_a_search(observed, acting, facts):
     assert "\n" not in str(caught.value)
 
 
-FORMS = [
-    Form("linear"),
-    Form("linear with history", history=True),
-    Form("network", hidden=(5, 4)),
-    Form("network with history", hidden=(4,), history=True),
-    Form("constant action", blind=True),
+FORMS = [  # for 3 observations and 2 outputs
+    Form("linear", 3, 2),
+    Form("linear with history", 3, 2, history=True),
+    Form("network", 3, 2, hidden=(5, 4)),
+    Form("network with history", 3, 2, hidden=(4,), history=True),
+    Form("constant action", 3, 2, blind=True),
 ]
 ACTING = [
     spaces.Box(np.array([-2.0, 10.0]), np.array([4.0, 30.0]), dtype=np.float64),
@@ -445,13 +445,16 @@ ACTING = [
 ]
 
 
+def sized(form, env):
+    """The form for an environment."""
+    bare = Policy(None).bind(env)
+    return replace(form, observed=len(bare.names), acting=bare.acting)
+
+
 def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
     """One with random weights, for one environment or for ``rows``."""
-    bare = Policy(None).bind(env_of_one)
-    sizes = len(bare.names), bare.acting
-    rng = np.random.default_rng(seed)
-    shape = (form.size(*sizes),) if rows is None else (rows, form.size(*sizes))
-    count = form.features(*sizes)
+    form, rng = sized(form, env_of_one), np.random.default_rng(seed)
+    shape, count = (form.size,) if rows is None else (rows, form.size), form.features
     scale = rng.normal(size=count), rng.uniform(0.5, 2.0, count)
     return Policy(baseline, form, rng.normal(size=shape), scale)
 
@@ -465,7 +468,7 @@ class TestPolicy:
 
     def test_corrections_are_halves_of_the_range_and_end_at_its_limits(self):
         env = Stub(NUMBERS, ACTING[0])
-        form = Form("linear")
+        form = FORMS[0]
         weights = np.zeros((4, 2))
         weights[3] = 2.0 * np.array([0.5, -0.25])  # constants; 2 is the root of 4 inputs
         policy = Policy(None, form, weights.ravel(), (np.zeros(3), np.ones(3))).bind(env)
@@ -481,7 +484,7 @@ class TestPolicy:
         env = Stub(spaces.Box(-9, 9, (1,)), spaces.Box(0.0, 2.0, (1,), np.float64), names=("T",))
         weights = np.array([0.0, -0.25 * np.sqrt(2)])
         scale = np.zeros(1), np.ones(1)
-        policy = Policy(PID("T", 8.0, kp=1.0), Form("linear"), weights, scale).bind(env)
+        policy = Policy(PID("T", 8.0, kp=1.0), Form("linear", 1, 1), weights, scale).bind(env)
         assert policy.act(np.zeros(1)) == pytest.approx(2.0 - 0.25)
         assert policy.act(np.array([7.5])) == pytest.approx(0.5 - 0.25)
         assert policy.act(np.array([7.9])) == 0.0
@@ -490,7 +493,7 @@ class TestPolicy:
         env = Stub(spaces.Box(-1e9, 1e9, (1,)), spaces.Box(-1e3, 1e3, (1,), np.float64))
         scale = np.array([5.0]), np.array([2.0])
         weights = np.array([np.sqrt(2) / 1e3, 0.0])
-        policy = Policy(None, Form("linear"), weights, scale).bind(env)
+        policy = Policy(None, Form("linear", 1, 1), weights, scale).bind(env)
         seen = [policy.act(np.array([value])).item() for value in (8.0, 1e9, -1e9)]
         assert seen == pytest.approx([1.5, LIMIT, -LIMIT])
 
@@ -554,7 +557,7 @@ class TestPolicy:
             together.reset(mask)
             actions.append(together.act(observations))
         for i in range(6):
-            alone = Policy(None, form, together.weights[i], together.scale).bind(one)
+            alone = Policy(None, together.form, together.weights[i], together.scale).bind(one)
             for observations, mask, expected in zip(steps, begins, actions, strict=True):
                 if mask[i]:
                     alone.reset()
@@ -619,7 +622,7 @@ class TestMasks:
                 allowed.append(np.stack(envs.call("action_masks")))
                 observations, *_ = envs.step(actions)
             for index in range(6):
-                alone = Policy(None, FORMS[1], policy.weights[index], policy.scale).bind(one)
+                alone = Policy(None, policy.form, policy.weights[index], policy.scale).bind(one)
                 observation, _ = one.reset(seed=3 + index)
                 for actions in chosen:
                     action = alone.act(observation)
@@ -649,8 +652,8 @@ def recording(network, seen):
 def test_a_scale_is_that_of_all_features():
     """Of the steps of all episodes until their ends, whatever plays beside them."""
     observed = []
-    form = Form("linear with history", history=True)
-    rows = np.array([np.zeros(form.size(2, 1))] * 4)
+    form = Form("linear with history", 2, 1, history=True)
+    rows = np.array([np.zeros(form.size)] * 4)
     rows[:, -1] = np.sqrt(8) * np.array([-1.0, -0.3, 0.2, 0.9])
     make = partial(Policy, None, form, scale=(np.zeros(7), np.ones(7)))
     scales = []
@@ -688,8 +691,8 @@ def test_constants_are_not_made_larger_and_go_with_nothing():
 def test_what_goes_together_and_what_differs_move_the_outputs_alike(form):
     """The variance of an output is that of all observations, and not of their sum only."""
     correlations = np.array([[1.0, 0.98, 0.0], [0.98, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    covariance = form.covariance(correlations, 3, 2)
-    after = form.shapes(3, 2)[0][1]
+    covariance = form.covariance(correlations)
+    after = form.shapes[0][1]
     weights = covariance[: 3 * after, : 3 * after].reshape(3, after, 3, after)
     assert weights[:, 0, :, 1] == pytest.approx(0.0)  # outputs are independent
     values, axes = np.linalg.eigh(correlations)
@@ -704,9 +707,8 @@ def test_a_linear_policy_can_be_extended_by_a_history():
     env = Stub(NUMBERS, ACTING[0])
     linear, longer = FORMS[:2]
     first = policy_with(linear, env)
-    more = longer.features(3, 2)
-    mean, divisor = (np.resize(part, more) for part in first.scale)
-    weights = longer.extended(first.weights, 3, 2)
+    mean, divisor = (np.resize(part, longer.features) for part in first.scale)
+    weights = longer.extended(first.weights)
     second = Policy(first.baseline, longer, weights, (mean, divisor)).bind(env)
     first.bind(env)
     for row in np.random.default_rng(2).uniform(-2, 2, (4, 3)):
@@ -807,7 +809,7 @@ class TestAgent:
         with closing(load()()) as env:
             policy, space = policy_with(request.param, env), str(env.action_space)
         text = "pid of=theta setpoint=0 kp=0.2 td=0.2"
-        return Agent("own", text, request.param, policy.weights, policy.scale, self.NAMES, space)
+        return Agent("own", text, policy.form, policy.weights, policy.scale, self.NAMES, space)
 
     def test_saved_and_loaded_it_acts_as_before(self, agent, tmp_path):
         agent.save(tmp_path)
@@ -835,17 +837,21 @@ class TestAgent:
                 Agent.load(tmp_path)
 
     @pytest.mark.parametrize(
-        "change", [{"weights": np.ones(2)}, {"scale": (np.ones(1), np.ones(1))}], ids=str
+        "change",
+        [
+            {"weights": np.ones(2)},
+            {"scale": (np.ones(1), np.ones(1))},
+            {"weights": np.full(3, np.nan)},
+        ],
+        ids=str,
     )
     def test_arrays_of_another_size(self, change, tmp_path):
-        with closing(load()()) as env:
-            policy, space = policy_with(FORMS[0], env), str(env.action_space)
-            facts = {"weights": policy.weights, "scale": policy.scale} | change
-            Agent("own", None, FORMS[0], names=self.NAMES, actions=space, **facts).save(tmp_path)
-            with pytest.raises(
-                ConfigError, match=r"a linear needs [23] (weights|scales) here, got [12]"
-            ):
-                Agent.load(tmp_path).policy().bind(env)
+        facts = {"weights": np.ones(3), "scale": (np.ones(2), np.ones(2))}
+        Agent("own", None, Form("linear", 2, 1), names=self.NAMES, **facts).save(tmp_path)
+        assert Agent.load(tmp_path).weights.tolist() == [1, 1, 1]
+        Agent("own", None, Form("linear", 2, 1), names=self.NAMES, **facts | change).save(tmp_path)
+        with pytest.raises(ConfigError, match=r"\[3, 2, 2\] finite numbers"):
+            Agent.load(tmp_path)
 
     def test_a_missing_one(self, tmp_path):
         with pytest.raises(ConfigError, match=str(tmp_path)):

@@ -9,6 +9,7 @@ from itertools import pairwise
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 
 import fmugym
 from fmugym import ConfigError
@@ -203,8 +204,7 @@ class TestSingle:
         env.close()
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
+@in_turn({"hooks": ["compiled", "array", "per_env"], "mode": ["next_step", "same_step"]})
 def test_a_vector_environment_gives_the_rows_of_single_ones(hooks, mode):
     envs = FMUVectorEnv(make, 3, hooks=hooks, autoreset_mode=mode)
     wanted = ["*", "observation.*"]

@@ -7,16 +7,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from test_single_compiled import (
-    require_readings,
     require_same,
     require_same_snapshots,
-    same,
     with_hooks,
 )
 from vector_tools import Drawing
 
 import fmugym
-from fmugym import ConfigError, SimulationError, Uniform
+from fmugym import Uniform
 
 
 class Task(Drawing):
@@ -181,96 +179,6 @@ def test_each_hook_is_called_once_in_its_order(cls, monkeypatch):
 ACTION = np.float32([0.004])
 
 
-class TestFaults:
-    @pytest.mark.parametrize("value", [math.nan, math.inf])
-    @pytest.mark.parametrize("cls", [Reward, Observation])
-    def test_numbers_that_are_not_finite(self, cls, value):
-        class Bad(cls):
-            def _reward_policy(self):
-                reward = super()._reward_policy()
-                return value if self.step_count == 4 and cls is Reward else reward
-
-            def _get_observation(self):
-                seen = super()._get_observation()
-                has_moved = self.state != self.previous_state  # not after the fault
-                if self.step_count == 4 and has_moved and cls is Observation:
-                    seen = seen * np.float32(value)
-                return seen
-
-        one, other = pair(Bad)
-        for _ in range(4):
-            first, second = one.step(ACTION), other.step(ACTION)
-            assert same(first, second)
-        assert "fault" in first[4]
-        require_readings(one, other)
-        assert same(one.reset(), other.reset())
-        assert same(one.step(ACTION), other.step(ACTION))
-        one.close()
-        other.close()
-
-    @staticmethod
-    def fail_in_the_third_step(cls, error, match):
-        """Both raise the same error after two good steps; returns both."""
-        envs, texts = pair(cls), []
-        for env in envs:
-            env.step(ACTION)
-            env.step(ACTION)
-            with pytest.raises(error, match=match) as caught:
-                env.step(ACTION)
-            texts.append(str(caught.value))
-        assert texts[0] == texts[1]
-        return envs
-
-    @pytest.mark.parametrize("cls", [Truncated, Reward, Observation])
-    def test_exceptions_end_the_episode(self, cls):
-        (hook,) = LEFT[cls]
-
-        def failing(self):
-            if self.step_count == 3:
-                raise ZeroDivisionError("three")
-            return getattr(cls, hook)(self)
-
-        failing_class = type("Failing", (cls,), {hook: failing})
-        one, other = self.fail_in_the_third_step(failing_class, ZeroDivisionError, "three")
-        require_readings(one, other)
-        for env in (one, other):
-            with pytest.raises(SimulationError, match="reset"):
-                env.step(ACTION)
-        assert same(one.reset(), other.reset())
-        one.close()
-        other.close()
-
-    @pytest.mark.parametrize(
-        ("hook", "value"),
-        [
-            ("_is_truncated", None),
-            ("_is_truncated", 0.5),
-            ("_reward_policy", None),
-            ("_get_observation", None),
-            ("_get_observation", np.zeros(3)),
-        ],
-    )
-    def test_what_cannot_be_used_is_an_error(self, hook, value):
-        cls = next(cls for cls, left in LEFT.items() if left == {hook})
-
-        def bad(self):
-            good = getattr(cls, hook)(self)
-            return value if self.step_count == 3 else good
-
-        for env in self.fail_in_the_third_step(type("Bad", (cls,), {hook: bad}), ConfigError, hook):
-            env.close()
-
-    def test_hooks_may_not_draw(self):
-        class Drawn(Reward):
-            def _reward_policy(self):
-                if self.step_count < 3:
-                    return super()._reward_policy()
-                return float(self.np_random.uniform())
-
-        for env in self.fail_in_the_third_step(Drawn, SimulationError, "random"):
-            env.close()
-
-
 def test_each_hook_is_named_once(caplog):
     env = Both()
     with caplog.at_level(logging.INFO, logger="fmugym.vector.one"):
@@ -281,14 +189,6 @@ def test_each_hook_is_named_once(caplog):
     assert len(texts) == 2
     for name in LEFT[Both]:
         assert sum(f"{name}, line" in text for text in texts) == 1
-    env.close()
-
-
-def test_compiled_is_an_error_and_names_the_hook():
-    env = Reward()
-    env.inside.way = "compiled"
-    with pytest.raises(ConfigError, match=r"Reward.*_reward_policy, line"):
-        env.reset(seed=0)
     env.close()
 
 

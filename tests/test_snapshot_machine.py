@@ -4,7 +4,7 @@ import pickle
 
 import hypothesis.strategies as st
 import numpy as np
-import pytest
+from combinations import in_turn
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 from test_snapshots import Track
@@ -136,8 +136,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("version", ["1.0", "2.0", "3.0"])
-@pytest.mark.parametrize("way", WAYS)
+@in_turn({"way": list(WAYS), "version": ["1.0", "2.0", "3.0"]})
 def test_any_order(version, way):
     machine = type("Own", (Machine,), {"options": WAYS[way], "version": version})
     examples = 4 if way == "processes" else 25

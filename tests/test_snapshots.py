@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 import odd_values
 import pytest
+from combinations import in_turn
 from demanding_tools import DemandingEnv, make_fmu
 from fmu_tools import PlainEnv, grouped, probe_config
 from zoo_tools import ZooEnv, parameters, zoo_fmu
@@ -118,8 +119,7 @@ def halfway(opened):
 
 
 class TestSingle:
-    @pytest.mark.parametrize("pool", POOLS.values(), ids=POOLS)
-    @pytest.mark.parametrize("version", VERSIONS)
+    @in_turn({"version": VERSIONS, "pool": POOLS})
     def test_goes_on_as_the_original(self, halfway, pool, version):
         env = halfway(fmi_version=version, **pool)
         snapshot = env.save_state()
@@ -232,8 +232,7 @@ class TestSingle:
 
 
 class TestVector:
-    @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-    @pytest.mark.parametrize("threads", [1, 2])
+    @in_turn({"hooks": ["compiled", "array", "per_env"], "threads": [2, 1]})
     def test_goes_on_as_the_original(self, hooks, threads):
         envs = vector_of(Track, hooks=hooks, threads=threads)
         envs.reset(seed=3)
@@ -249,14 +248,18 @@ class TestVector:
         envs.close()
         other.close()
 
-    @pytest.mark.parametrize("version", VERSIONS)
-    @pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
-    @pytest.mark.parametrize("pool", POOLS.values(), ids=POOLS)
-    def test_goes_on_from_a_single_environment(self, halfway, pool, version, hooks):
-        if hooks == "auto" and pool:
-            hooks = "array"
+    @in_turn(
+        {
+            "hooks,isolation": [
+                *(("auto", None), ("array", None), ("per_env", None)),
+                *(("array", "process"), ("per_env", "process")),
+            ],
+            "version": VERSIONS,
+        }
+    )
+    def test_goes_on_from_a_single_environment(self, halfway, hooks, isolation, version):
         env = halfway(fmi_version=version)
-        envs = vector_of(lambda: Track(fmi_version=version), hooks=hooks, **pool)
+        envs = vector_of(lambda: Track(fmi_version=version), hooks=hooks, isolation=isolation)
         observations = envs.restore_state(env.save_state())
         assert observations.tolist() == [np.array(env.state, np.float32).tolist()] * 3
         back = envs.save_state([2])

@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS, PlainEnv, probe_config, probe_fmu
 from gymnasium import spaces
 
@@ -16,17 +17,18 @@ def box(low, high):
 
 
 class TestActionSpace:
-    @pytest.mark.parametrize("version", MAJOR_VERSIONS)
-    @pytest.mark.parametrize(
-        ("names", "expected"),
-        [
-            ("a", box([-1], [1])),
-            (["a", "b"], box([-1, -1], [1, 1])),
-            ("n", Discrete(11)),
-            ("mode", Discrete(3)),
-            ("on", MultiBinary(1)),
-            (["a", "on", "n"], box([-1, 0, -5], [1, 1, 5])),
-        ],
+    @in_turn(
+        {
+            "names,expected": [
+                ("a", box([-1], [1])),
+                (["a", "b"], box([-1, -1], [1, 1])),
+                ("n", Discrete(11)),
+                ("mode", Discrete(3)),
+                ("on", MultiBinary(1)),
+                (["a", "on", "n"], box([-1, 0, -5], [1, 1, 5])),
+            ],
+            "version": MAJOR_VERSIONS,
+        }
     )
     def test_from_types_and_limits(self, make_env, version, names, expected):
         assert make_env(version, model_input_names=names).action_space == expected
@@ -87,25 +89,26 @@ class TestActionSpace:
 
 
 class TestActions:
-    @pytest.mark.parametrize("version", MAJOR_VERSIONS)
-    @pytest.mark.parametrize(
-        ("names", "action", "inputs"),
-        [
-            ("a", [0.5], (0.5,)),
-            ("a", 0.5, (0.5,)),
-            ("a", 1, (1.0,)),
-            ("a", np.float32(0.25), (0.25,)),
-            (["b", "a"], [0.1, 0.2], (0.1, 0.2)),
-            ("n", 0, (-5.0,)),
-            ("n", np.int64(10), (5.0,)),
-            ("n", np.array(7), (2.0,)),
-            ("on", [1], (1.0,)),
-            ("on", np.array([0], np.int8), (0.0,)),
-            (["on", "a"], [0.5, 0.5], (1.0, 0.5)),
-            (["on", "a"], [0.49, 0.5], (0.0, 0.5)),
-            (["n", "a"], [2.4, 0.0], (2.0, 0.0)),
-            (["n", "a"], [-2.6, 0.0], (-3.0, 0.0)),
-        ],
+    @in_turn(
+        {
+            "names,action,inputs": [
+                ("a", [0.5], (0.5,)),
+                ("a", 0.5, (0.5,)),
+                ("a", 1, (1.0,)),
+                ("a", np.float32(0.25), (0.25,)),
+                (["b", "a"], [0.1, 0.2], (0.1, 0.2)),
+                ("n", 0, (-5.0,)),
+                ("n", np.int64(10), (5.0,)),
+                ("n", np.array(7), (2.0,)),
+                ("on", [1], (1.0,)),
+                ("on", np.array([0], np.int8), (0.0,)),
+                (["on", "a"], [0.5, 0.5], (1.0, 0.5)),
+                (["on", "a"], [0.49, 0.5], (0.0, 0.5)),
+                (["n", "a"], [2.4, 0.0], (2.0, 0.0)),
+                (["n", "a"], [-2.6, 0.0], (-3.0, 0.0)),
+            ],
+            "version": MAJOR_VERSIONS,
+        }
     )
     def test_to_inputs(self, make_env, version, names, action, inputs):
         env = make_env(version, model_input_names=names)

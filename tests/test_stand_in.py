@@ -9,10 +9,11 @@ import sys
 import tomllib
 
 import pytest
+from combinations import in_turn
 from fmu_tools import HERE, edited_fmu, library_name
 from process_tools import run_python
 
-from fmugym import FMU, ConfigError, Task
+from fmugym import FMU, ConfigError, Task, extras
 from fmugym.archive.dependencies import ask_in_a_child, missing_libraries
 from fmugym.archive.loader import ask
 from fmugym.repair import stand_in
@@ -39,7 +40,7 @@ def old_library(folder, name, first, versioned=True):
     subprocess.run(command, cwd=folder, check=True)
 
 
-@pytest.fixture(scope="module", params=["libgfortran.so.3", "libgfortran.so.4", "unversioned"])
+@pytest.fixture(scope="module", params=["libgfortran.so.4"])
 def fmu_path(request, probe, tmp_path_factory):
     """The probe, with a library that needs an old libgfortran as it is loaded."""
     folder = tmp_path_factory.mktemp("old")
@@ -79,16 +80,23 @@ except fmugym.FMULoadError as error:
 STEPPED = "[0.30000001192092896, 1.0]"
 
 
-@pytest.fixture(params=["cc", "ziglang"])
+@pytest.fixture
 def compiler(request, monkeypatch):
     """Build with the system's compiler, and without one with that of a package."""
     if request.param == "ziglang":
-        monkeypatch.setattr(stand_in, "_PROGRAMS", ("no-such-compiler",))
-    elif not any(map(shutil.which, stand_in._PROGRAMS)):
+        monkeypatch.setattr(extras, "_COMPILERS", ("no-such-compiler",))
+    elif not any(map(shutil.which, extras._COMPILERS)):
         pytest.skip("there is no system compiler")
     return request.param
 
 
+@in_turn(
+    {
+        "fmu_path": ["libgfortran.so.3", "libgfortran.so.4", "unversioned"],
+        "compiler": ["cc", "ziglang"],
+    },
+    indirect=["fmu_path", "compiler"],
+)
 def test_an_fmu_that_needs_an_old_libgfortran_runs(fmu_path, compiler, tmp_path, capsys):
     (name,) = stand_in.replaceable(FMU(fmu_path))
     assert f"not found here: {name} (no current" in play(fmu_path)
@@ -204,8 +212,8 @@ def test_where_it_is_written(fmu_path, tmp_path, monkeypatch, capsys):
 
 
 def test_without_a_compiler(fmu_path, tmp_path, monkeypatch):
-    monkeypatch.setattr(stand_in, "_PROGRAMS", ())
-    monkeypatch.setattr(stand_in.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(extras, "_COMPILERS", ())
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"needs a C compiler: install gcc .* or ziglang"):
         stand_in.build_stand_in(FMU(fmu_path), tmp_path)
 

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import wine_tools
+from combinations import in_turn
 from fmu_tools import grouped
 from pool_tools import KINDS, open_pool, step
 from test_rollouts import WAYS
@@ -25,8 +26,11 @@ STARTS = np.array([0.0, 1.5, 86400.25])
 OUTPUTS = ("x", "now", "sine", "seconds")
 SUNS = [("ModelExchange", 1), ("ModelExchange", 2), ("ModelExchange", 3)]
 SUNS += [("CoSimulation", 2), ("CoSimulation", 3)]
-CASES = [(kind, *sun) for kind in KINDS for sun in SUNS]
-CASES += [("wine", *sun) for sun in SUNS if sun[0] == "ModelExchange"]
+CASES = [
+    *(("native", *sun) for sun in SUNS),
+    *(("process", "ModelExchange", 1), ("process", "CoSimulation", 3)),
+    ("wine", "ModelExchange", 2),
+]
 all_cases = pytest.mark.parametrize(("kind", "interface", "version"), CASES)
 with_states = pytest.mark.parametrize(
     ("kind", "interface", "version"), [case for case in CASES if case[2] > 1]
@@ -214,11 +218,16 @@ def test_a_single_environment(sun, interface):
     env.close()
 
 
-@pytest.mark.parametrize(
-    ("interface", "mode"),
-    [("CoSimulation", "next_step"), ("CoSimulation", "disabled"), ("ModelExchange", "same_step")],
+@in_turn(
+    {
+        "way": WAYS,
+        "interface,mode": [
+            ("CoSimulation", "next_step"),
+            ("CoSimulation", "disabled"),
+            ("ModelExchange", "same_step"),
+        ],
+    }
 )
-@all_ways
 def test_many_environments_equal_single_ones(sun, way, interface, mode):
     assert require_same_alone(partial(Sun, sun(interface)), 14, mode, **way)
 
@@ -230,8 +239,7 @@ def test_compiled_single_environments(sun):
     plain.close()
 
 
-@pytest.mark.parametrize("version", [2, 3])
-@all_ways
+@in_turn({"way": WAYS, "version": [2, 3]})
 def test_snapshots_and_rollouts_keep_it(sun, way, version):
     make = partial(Sun, sun("ModelExchange", version), max_episode_steps=20)
     env, envs = make(), vector(make, 2, **way)
@@ -445,8 +453,12 @@ def test_recorded_times_are_those_of_the_fmu(task, tmp_path):
     assert len(set(times)) == 6
 
 
-@pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-@pytest.mark.parametrize("warm_up", [0, {"period": "12h", "controller": 0.5, "cache": True}])
+@in_turn(
+    {
+        "hooks": ["compiled", "array", "per_env"],
+        "warm_up": [{"period": "12h", "controller": 0.5, "cache": True}, 0],
+    }
+)
 def test_vectors_of_tasks_equal_single_ones(task, hooks, warm_up):
     task = task | {"start_time": {"from": "10-01", "to": "10-03", "step": "6h"}}
     task |= {"warm_up": warm_up} if warm_up else {}

@@ -4,14 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.utils import seeding
-from vector_tools import Drawing, each_way
+from vector_tools import HOOKS, Drawing
 
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool.form import form_of_draws
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.generators import state_of as generator_state_of
+from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector import streams as module
 from fmugym.vector.streams import EpisodeStreams
@@ -185,8 +186,7 @@ MIXED = {
 }
 
 
-@each_way
-@pytest.mark.parametrize("own", [False, True], ids=["known", "own"])
+@in_turn({"hooks": HOOKS, "own": {"known": False, "own": True}})
 def test_every_distribution_in_episodes(own, hooks):
     """Environment i, seeded with s, draws what a single environment seeded with s + i draws."""
     parameters = {**MIXED, "q_dot_0": OwnUniform(0.1, 0.4)} if own else MIXED

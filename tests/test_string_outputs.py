@@ -18,9 +18,15 @@ import pytest
 import test_strings
 import values_tools
 import wine_tools
+from combinations import in_turn
 from pythonfmu import FmuBuilder
-from values_tools import fixture_feedthrough  # noqa: F401  # the fixture "feedthrough"
-from vector_tools import require_same_alone
+from values_tools import (
+    POOLS,
+    VERSIONS,
+    fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
+    pools,
+)
+from vector_tools import HOOKS, in_each_mode, require_same_alone
 
 import fmugym
 from fmugym import Choice, ConfigError, FMUVectorEnv, SimulationError
@@ -33,7 +39,6 @@ from fmugym.series import RecordSeries, RecordVectorSeries, TimeSeries, plot, wr
 from fmugym.task.quantity import Quantity
 
 WORDS = test_strings.WORDS
-pools, versions = test_strings.pools, test_strings.versions
 
 
 class Echo(test_strings.Reading):
@@ -53,8 +58,7 @@ class Echo(test_strings.Reading):
         return {"told": self.out["String_told"]}
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_hooks_read_texts(feedthrough, version, options):
     env = Echo(feedthrough[version], **options)
     for _ in range(6):
@@ -73,8 +77,7 @@ def test_hooks_read_texts(feedthrough, version, options):
     env.close()
 
 
-@pools
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+@in_turn({"hooks": HOOKS, "options": POOLS})
 def test_vector_environments_read_texts(feedthrough, options, hooks):
     def make():
         return Echo(feedthrough[3], max_episode_steps=2, **options)
@@ -184,8 +187,7 @@ class Pair(test_strings.Reading):
         return self.out["a.String_told"] == "never"
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_components_of_a_system(feedthrough, version, options):
     env = Pair(feedthrough[version], **options)
     for episode, word in enumerate(test_strings.drawn_words(1, 4)):
@@ -299,8 +301,7 @@ class TestSeries:
                 told.append(env.out["String_told"])
         return recorded, told
 
-    @versions
-    @pools
+    @in_turn({"version": VERSIONS, "options": POOLS})
     def test_of_one_environment(self, feedthrough, version, options):
         recorded, told = self.record(Echo(feedthrough[version], **options))
         series = recorded.series
@@ -327,21 +328,19 @@ class TestSeries:
         lengths = [test_strings.SIZES[word] for word in series["String_told"]]
         assert series["length"].tolist() == lengths
 
-    @pools
-    @pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
-    @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
+    @in_each_mode({"options": POOLS})
     def test_of_many_environments(self, feedthrough, options, hooks, mode):
         envs = FMUVectorEnv(
             lambda: Echo(feedthrough[3], max_episode_steps=2, **options),
             3,
             hooks=hooks,
-            autoreset_mode=gymnasium.vector.AutoresetMode[mode.upper()],
+            autoreset_mode=mode,
         )
         recorded = RecordVectorSeries(envs, ALL)
         recorded.reset(seed=4)
         for _ in range(7):
             ended = recorded.step(np.zeros(3, np.int64))[3]
-            if mode == "disabled" and ended.any():
+            if mode is gymnasium.vector.AutoresetMode.DISABLED and ended.any():
                 recorded.reset(options={"reset_mask": ended})
         episodes = recorded.series.episodes()
         recorded.close()

@@ -5,13 +5,15 @@ from functools import partial
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import grouped
 from gymnasium import spaces
 from process_tools import run_python
 from values_tools import (
+    POOLS,
+    VERSIONS,
     fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
     pools,
-    versions,
 )
 from vector_tools import require_same_alone
 
@@ -63,8 +65,7 @@ def drawn_words(seed, count):
     return [WORDS[rng.choice(len(WORDS), p=None)] for _ in range(count)]
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
     env = Reading(feedthrough[version], **options)
     wanted = drawn_words(3, 12)
@@ -78,11 +79,14 @@ def test_a_string_is_drawn_for_each_episode(feedthrough, version, options):
     env.close()
 
 
-@pools
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
-@pytest.mark.parametrize(
-    ("cls", "hooks"),
-    [(Reading, "compiled"), (Telling, "auto"), (Telling, "array"), (Telling, "per_env")],
+HOOKED = [(Reading, "compiled"), (Telling, "auto"), (Telling, "array"), (Telling, "per_env")]
+
+
+@in_turn(
+    {
+        "mode,cls,hooks": [(mode, *one) for one in HOOKED for mode in ("next_step", "same_step")],
+        "options": POOLS,
+    }
 )
 def test_vector_environments_draw_what_single_ones_do(feedthrough, options, mode, cls, hooks):
     """Compiled hooks draw numbers; ``Telling`` has one hook in Python."""
@@ -108,8 +112,7 @@ def test_a_text_for_one_episode(feedthrough, options):
     env.close()
 
 
-@pools
-@pytest.mark.parametrize("hooks", ["auto", "array", "per_env"])
+@in_turn({"hooks": ["auto", "array", "per_env"], "options": POOLS})
 def test_each_environment_has_its_own_text(feedthrough, options, hooks):
     envs = FMUVectorEnv(lambda: Telling(feedthrough[3], words="abc", **options), 3, hooks=hooks)
     assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]

@@ -1,7 +1,7 @@
 """Systems: what the masters compute, and that a system does what an FMU does."""
 
-import pickle
 from dataclasses import replace
+from itertools import product
 
 import container_tools
 import exchange_tools
@@ -11,12 +11,12 @@ import fmu_tools
 import numpy as np
 import pytest
 import system_tools
-from pool_tools import open_pool, start, step
+from combinations import in_turn
 from system_tools import (
     by_each_master,
     closing_pools,  # noqa: F401  # the fixture "make"
+    compiled,  # noqa: F401  # the fixture "fmus"
     linear,
-    linear_fmu,
     masses,
     parted_pendulum,
     play,
@@ -26,11 +26,9 @@ from system_tools import (
 )
 
 import fmugym
-from fmugym import ConfigError, FMULoadError, SimulationError, bundled_fmu
+from fmugym import ConfigError, FMULoadError, bundled_fmu
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.bundle import SaveMethod
-from fmugym.pool.spec import ResetMethod
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import (
     MASTERS,
@@ -47,13 +45,6 @@ from fmugym.systems.system_plan import (
 NO_START = ((), np.zeros((0, 1)))
 
 
-@pytest.fixture(scope="module", name="fmus")
-def compiled(tmp_path_factory):
-    """The FMU of linear equations by FMI version."""
-    folder = tmp_path_factory.mktemp("linear")
-    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
-
-
 # Correctness
 
 ORDERS = {
@@ -63,9 +54,7 @@ ORDERS = {
 
 
 class TestAgainstClosedForms:
-    @by_each_master
-    @pytest.mark.parametrize("name", ORDERS)
-    @pytest.mark.parametrize("steps", [(1, 1), (1, 4), (3, 2)])
+    @in_turn({"name,master": list(product(ORDERS, MASTERS)), "steps": [(1, 1), (1, 4), (3, 2)]})
     def test_errors_are_of_the_first_order_in_the_step_size(self, make, fmus, master, name, steps):
         """Inputs are constant over a step, so half the step size gives half the error."""
         build, exact, outputs = ORDERS[name]
@@ -125,10 +114,13 @@ def pendulums(master="gauss_seidel", versions=("2.0", "3.0", "2.0"), steps=(1, 2
 PENDULUM_OUTPUTS = ["a.theta", "b.theta_dot", "c.q", "c.tau"]
 
 
-@by_each_master
-@pytest.mark.parametrize("versions", [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])
-@pytest.mark.parametrize("substeps", [1, 3])
-@pytest.mark.parametrize("warm_up", [0, 2])
+@in_turn(
+    {
+        "master,versions": list(product(MASTERS, [("2.0", "3.0", "2.0"), ("1.0", "2.0", "1.0")])),
+        "substeps": [1, 3],
+        "warm_up": [0, 2],
+    }
+)
 def test_steps_are_those_of_a_loop_over_fmpy(make, master, versions, substeps, warm_up):
     plan = pendulums(master, versions)
     options = {"substeps": substeps, "start_time": 0.5, "warm_up_steps": warm_up}
@@ -437,34 +429,6 @@ class TestFaults:
 # States
 
 
-class TestStates:
-    @by_each_master
-    def test_return_as_one(self, make, master):
-        pool = make(pendulums(master), (), PENDULUM_OUTPUTS, 2, 0.02)
-        pool.reset((), np.zeros((0, 2)))
-        for _ in range(7):
-            pool.step()
-        snapshot = pool.save()
-        before = [pool.step()[0].copy() for _ in range(5)]
-        pool.restore(snapshot)
-        again = [pool.step()[0].copy() for _ in range(5)]
-        assert np.array_equal(before, again)
-
-    def test_pass_to_other_pools_as_bytes(self, make):
-        one = make(pendulums(), (), PENDULUM_OUTPUTS, 2, 0.02)
-        other = make(pendulums(), (), PENDULUM_OUTPUTS, 2, 0.02)
-        for pool in (one, other):
-            pool.reset((), np.zeros((0, 2)))
-        for _ in range(5):
-            one.step()
-        one.save_by(lambda: SaveMethod.STATE)
-        other.save_by(lambda: SaveMethod.STATE)
-        bundle = pickle.loads(pickle.dumps(one.save_instances(np.arange(2))))
-        other.restore_instances(bundle, np.arange(2), np.arange(2))
-        for _ in range(5):
-            assert one.step()[0].tobytes() == other.step()[0].tobytes()
-
-
 # Where an FMU stands
 
 
@@ -484,30 +448,3 @@ def test_the_house_of_trials_takes_a_system(fmus, tmp_path, monkeypatch):
     assert known_verdict(SystemFMU(masses([fmus[2], fmus[3]]))) is not None
     other = masses([fmus[2], fmus[3]], steps=(2, 1))
     assert known_verdict(SystemFMU(other)) is None
-
-
-@pytest.mark.parametrize("method", list(ResetMethod)[:4])
-def test_episodes_begin_anew_by_each_method(make, opened, method):
-    """Each instance has private copies of all libraries, which are also loaded anew."""
-    options = {"private_libraries": True, "reset_method": method}
-    pool = opened(open_pool(SystemFMU(pendulums()), (), PENDULUM_OUTPUTS, 0.02, 2, options))
-    expected = play(make(pendulums(), (), PENDULUM_OUTPUTS, time_step=0.02), 10).tobytes()
-    assert [play(pool, 10).tobytes() for _ in range(4)] == [expected] * 4
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_system_runs_in_worker_processes(make, opened, workers):
-    options = {"isolation": "process", "workers": workers}
-    pool = opened(open_pool(SystemFMU(pendulums()), (), PENDULUM_OUTPUTS, 0.02, 3, options))
-    here = make(pendulums(), (), PENDULUM_OUTPUTS, 3, 0.02)
-    for one in (pool, here):
-        start(one)
-    for _ in range(10):
-        assert step(pool).tobytes() == step(here).tobytes()
-
-
-def test_a_closed_system_says_so(make):
-    pool = make(pendulums(), (), PENDULUM_OUTPUTS)
-    pool.close()
-    with pytest.raises(SimulationError, match="closed"):
-        pool.reset(*NO_START)

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 import ssp_tools
 import values_tools
-from fmpy import extract, read_model_description
-from fmpy.fmi3 import FMU3Slave
 from fmu_tools import PlainEnv
 from gymnasium import spaces
 from scipy.linalg import expm
@@ -22,7 +20,6 @@ from fmugym import (
     ConfigError,
     Connection,
     FMUSystem,
-    FMUVectorEnv,
     Uniform,
 )
 from fmugym.fmi import Status
@@ -102,28 +99,6 @@ class TestConnections:
         assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.2)
         assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.1)
 
-    def test_a_system_does_what_a_loop_over_fmpy_does(self, make, path, tmp_path):
-        """A Jacobi step: all inputs are outputs of the beginning of the step."""
-        slaves = {n: slave(path, tmp_path / n, v) for n, v in parts().items()}
-        rows = []
-        for count in range(11):
-            told = {
-                name: one.getFloat64([10], nValues=len(v["C"]))
-                for name, one, v in slaves_of(slaves)
-            }
-            rows.append(told["plant"])
-            slaves["control"].setFloat64([9], told["plant"])
-            first, second = told["control"]
-            slaves["plant"].setFloat64([9], [first, GAIN * second + OFFSET])
-            for one in slaves.values():
-                one.doStep(0.1 * count, 0.1)
-        for one in slaves.values():
-            one.terminate()
-            one.freeInstance()
-        outputs = [f"plant.y[{i}]" for i in (1, 2, 3)]
-        pool = make(plant_and_control(path, master="jacobi"), (), outputs)
-        assert play(pool, 10) == pytest.approx(np.array(rows), abs=1e-12)
-
     @pytest.mark.parametrize("loops", ["newton", "fixed_point"])
     def test_algebraic_loops_of_arrays_are_solved(self, make, path, loops):
         """y1 = D1 y2 and y2 = D2 y1 + c, where c comes from the state."""
@@ -189,37 +164,6 @@ class TestConnections:
         assert "component 'big'" in pool.failure(0)
 
 
-def parts():
-    return {"plant": PLANT, "control": CONTROL}
-
-
-def slaves_of(slaves):
-    return [(name, one, parts()[name]) for name, one in slaves.items()]
-
-
-def slave(path, folder, values):
-    """A component in FMPy, initialized."""
-    folder = extract(str(path), str(folder))
-    description = read_model_description(folder, validate=False)
-    one = FMU3Slave(
-        guid=description.guid, unzipDirectory=folder, modelIdentifier="Model", instanceName="one"
-    )
-    one.instantiate()
-    one.enterConfigurationMode()
-    one.setUInt64([1, 2, 3], [values["B"].shape[1], *values["C"].shape[::-1]])
-    one.exitConfigurationMode()
-    for reference, name in enumerate("ABC", 4):
-        one.setFloat64([reference], values[name].ravel())
-    direct = values.get("D", np.zeros((len(values["C"]), values["B"].shape[1])))
-    one.setFloat64([7], direct.ravel())
-    one.setFloat64([8], values["x_0"])
-    one.enterInitializationMode()
-    if values is CONTROL:
-        one.setFloat64([9], PLANT["C"] @ PLANT["x_0"])
-    one.exitInitializationMode()
-    return one
-
-
 # The system's own arrays, and what an environment does with them
 
 
@@ -268,18 +212,6 @@ class TestOwnArrays:
     def test_vector_environments_do_as_single_ones(self, path):
         system = own_arrays(path)
         require_same_alone(lambda: Plant(system), 4)
-
-    def test_snapshots_and_rollouts(self, path):
-        envs = FMUVectorEnv(lambda: Plant(own_arrays(path)), 2)
-        envs.reset(seed=3)
-        actions = np.full((2, 2), 0.5, np.float32)
-        snapshot = envs.save_state()
-        planned = envs.rollout(None, np.stack([actions] * 3, axis=1))
-        rows = [envs.step(actions)[0] for _ in range(3)]
-        envs.restore_state(snapshot)
-        assert np.array_equal(rows, [envs.step(actions)[0] for _ in range(3)])
-        assert np.array_equal(planned.observations.swapaxes(0, 1), rows)
-        envs.close()
 
     def test_an_element_is_an_input_by_itself(self, path):
         """In a system, the other elements keep what they have, also a start value of the config."""

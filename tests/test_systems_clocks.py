@@ -4,6 +4,7 @@ import clocks_tools
 import numpy as np
 import pytest
 import ssp_tools
+from combinations import in_turn
 from fmu_tools import PlainEnv
 from pool_tools import open_pool, start, step
 from system_tools import (
@@ -20,7 +21,6 @@ COUNTS = tuple(f"count of {name}" for name in clocks_tools.CLOCKS)
 LASTS = tuple(f"last {name}" for name in clocks_tools.CLOCKS)
 INPUTS = ("strike", "command", "pace")
 OUTPUTS = (*COUNTS, *LASTS, "x", "sample", "bell", "countdown", "strike")
-both_interfaces = pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
 
 
 @pytest.fixture(scope="module", name="fmus")
@@ -49,8 +49,7 @@ def commands(count=30, seed=0):
     )
 
 
-@both_interfaces
-@pytest.mark.parametrize("substeps", [1, 3])
+@in_turn({"interface": ["CoSimulation", "ModelExchange"], "substeps": [3, 1]})
 def test_a_component_does_what_the_fmu_does_alone(make, opened, fmus, interface, substeps):
     """Also with substeps: a clock that is set ticks once in a step of the environment."""
     fmu = FMU(fmus[interface], probe_timeout=None)

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import pytest
 from fmu_tools import PlainEnv
+from system_tools import links_of
 
 from fmugym import Component, Connection, FMUSystem, bundled_fmu
 from fmugym.archive.structure import Feedthrough
@@ -19,10 +20,6 @@ CART = {version: bundled_fmu("CartPole", version) for version in ("1.0", "2.0", 
 
 def houses(*connections, **options):
     return FMUSystem({"a": HOUSE, "b": HOUSE}, list(connections), **options)
-
-
-def links_of(system):
-    return [(k.source, k.output, k.target, k.input, k.gain, k.offset) for k in system.links]
 
 
 class TestConnections:

@@ -4,7 +4,6 @@ import json
 import pickle
 from contextlib import closing
 
-import gymnasium
 import numpy as np
 import pytest
 import ssp_tools
@@ -15,9 +14,8 @@ import fmugym
 from fmugym import Component, ConfigError, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
 from fmugym.linearization import linearize
-from fmugym.systems.placing import layout_of
+from fmugym.systems.placing import picture_of
 from fmugym.testing import check_fmu_env
-from fmugym.tools.cli import main
 
 HOUSE = bundled_fmu("House")
 
@@ -304,11 +302,11 @@ def test_the_master_of_an_archive_can_be_chosen(archive):
 
 
 class TestCommandLine:
-    def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, capsys):
+    def test_info_of_an_archive_and_of_a_task(self, archive, task, tmp_path, cli):
         for number, path in enumerate((archive, task())):
             picture = tmp_path / f"{number}.svg"
-            assert main(["info", str(path), "--plot", str(picture)]) == 0
-            text = capsys.readouterr().out
+            code, text, _ = cli("info", path, "--plot", picture)
+            assert code == 0
             for fact in (
                 "two houses (a system of 2 FMUs)",
                 "east.Q_em -> west.Q_int (* 0.1)",
@@ -320,34 +318,34 @@ class TestCommandLine:
             assert all(f">{name}<" in drawn for name in ("east", "west", "outside", "Q_int"))
 
     @pytest.mark.parametrize("declared", [True, False])
-    def test_the_master_can_be_chosen(self, archive, task, tmp_path, capsys, declared):
+    def test_the_master_can_be_chosen(self, archive, task, tmp_path, cli, declared):
         path = task()
         if not declared:
             head, _, rest = path.read_text().partition("[system]")
             path.write_text(f'{head}fmu = "{archive}"\n{rest[rest.index("[variables]") :]}')
-        assert main(["info", str(path), "--master", "jacobi", "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["system"]["master"] == "jacobi"
+        _, facts, _ = cli("info", path, "--master", "jacobi", "--json")
+        assert json.loads(facts)["system"]["master"] == "jacobi"
         runs = []
         for options in ([], ["--master", "gauss_seidel"], ["--master", "jacobi"]):
             file = tmp_path / f"{len(runs)}.csv"
-            run = ["simulate", str(path), "--steps", "3", "--output", str(file), *options]
-            assert main(run) == 0
+            assert cli("simulate", path, "--steps", 3, "--output", file, *options)[0] == 0
             runs.append(file.read_text())
         assert runs[0] == runs[1] != runs[2]
 
-    def test_a_single_fmu_has_no_master(self, tmp_path, capsys):
+    def test_a_single_fmu_has_no_master(self, tmp_path, cli):
         path = tmp_path / "task.toml"
         path.write_text('fmu = { bundled = "House" }\n')
         for one in (HOUSE, path):
-            assert main(["info", str(one), "--master", "jacobi"]) == 1
-            assert "House.fmu is a single FMU" in capsys.readouterr().err
-        assert main(["validate", "somewhere:Own", "--master", "jacobi"]) == 1
-        assert "'somewhere:Own'" in capsys.readouterr().err
+            code, _, error = cli("info", one, "--master", "jacobi")
+            assert code == 1
+            assert "House.fmu is a single FMU" in error
+        code, _, error = cli("validate", "somewhere:Own", "--master", "jacobi")
+        assert code == 1
+        assert "'somewhere:Own'" in error
 
-    def test_info_as_json(self, archive, capsys):
-        assert main(["info", str(archive), "--json"]) == 0
-        facts = json.loads(capsys.readouterr().out)
-        system = facts["system"]
+    def test_info_as_json(self, archive, cli):
+        _, facts, _ = cli("info", archive, "--json")
+        system = json.loads(facts)["system"]
         assert [one["name"] for one in system["components"]] == ["east", "west"]
         assert system["connections"][0]["gain"] == 0.1
         assert system["order"] == [
@@ -355,40 +353,35 @@ class TestCommandLine:
             {"components": ["west"], "is_loop": False},
         ]
 
-    def test_info_of_a_task_with_an_fmu_is_that_of_the_fmu(self, tmp_path, capsys):
+    def test_info_of_a_task_with_an_fmu_is_that_of_the_fmu(self, tmp_path, cli):
         path = tmp_path / "task.toml"
         path.write_text('fmu = { bundled = "House" }\n')
-        assert main(["info", str(path)]) == 0
-        found = capsys.readouterr().out
-        assert main(["info", str(HOUSE)]) == 0
-        assert found == capsys.readouterr().out
+        found = cli("info", path)
+        assert found == cli("info", HOUSE)
+        assert found[0] == 0
 
-    def test_the_plot_is_for_systems(self, tmp_path, capsys):
-        assert main(["info", str(HOUSE), "--plot", str(tmp_path / "x.svg")]) == 1
-        assert "--plot" in capsys.readouterr().err
+    def test_the_plot_is_for_systems(self, tmp_path, cli):
+        code, _, error = cli("info", HOUSE, "--plot", tmp_path / "x.svg")
+        assert code == 1
+        assert "--plot" in error
         assert not list(tmp_path.iterdir())
 
-    def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, capsys):
+    def test_from_an_archive_to_a_task_and_an_episode(self, archive, tmp_path, cli):
         path = tmp_path / "new.toml"
-        assert main(["new", str(archive), "--output", str(path)]) == 0
-        run = ["simulate", str(path), "--steps", "3", "--output", str(tmp_path / "run.csv")]
-        assert main(run) == 0
-        header = (tmp_path / "run.csv").read_text().splitlines()[0]
+        assert cli("new", archive, "--output", path)[0] == 0
+        run = tmp_path / "run.csv"
+        assert cli("simulate", path, "--steps", 3, "--output", run)[0] == 0
+        header = run.read_text().splitlines()[0]
         assert "west_E" in header
         program = tmp_path / "houses.py"
-        assert main(["new", "--class", str(archive), "--output", str(program)]) == 0
+        assert cli("new", "--class", archive, "--output", program)[0] == 0
         assert "(fmugym.FMUEnv)" in program.read_text()
-        assert main(["bench", str(archive), "--envs", "2", "--seconds", "0.1"]) == 0
-        capsys.readouterr()
+        assert cli("bench", archive, "--envs", 2, "--seconds", 0.1)[0] == 0
 
-    def test_validation_of_an_archive(self, archive, capsys):
-        assert main(["validate", str(archive)]) == 0
-        assert "repetition" in capsys.readouterr().out
-
-    def test_make(self, task):
-        env = gymnasium.make("fmugym/FMU-v0", config=str(task()))
-        assert env.reset(seed=0)[0].shape == (2,)
-        env.close()
+    def test_validation_of_an_archive(self, archive, cli):
+        code, text, _ = cli("validate", archive)
+        assert code == 0
+        assert "repetition" in text
 
 
 class TestPictures:
@@ -399,7 +392,7 @@ class TestPictures:
         return FMUSystem({"a": HOUSE, "b": HOUSE, "c": HOUSE}, links)
 
     def test_boxes_do_not_overlap(self):
-        boxes = list(layout_of(self.make()).boxes.values())
+        boxes = list(picture_of(self.make()).boxes.values())
         assert len(boxes) == 6
         for number, one in enumerate(boxes):
             for other in boxes[:number]:
@@ -408,19 +401,19 @@ class TestPictures:
                 assert beside or above, (one.title, other.title)
 
     def test_wires_lead_from_port_to_port(self):
-        layout = layout_of(self.make())
-        assert len(layout.wires) == 8
-        for wire in layout.wires:
+        picture = picture_of(self.make())
+        assert len(picture.wires) == 8
+        for wire in picture.wires:
             (source, name), (target, other) = wire.source, wire.target
-            assert wire.points[0] == layout.boxes[source].port(name, left=False)
-            assert wire.points[-1] == layout.boxes[target].port(other, left=True)
+            assert wire.points[0] == picture.boxes[source].port(name, left=False)
+            assert wire.points[-1] == picture.boxes[target].port(other, left=True)
 
     def test_loops_are_marked_and_wires_back_run_below(self):
-        layout = layout_of(self.make())
-        marked = {(w.source[0], w.target[0]) for w in layout.wires if w.in_loop}
+        picture = picture_of(self.make())
+        marked = {(w.source[0], w.target[0]) for w in picture.wires if w.in_loop}
         assert marked == {("a", "b"), ("b", "a")}
-        bottom = min(box.y - box.height for box in layout.boxes.values())
-        back = [wire for wire in layout.wires if wire.leads_back]
+        bottom = min(box.y - box.height for box in picture.boxes.values())
+        back = [wire for wire in picture.wires if wire.leads_back]
         assert back
         assert all(min(y for _, y in wire.points) < bottom for wire in back)
 

@@ -22,7 +22,12 @@ from process_tools import (
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
     start_values,
 )
-from system_tools import linear, linear_fmu, masses, system
+from system_tools import (
+    compiled,  # noqa: F401  # the fixture "fmus"
+    linear,
+    masses,
+    system,
+)
 
 import fmugym
 from fmugym import Component, ConfigError, Connection, FMULoadError, FMUSystem, bundled_fmu
@@ -37,13 +42,6 @@ from fmugym.tools import cli
 from fmugym.wine.installation import can_run_windows
 
 MASSES = ["first.y1", "second.y2"]
-
-
-@pytest.fixture(scope="module", name="fmus")
-def compiled(tmp_path_factory):
-    """The FMU of linear equations by FMI version."""
-    folder = tmp_path_factory.mktemp("linear")
-    return {v: linear_fmu(folder / f"linear{v}.fmu", v) for v in (1, 2, 3)}
 
 
 @pytest.fixture(name="make")

@@ -8,6 +8,7 @@ import fmpy.model_description as md
 import numpy as np
 import pytest
 import system_tools
+from combinations import in_turn
 from fmpy.container_fmu import config
 from fmpy.container_fmu.cli import create_container_fmu
 from pool_tools import open_pool, start, step
@@ -106,8 +107,7 @@ def house_in_parts(linear, master, loops):
 
 
 class TestAgainstOneModel:
-    @pytest.mark.parametrize("master", ["gauss_seidel", "jacobi"])
-    @pytest.mark.parametrize("steps", [(1, 1), (4, 1), (1, 3)])
+    @in_turn({"steps": [(1, 1), (4, 1), (1, 3)], "master": ["gauss_seidel", "jacobi"]})
     def test_the_pendulum(self, linear, master, steps):
         """Half the step size, half the difference: order 1 for each ratio of steps."""
         system = pendulum_in_parts(linear, master, steps)

@@ -113,10 +113,6 @@ def one_house(*wires, ports=None, more="", **attributes):
     return system("r", ports or {}, [house], [connection(*wire) for wire in wires])
 
 
-def links_of(system):
-    return [(k.source, k.output, k.target, k.input, k.gain, k.offset) for k in system.links]
-
-
 def starts_of(system):
     return {one.name: dict(one.starts) for one in system.plan.components}
 
@@ -125,7 +121,7 @@ class TestReading:
     def test_of_one_level(self, pack):
         system = FMUSystem.read(pack(LINKED))
         assert system.name == "test"
-        assert links_of(system) == [("a", "Q_em", "b", "Q_int", 0.5, 10.0)]
+        assert system_tools.links_of(system) == [("a", "Q_em", "b", "Q_int", 0.5, 10.0)]
         found = {c.name: (c.causality, c.ends[0].component) for c in system.plan.connectors}
         assert found == {"T": ("input", "a"), "warmth": ("output", "b")}
         (end,) = system.plan.connectors[0].ends
@@ -134,7 +130,7 @@ class TestReading:
     def test_nested_systems_become_flat(self, pack):
         system = FMUSystem.read(pack(NESTED))
         assert list(system.components) == ["east.house", "west.room.house"]
-        ((*ends, gain, offset),) = links_of(system)
+        ((*ends, gain, offset),) = system_tools.links_of(system)
         assert ends == ["east.house", "Q_em", "west.room.house", "Q_int"]
         assert (gain, offset) == (6.0, 11.0)  # 2 (3 x + 5) + 1
         inputs = {c.name: c.ends[0] for c in system.plan.connectors}
@@ -270,11 +266,11 @@ class TestUnits:
     def test_an_empty_unit_of_an_fmu_is_none(self, pack, odd_fmu):
         root = self.pair({}, [connection("a.y1", "b.u1")])
         found = self.read(pack, odd_fmu, root)
-        assert links_of(found) == [("a", "y1", "b", "u1", 1.0, 0.0)]
+        assert system_tools.links_of(found) == [("a", "y1", "b", "u1", 1.0, 0.0)]
 
     def test_that_the_file_defines_convert_between_fmus(self, pack, odd_fmu):
         found = self.read(pack, odd_fmu, self.pair({}, [connection("a.y1", "b.u2")]))
-        assert links_of(found) == [("a", "y1", "b", "u2", 3.5, 0.0)]
+        assert system_tools.links_of(found) == [("a", "y1", "b", "u2", 3.5, 0.0)]
 
     def test_that_the_file_defines_convert_through_systems(self, pack, odd_fmu):
         inner = system(
@@ -286,14 +282,16 @@ class TestUnits:
         outer = component("b", {"u2": "input even"}, **self.ODD)
         wires = [connection("inner.out", "b.u2", linear(2.0))]
         found = self.read(pack, odd_fmu, system("r", {}, [inner, outer], wires))
-        assert links_of(found) == [("inner.a", "y1", "b", "u2", 7.0, 0.0)]
+        assert system_tools.links_of(found) == [("inner.a", "y1", "b", "u2", 7.0, 0.0)]
 
     def test_of_a_connector_is_that_of_a_variable_without_one(self, pack, odd_fmu):
         root = self.pair({"q": "input odd"}, [connection("q", "b.u1")], of_second="input even")
         (connector,) = self.read(pack, odd_fmu, root).connectors
         assert (connector.unit, connector.ends[0].gain) == ("odd", 3.5)
         root = self.pair({}, [connection("a.y1", "b.u1")], of_second="input W")
-        assert links_of(self.read(pack, odd_fmu, root)) == [("a", "y1", "b", "u1", 7.0, 0.0)]
+        assert system_tools.links_of(self.read(pack, odd_fmu, root)) == [
+            ("a", "y1", "b", "u1", 7.0, 0.0)
+        ]
 
     def test_that_the_file_defines_are_known_to_tasks(self, pack, odd_fmu, tmp_path):
         fmu = self.read(pack, odd_fmu, self.pair({"q": "input odd"}, [connection("q", "b.u2")]))
@@ -432,7 +430,7 @@ class TestDamaged:
         "\u202e",
     )
 
-    @pytest.mark.parametrize("seed", range(6))
+    @pytest.mark.parametrize("seed", range(3))
     def test_by_chance(self, pack, seed):
         draw = random.Random(seed)
         texts = [NESTED, LINKED, self.with_parameters()]

@@ -160,8 +160,9 @@ def test_another_thread_is_refused_while_the_fmu_steps(hooks):
     env.close()
 
 
-@WAYS
-@pytest.mark.parametrize("cls", [CartPoleEnv, Left])
+@pytest.mark.parametrize(
+    ("hooks", "cls"), [("auto", CartPoleEnv), ("auto", Left), ("python", CartPoleEnv)]
+)
 def test_threads_at_once_leave_it_whole(hooks, cls):
     env = begin(cls(hooks=hooks), hooks)
     calls = quiet_methods(env, env.save_state())
@@ -245,8 +246,9 @@ def interrupt(play, arguments):
 
 
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers of Unix")
-@WAYS
-@pytest.mark.parametrize("cls", [CartPoleEnv, Left])
+@pytest.mark.parametrize(
+    ("hooks", "cls"), [("auto", CartPoleEnv), ("auto", Left), ("python", CartPoleEnv)]
+)
 def test_interrupts_leave_it_whole(hooks, cls):
     env = begin(cls(hooks=hooks), hooks)
     calls = quiet_methods(env, env.save_state())

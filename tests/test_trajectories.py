@@ -4,10 +4,11 @@ import exchange_tools
 import gymnasium
 import numpy as np
 import pytest
+from combinations import in_turn
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from test_derivatives import DT, HORIZON, B, G, L, M, Precise
-from test_snapshots import POOLS, vector_of
+from test_snapshots import vector_of
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 import fmugym
@@ -102,10 +103,9 @@ class TestDifferences:
             effect = found.A[step] @ effect
         assert effect == pytest.approx(by_actions[-1, :, 2], rel=1e-4, abs=1e-4)
 
-    @pytest.mark.parametrize("pool", POOLS)
-    def test_on_every_pool(self, pool):
+    def test_in_a_worker_process(self):
         wanted = along(states=STARTS, method="differences")
-        found = along(states=STARTS, method="differences", options=POOLS[pool])
+        found = along(states=STARTS, method="differences", options={"isolation": "process"})
         assert found.A.tobytes() == wanted.A.tobytes()
         assert found.B.tobytes() == wanted.B.tobytes()
 
@@ -140,8 +140,7 @@ class TestDifferences:
             along(Old, states=STARTS, method="directional")
 
 
-@pytest.mark.parametrize("method", ["directional", "differences"])
-@pytest.mark.parametrize("shape", [(), (2, 2)])
+@in_turn({"method": ["directional", "differences"], "shape": [(), (2, 2)]})
 def test_of_actions_of_any_shape(method, shape):
     class Shaped(Precise):
         def _get_action_space(self):
@@ -235,9 +234,8 @@ class TestDirectional:
         assert pytest.approx(own.A, abs=1e-9) == scaled.A
         assert pytest.approx(0.25 * own.B, rel=1e-4) == scaled.B
 
-    @pytest.mark.parametrize("isolation", ["none", "process"])
-    def test_wherever_the_fmu_runs(self, isolation):
-        found = along(lambda: Precise(isolation=isolation), method="directional")
+    def test_in_a_worker_process(self):
+        found = along(lambda: Precise(isolation="process"), method="directional")
         assert found.A.tobytes() == along(method="directional").A.tobytes()
 
     def test_exponential_of_stiff_models(self):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import fmpy
 import pytest
+from combinations import in_turn
 from fmu_tools import (
     PlainEnv,
     library_name,
@@ -74,8 +75,12 @@ def refused(path, match):
 
 
 class TestNames:
-    @pytest.mark.parametrize("version", [2, 3])
-    @pytest.mark.parametrize("identifier", ["Pro-be", "Pro.be", "Pro be", "1st", "Pröbe", "~", "-"])
+    @in_turn(
+        {
+            "identifier": ["Pro-be", "Pro.be", "Pro be", "1st", "Pröbe", "~", "-"],
+            "version": [2, 3],
+        }
+    )
     def test_model_identifiers_that_are_not_c_identifiers(self, tmp_path, identifier, version):
         """FMI 2.0 and 3.0 make a file name of it, and nothing else."""
         old, new = library_name(version), library_name(version, identifier)
@@ -184,8 +189,7 @@ class TestLibraries:
 
         return pack_named
 
-    @pytest.mark.parametrize("version", [2, 3])
-    @pytest.mark.parametrize("name", ["Other", "probe", "lib Probe-1.0"])
+    @in_turn({"name": ["Other", "probe", "lib Probe-1.0"], "version": [2, 3]})
     def test_of_another_name(self, named, capsys, caplog, version, name):
         path, other = named(name, version), library_name(version, name)
         with caplog.at_level("INFO", "fmugym"):

@@ -5,16 +5,18 @@ import makers
 import numpy as np
 import pytest
 import values_tools
+from combinations import in_turn
 from gymnasium import spaces
 from scipy.linalg import expm
 from values_tools import (
+    POOLS,
     STEP,
+    VERSIONS,
     Env,
     Writing,
     fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
     pools,
     state_space_env,
-    versions,
     ways,
 )
 from vector_tools import require_same_alone
@@ -114,8 +116,7 @@ def test_one_element(state_space, options):
     env.close()
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_some_elements_are_inputs(feedthrough, version, options):
     """Names as ``v[1]`` are elements in FMI 3.0, and mere names before it."""
     first, second = ("v[1,2]", "v[2,1]") if version == 3 else ("v[1]", "v[2]")

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import values_tools
+from combinations import in_turn
 from scipy.linalg import expm
 from values_tools import (
     LARGER,
     STEP,
+    WAYS,
     Writing,
     state_space_env,
-    ways,
 )
 
 import fmugym
@@ -29,8 +30,7 @@ def larger(steps, u):
     return np.append(np.dot(LARGER["C"], x) + np.dot(LARGER["D"], u), x)
 
 
-@pytest.mark.parametrize("probe", [None, 60.0], ids=["", "tried"])
-@ways
+@in_turn({"options": WAYS, "probe": [None, 60.0]})
 def test_structural_parameters_give_arrays_their_sizes(sized, options, probe):
     config = {"model_parameters": LARGER, "probe_timeout": probe} | options
     envs = FMUVectorEnv(lambda: state_space_env(sized, **config), 2)

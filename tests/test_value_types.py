@@ -4,12 +4,14 @@ import model_tools
 import numpy as np
 import pytest
 import values_tools
+from combinations import in_turn
 from gymnasium import spaces
 from values_tools import (
+    POOLS,
+    VERSIONS,
     Env,
     Writing,
     fixture_feedthrough,  # noqa: F401  # the fixture "feedthrough"
-    pools,
     versions,
 )
 
@@ -28,8 +30,7 @@ LIMITS = {
 }
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_numbers_of_every_type_come_out_as_they_went_in(feedthrough, version, options):
     types = values_tools.TYPES[version]
     names = {key: [f"{t}_{key}" for t in types] for key in ("in", "out", "parameter", "told")}
@@ -81,8 +82,7 @@ def test_values_outside_of_a_type(feedthrough, version):
             env.close()
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_enumerations_are_discrete(feedthrough, version, options):
     env = Env(
         feedthrough[version],
@@ -96,8 +96,7 @@ def test_enumerations_are_discrete(feedthrough, version, options):
     env.close()
 
 
-@versions
-@pools
+@in_turn({"version": VERSIONS, "options": POOLS})
 def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options):
     path = model_tools.model_fmu(
         tmp_path / "Resource.fmu",

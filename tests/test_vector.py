@@ -6,11 +6,12 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     IDS,
-    each_mode,
     each_way,
     fixture_outside,  # noqa: F401  # the fixture "outside"
+    in_each_mode,
     require_equal,
     require_pair_equal,
+    results_of_both,
     run_side_by_side,
     sampled_actions,
 )
@@ -18,9 +19,7 @@ from vector_tools import (
 import fmugym
 
 
-@each_way
-@each_mode
-@pytest.mark.parametrize("env_id", IDS)
+@in_each_mode({"env_id": IDS})
 def test_each_environment_is_what_it_is_alone(env_id, mode, hooks, outside):
     options = {"max_episode_steps": 25}
     ours = gym.make_vec(env_id, num_envs=5, autoreset_mode=mode, hooks=hooks, **options)
@@ -48,6 +47,31 @@ def test_any_number_of_environments_in_gymnasiums_own_ways(num_envs, way):
     ours = gym.make_vec("fmugym/CartPole-v0", num_envs=num_envs)
     theirs = gym.make_vec("fmugym/CartPole-v0", num_envs=num_envs, vectorization_mode=way)
     assert run_side_by_side(ours, theirs) > 0
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_figures_of_a_task_file_come_out_of_gymnasiums_own_processes(tmp_path):
+    path = tmp_path / "task.toml"
+    path.write_text(
+        """
+        fmu = { bundled = "Pendulum" }
+        time_step = "50ms"
+        episode_length = "0.5s"
+        reward = "-abs(q)"
+        parameters = { q_0 = { distribution = "uniform", low = -1, high = 1 } }
+        agent = { actions = ["tau"], observations = ["q"] }
+        kpis = { worst = { max = "abs(q)" } }
+        """
+    )
+    ours, theirs = (
+        gym.make_vec("fmugym/FMU-v0", 2, vectorization_mode=way, config=str(path))
+        for way in ("vector_entry_point", "async")
+    )
+    for result in results_of_both(ours, theirs, 9):
+        worst = result[4]["kpis"]["worst"]
+        assert (worst > np.abs(result[0][:, 0]) - 1e-6).all()
+    ours.close()
+    theirs.close()
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])

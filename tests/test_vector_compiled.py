@@ -12,10 +12,9 @@ from vector_tools import (
     Drawing,
     PushedCart,
     RingError,
-    each_mode,
-    each_way,
     fixture_outside,  # noqa: F401  # the fixture "outside"
     handler,  # noqa: F401  # the fixture "handler"
+    in_each_mode,
     require_pair_equal,
     require_same_starts,
     results_of_both,
@@ -96,9 +95,7 @@ class MoreArithmetic(Arithmetic):
         return first + second - 1
 
 
-@each_way
-@each_mode
-@pytest.mark.parametrize("cls", [Arithmetic, MoreArithmetic])
+@in_each_mode({"cls": [Arithmetic, MoreArithmetic]})
 def test_compiled_arithmetic_is_that_of_numbers(cls, mode, hooks):
     way = hooks if hooks != "auto" else "compiled"
     assert require_pair_equal(cls, steps=150, mode=mode, num_envs=7, hooks=way) > 20

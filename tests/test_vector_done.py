@@ -8,6 +8,7 @@ from vector_tools import (
     CART_POLE,
     PushedCart,
     each_mode,
+    in_each_mode,
     require_equal,
     results_of_both,
 )
@@ -17,7 +18,8 @@ from fmugym import SimulationError
 from fmugym.series import RecordVectorSeries
 from fmugym.vector import FMUVectorEnv
 
-each_kind = pytest.mark.parametrize("hooks", ["compiled", "array"])
+KINDS = ("compiled", "array")
+each_kind = pytest.mark.parametrize("hooks", KINDS)
 
 
 class Faulty(PushedCart):
@@ -47,9 +49,7 @@ def pair(task, hooks, mode, num_envs=6):
     )
 
 
-@each_kind
-@each_mode
-@pytest.mark.parametrize("task", [CART_POLE, Faulty, Truncating])
+@in_each_mode({"task": [CART_POLE, Faulty, Truncating]}, KINDS)
 def test_done_is_that_of_single_environments(task, mode, hooks):
     ours, theirs = pair(task, hooks, mode)
     seen = set()
@@ -213,9 +213,7 @@ class Doomed(Broken):
         return self.state[0] > 0.2
 
 
-@each_kind
-@each_mode
-@pytest.mark.parametrize("task", [Broken, BrokenCut, Doomed])
+@in_each_mode({"task": [Broken, BrokenCut, Doomed]}, KINDS)
 def test_observations_have_done(task, mode, hooks):
     """Of a step whose FMU failed it is what the fault makes it; of a start, it is False."""
     ours, theirs = pair(task, hooks, mode)
@@ -225,9 +223,7 @@ def test_observations_have_done(task, mode, hooks):
     theirs.close()
 
 
-@each_kind
-@each_mode
-@pytest.mark.parametrize("task", [Judged, Cut])
+@in_each_mode({"task": [Judged, Cut]}, KINDS)
 def test_infos_of_faults_have_done(task, mode, hooks):
     ours, theirs = pair(task, hooks, mode)
     infos = [result[4].get("final_info", result[4]) for result in results_of_both(ours, theirs)]

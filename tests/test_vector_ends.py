@@ -14,6 +14,7 @@ import tracemalloc
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     CART_POLE,
@@ -217,8 +218,7 @@ FOREIGN = {
 }
 
 
-@pytest.mark.parametrize("task", [CART_POLE, Named])
-@pytest.mark.parametrize("make", FOREIGN.values(), ids=FOREIGN)
+@in_turn({"make": FOREIGN, "task": [CART_POLE, Named]})
 def test_objects_of_the_caller_do_not_come_back(task, make):
     envs, own = made(task), set()
     for infos in infos_of(envs):
@@ -245,8 +245,7 @@ def test_copies_are_plain_and_equal(task):
     envs.close()
 
 
-@pytest.mark.parametrize("task", [CART_POLE, Telling])
-@pytest.mark.parametrize("holds", [False, True])
+@in_turn({"task": [CART_POLE, Telling], "holds": [False, True]})
 def test_nothing_leaks(task, holds):
     envs = made(task, 12)
     watched = (None, True, False, "final_obs", "_final_obs", "final_info", "drawn", "state")

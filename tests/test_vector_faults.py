@@ -5,14 +5,16 @@ import logging
 import fmu_tools
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import SyncVectorEnv
 from vector_tools import (
     ABSURD,
+    HOOKS,
     Cart,
     Drawing,
     PushedCart,
-    each_mode,
     each_way,
+    in_each_mode,
     make_pair,
     require_same_infos,
     results_of_both,
@@ -32,10 +34,7 @@ def require_same_reasons(first, second):
     require_same_infos(first, second)
 
 
-@each_way
-@each_mode
-@pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
-@pytest.mark.parametrize("cls", [Cart, PushedCart])
+@in_each_mode({"on_fault": ["truncate", "terminate"], "cls": [Cart, PushedCart]})
 def test_faults_are_those_of_single_environments(cls, on_fault, mode, hooks):
     logging.getLogger(f"fmugym.{cls.__name__}").setLevel(logging.CRITICAL)
     ours, theirs = make_pair(cls, mode, hooks=hooks, on_fault=on_fault)
@@ -51,8 +50,7 @@ def test_faults_are_those_of_single_environments(cls, on_fault, mode, hooks):
     theirs.close()
 
 
-@each_way
-@pytest.mark.parametrize("cls", [Cart, PushedCart])
+@in_turn({"hooks": HOOKS, "cls": [Cart, PushedCart]})
 def test_a_fault_may_be_raised(cls, hooks):
     vector = FMUVectorEnv(lambda: cls(on_fault="raise"), 3, hooks=hooks)
     vector.reset(seed=0)
@@ -64,8 +62,7 @@ def test_a_fault_may_be_raised(cls, hooks):
     vector.close()
 
 
-@each_way
-@pytest.mark.parametrize("version", [2, 3])
+@in_turn({"hooks": HOOKS, "version": [2, 3]})
 def test_an_fmu_may_ask_for_the_end(version, hooks, probe):
     """The one whose parameters say so stops in its third step."""
 
@@ -126,9 +123,7 @@ class Rewarding(Drawing):
         return {"sum": self.variables["sum"], "count": self.step_count}
 
 
-@each_way
-@each_mode
-@pytest.mark.parametrize("on_fault", ["truncate", "terminate"])
+@in_each_mode({"on_fault": ["truncate", "terminate"]})
 def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(on_fault, mode, hooks):
     logging.getLogger("fmugym.Rewarding").setLevel(logging.CRITICAL)
     way = "compiled" if hooks == "auto" else hooks

@@ -1,5 +1,7 @@
 """Functions of numpy give compiled what they give on arrays, or are refused by name."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -135,10 +137,9 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("letter", "dqf")
 @pytest.mark.parametrize("name", ROWS)
-def test_functions_of_a_few_elements(name, letter):
-    for count in (1, 2, 3, 7):
+def test_functions_of_a_few_elements(name):
+    for letter, count in itertools.product("dqf", (1, 2, 3, 7)):
         x = np.array([values(letter, seed=i) for i in range(count)])
         for row in x:
             np.random.default_rng(count).shuffle(row)

@@ -3,8 +3,11 @@
 import fmu_tools
 import numpy as np
 import pytest
+from combinations import in_turn
+from gymnasium.vector import AutoresetMode
 from vector_tools import (
     CART_POLE,
+    HOOKS,
     Drawing,
     Historic,
     Reaching,
@@ -65,7 +68,7 @@ def test_the_rewards_of_goals(hooks):
     vector.close()
 
 
-@each_way
+@pytest.mark.parametrize("hooks", ["array", "auto"])
 @pytest.mark.parametrize(
     "config",
     [
@@ -102,23 +105,22 @@ def test_discrete_observations(make_env):
     vector.close()
 
 
-@pytest.mark.parametrize(
-    ("hook", "value", "error", "text"),
-    [
-        *(
-            (hook, lambda env: None, ConfigError, f"{hook} returned None")
-            for hook in ("_get_inputs", "_reward_policy", "_is_done", "_get_observation")
-        ),
-        ("_get_inputs", lambda env: [env.action[0]] * 2, ConfigError, "2 values, expected 1"),
-        (
-            "_reward_policy",
-            lambda env: env.np_random.random(),
-            SimulationError,
-            "a hook drew random numbers",
-        ),
-    ],
-)
-@each_way
+MISTAKES = [
+    *(
+        (hook, lambda env: None, ConfigError, f"{hook} returned None")
+        for hook in ("_get_inputs", "_reward_policy", "_is_done", "_get_observation")
+    ),
+    ("_get_inputs", lambda env: [env.action[0]] * 2, ConfigError, "2 values, expected 1"),
+    (
+        "_reward_policy",
+        lambda env: env.np_random.random(),
+        SimulationError,
+        "a hook drew random numbers",
+    ),
+]
+
+
+@in_turn({"hook,value,error,text": MISTAKES, "hooks": HOOKS})
 def test_mistakes_in_hooks(hook, value, error, text, hooks):
     vector = FMUVectorEnv(type("Mistaken", (Drawing,), {hook: value}), 2, hooks=hooks)
     with pytest.raises(error, match=text):
@@ -142,8 +144,7 @@ class Branching(CART_POLE):
         return True if abs(self.out["x"]) > 0.1 else super()._is_done()
 
 
-@pytest.mark.parametrize("cls", [OwnStep, Branching])
-@each_mode
+@in_turn({"mode": list(AutoresetMode), "cls": [OwnStep, Branching]})
 def test_hooks_that_branch(cls, mode):
     assert require_pair_equal(cls, mode=mode, hooks="per_env") > 5
 

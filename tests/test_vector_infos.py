@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode
 from vector_tools import (
     CART_POLE,
     Remembering,
-    each_mode,
     each_way,
+    in_each_mode,
     require_equal,
     sampled_actions,
 )
@@ -80,9 +80,7 @@ def require_zero_outside_of_masks(infos):
             assert not values[~mask].any(), name
 
 
-@each_way
-@each_mode
-@pytest.mark.parametrize("cls", [Remembering, CART_POLE])
+@in_each_mode({"cls": [Remembering, CART_POLE]})
 def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks):
     vector = FMUVectorEnv(cls, 4, autoreset_mode=mode, hooks=hooks)
     require_zero_outside_of_masks(vector.reset(seed=0)[1])

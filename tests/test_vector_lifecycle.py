@@ -10,6 +10,7 @@ import cloudpickle
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from test_vector_threads import methods
 from vector_tools import CART_POLE, Drawing, each_mode, each_way, require_equal, sampled_actions
@@ -46,8 +47,7 @@ MAKERS = {
 }
 
 
-@pytest.mark.parametrize("how", COPIES)
-@pytest.mark.parametrize("maker", MAKERS)
+@in_turn({"maker": list(MAKERS), "how": list(COPIES)})
 def test_a_copy_is_the_same_construction(maker, how):
     original = MAKERS[maker]()
     original.reset(seed=1)

@@ -5,7 +5,8 @@ import threading
 import gymnasium as gym
 import numpy as np
 import pytest
-from vector_tools import Drawing, each_way, require_equal, require_pair_equal
+from combinations import in_turn
+from vector_tools import HOOKS, Drawing, require_equal, require_pair_equal
 
 import fmugym
 from fmugym import ConfigError, SimulationError
@@ -101,8 +102,7 @@ class UsesItself(Drawing):
         return self.state[0] - self.offset
 
 
-@each_way
-@pytest.mark.parametrize("cls", [WithHelper, UsesItself])
+@in_turn({"hooks": HOOKS, "cls": [WithHelper, UsesItself]})
 def test_constructors_may_make_and_use_environments(cls, hooks):
     require_pair_equal(cls, 12, num_envs=3, hooks=hooks)
 
@@ -173,8 +173,7 @@ class Failing(Drawing):
         return 1.0
 
 
-@pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])
-@pytest.mark.parametrize("hooks", ["array", "per_env"])
+@in_turn({"mode": ["next_step", "same_step", "disabled"], "hooks": ["array", "per_env"]})
 def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, monkeypatch):
     monkeypatch.setattr("fmugym.vector.choosing.find_difference", lambda env: None)
     vector = FMUVectorEnv(Failing, 3, hooks=hooks, autoreset_mode=mode)

@@ -9,6 +9,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from vector_tools import CART_POLE, Drawing, PushedCart, require_equal
 
@@ -122,8 +123,7 @@ def play_both(first, second, steps=40):
     return resets
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("num_envs", [1, 5, 140])
+@in_turn({"task": TASKS, "num_envs": [1, 5, 140]})
 def test_both_ways_do_the_same(task, num_envs):
     first, second = made(task, num_envs), made(task, num_envs)
     assert first.inside.engine.way == "compiled"

@@ -9,14 +9,15 @@ import threading
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.error import AlreadyPendingCallError, NoAsyncCallError
+from gymnasium.vector import AutoresetMode
 from test_native_pool import busy_fmu
 from test_vector_threads import methods
 from vector_tools import (
     CART_POLE,
+    HOOKS,
     Drawing,
-    each_mode,
-    each_way,
     require_equal,
     run_side_by_side,
 )
@@ -46,8 +47,7 @@ class InTheBackground(gym.vector.VectorWrapper):
         return self.env.step_wait()
 
 
-@each_mode
-@each_way
+@in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
 def test_results_are_those_of_step(mode, hooks):
     first, second = (FMUVectorEnv(CART_POLE, 4, autoreset_mode=mode, hooks=hooks) for _ in range(2))
     assert run_side_by_side(InTheBackground(first), second, 40) > 4

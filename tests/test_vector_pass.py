@@ -1,8 +1,11 @@
 """Episodes start within the native pool's pass, in every autoreset mode, as outside of it."""
 
+from itertools import product
+
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from vector_tools import (
     CART_POLE,
@@ -49,10 +52,7 @@ class Tracking(Drawing):
         return {"error": self.variables["target"] - self.state[0]}
 
 
-@each_mode
-@pytest.mark.parametrize(
-    ("task", "num_envs"), [(CART_POLE, 1), (CART_POLE, 140), (Tracking, 3), (Tracking, 140)]
-)
+@in_turn({"task,mode": list(product([CART_POLE, Tracking], AutoresetMode)), "num_envs": [140, 1]})
 def test_no_reset_is_made_outside_of_the_pass(mode, task, num_envs, outside):
     assert require_pair_equal(task, 60, mode, num_envs=num_envs, hooks="compiled") >= 2 * num_envs
     assert not outside

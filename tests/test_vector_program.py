@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from vector_tools import (
@@ -232,8 +233,7 @@ class Acting(Task):
         return np.array([0.25 * flat[0], 0.5 * before[-1], self.inputs[0]])
 
 
-@pytest.mark.parametrize("mode", ["next_step", "same_step"])
-@pytest.mark.parametrize("name", SPACES)
+@in_turn({"name": list(SPACES), "mode": ["next_step", "same_step"]})
 def test_actions_of_compiled_types(name, mode):
     assert require_same(type("Own", (Acting,), {"space": SPACES[name]}), mode=mode) > 40
 
@@ -266,8 +266,7 @@ def test_minus_zero_is_zero_for_integers():
     envs.close()
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("bad", [np.nan, "x"])
+@in_turn({"dtype": [np.float32, np.float64], "bad": [np.nan, "x"]})
 def test_bad_actions_are_refused(bad, dtype):
     cls = type("Acting", (Task,), {"space": gym.spaces.Box(-1.0, 1.0, (2,), dtype)})
     envs = FMUVectorEnv(cls, 3, hooks="compiled")

@@ -10,13 +10,12 @@ from itertools import islice
 
 import gymnasium as gym
 import numpy as np
-import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from vector_tools import (
     CART_POLE,
     Drawing,
-    each_mode,
     each_way,
+    in_each_mode,
     results_of_both,
     sampled_actions,
 )
@@ -71,10 +70,7 @@ ASKED = {
 }
 
 
-@each_mode
-@each_way
-@pytest.mark.parametrize("way", ASKED)
-@pytest.mark.parametrize("first", [1, 3])
+@in_each_mode({"way": list(ASKED), "first": [1, 3]})
 def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mode):
     envs = ours, theirs = pair(hooks, mode)
     for count, _ in enumerate(results_of_both(*envs, STEPS, seed=0), 1):
@@ -83,9 +79,7 @@ def test_the_last_step_is_told_from_the_first_question_on(first, way, hooks, mod
     close(envs)
 
 
-@each_mode
-@each_way
-@pytest.mark.parametrize("count", [1, 2, 3])
+@in_each_mode({"count": [1, 2, 3]})
 def test_snapshots_hold_the_last_step(count, hooks, mode):
     envs = ours, theirs = pair(hooks, mode)
     list(islice(results_of_both(*envs, STEPS, seed=0), count))

@@ -5,10 +5,12 @@ import functools
 import gc
 import pickle
 import weakref
+from itertools import product
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from vector_tools import CART_POLE, Drawing, grow, protect, reshape, retype, sampled_actions
 
 from fmugym import ConfigError, FMUVectorEnv
@@ -36,8 +38,8 @@ class Telling(Named):
         return {"angle": self.state[0]}
 
 
-each_task = pytest.mark.parametrize("task", [CART_POLE, Named, Telling])
-each_mode = pytest.mark.parametrize("mode", ["next_step", "same_step"])
+TASKS = (CART_POLE, Named, Telling)
+MODES = ("next_step", "same_step")
 
 
 def make(task, mode="next_step"):
@@ -88,9 +90,9 @@ def held_buffers(arrays, step):
     return list(map(memoryview, arrays))
 
 
-@each_task
-@each_mode
-@pytest.mark.parametrize("hold", [held_in_turn, held_views, held_buffers])
+@in_turn(
+    {"mode,hold": list(product(MODES, [held_in_turn, held_views, held_buffers])), "task": TASKS}
+)
 def test_what_the_caller_holds_does_not_change(task, mode, hold):
     """Nor do whole results, as test_vector_infos.py shows."""
     envs, kept = make(task, mode), []
@@ -110,9 +112,9 @@ def shrink(array):
     array.resize(1, refcheck=False)
 
 
-@each_task
-@each_mode
-@pytest.mark.parametrize("change", [reshape, retype, protect, shrink, grow])
+@in_turn(
+    {"mode,change": list(product(MODES, [reshape, retype, protect, shrink, grow])), "task": TASKS}
+)
 @pytest.mark.filterwarnings("ignore:Setting the:DeprecationWarning")
 def test_what_the_caller_changes_in_place_does_not_come_back(task, mode, change):
     expected, envs = played(task, mode), make(task, mode)
@@ -127,8 +129,7 @@ def test_what_the_caller_changes_in_place_does_not_come_back(task, mode, change)
     envs.close()
 
 
-@each_task
-@each_mode
+@in_turn({"task": TASKS, "mode": MODES})
 def test_weak_references_end(task, mode):
     envs, references = make(task, mode), []
     for actions in sampled_actions(envs, STEPS):

@@ -2,7 +2,10 @@
 
 import numpy as np
 import pytest
+from combinations import in_turn
+from gymnasium.vector import AutoresetMode
 from vector_tools import (
+    HOOKS,
     Drawing,
     each_mode,
     each_way,
@@ -39,7 +42,7 @@ OPTIONS = (
 )
 
 
-@each_way
+@pytest.mark.parametrize("hooks", ["array", "auto"])
 @pytest.mark.parametrize("kind", PARAMETERS)
 def test_options_take_the_streams_back(kind, hooks):
     keywords = {"model_parameters": PARAMETERS[kind], "episode_variables": VARIABLES}
@@ -148,8 +151,7 @@ def test_a_distribution_for_each_element(hooks, mode):
     theirs.close()
 
 
-@each_mode
-@each_way
+@in_turn({"mode": list(AutoresetMode), "hooks": HOOKS})
 def test_elements_that_only_python_can_draw(hooks, mode):
     variables = {**ELEMENTS, "target": [OwnUniform(-1, 1), Uniform(0, 2), 0.5]}
     options = {"num_envs": 3, "hooks": hooks, "variables": variables}

@@ -6,11 +6,11 @@ import logging
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import PlainEnv, probe_config
 from test_vector_program import Task, require_bits, require_same, require_variables
 from vector_tools import (
     require_equal,
-    require_pair_equal,
     results_of_both,
 )
 
@@ -137,11 +137,6 @@ def test_tasks(cls, mode):
         assert require_same(cls, num_envs=num_envs, steps=30, mode=mode) >= num_envs
 
 
-@pytest.mark.parametrize("cls", [Delayed, Goal])
-def test_tasks_are_those_of_single_environments(cls):
-    require_pair_equal(cls, steps=30, hooks="compiled", rtol=1e-12)
-
-
 def test_inputs_outside_of_their_type(probe):
     class Typed(PlainEnv):
         def __init__(self):
@@ -201,8 +196,7 @@ LEFT = {
 }
 
 
-@each_mode
-@pytest.mark.parametrize("hook", LEFT)
+@in_turn({"hook": list(LEFT), "mode": ["next_step", "same_step"]})
 def test_only_the_hook_that_cannot_be_traced_leaves_the_pass(hook, mode, caplog):
     cls = type("Partial", (Tracking,), {hook: LEFT[hook]})
     with caplog.at_level("INFO", "fmugym"):
@@ -215,8 +209,7 @@ def test_only_the_hook_that_cannot_be_traced_leaves_the_pass(hook, mode, caplog)
         FMUVectorEnv(cls, 2, hooks="compiled")
 
 
-@pytest.mark.parametrize("mode", ["same_step", "disabled"])
-@pytest.mark.parametrize("hook", LEFT)
+@in_turn({"hook": list(LEFT), "mode": ["same_step", "disabled"]})
 def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(hook, mode, monkeypatch):
     """numpy started them, which took two to three times the time of a step."""
     cls = type("Partial", (Tracking,), {hook: LEFT[hook]})

@@ -32,6 +32,7 @@ def methods(envs, snapshot):
     return {
         "reset": envs.reset,
         "step": lambda: envs.step(ACTIONS),
+        "step_around": lambda: envs.step_around(ACTIONS, np.array([True, False, False])),
         "step_async": lambda: envs.step_async(ACTIONS),
         "render": envs.render,
         "save_state": envs.save_state,

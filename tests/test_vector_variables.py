@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode
 from test_single_compiled import require_same, with_hooks
 from vector_tools import Drawing, require_equal, require_pair_equal, sampled_actions
@@ -74,8 +75,7 @@ class Changing(Drawing):
         return np.stack([0.0 * self.state[0] + part for part in parts])
 
 
-@pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
-@pytest.mark.parametrize("hooks", ["array", "compiled"])
+@in_turn({"mode": list(AutoresetMode), "hooks": ["compiled", "array"]})
 def test_each_episode_starts_with_the_whole_value(mode, hooks):
     """The first episode and later ones, while others have other types."""
     assert require_pair_equal(Changing, steps=20, mode=mode, hooks=hooks) > 5

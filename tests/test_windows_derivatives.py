@@ -6,6 +6,7 @@ import fmu_tools
 import numpy as np
 import pytest
 import test_array_derivatives
+from combinations import in_turn
 from test_derivatives import HORIZON, Precise
 from test_linearization import POINTS
 from test_trajectories import STARTS, TORQUES, along
@@ -20,8 +21,7 @@ PARTS = ("A", "B", "f", "x0", "u0")
 
 @pytest.mark.usefixtures("wine")
 class TestInWine:
-    @pytest.mark.parametrize("version", ["2.0", "3.0"])
-    @pytest.mark.parametrize("model", POINTS)
+    @in_turn({"model": list(POINTS), "version": ["2.0", "3.0"]})
     def test_linear_models_are_those_of_the_library_for_linux(self, tmp_path, model, version):
         path = bundled_fmu(model, version)
         ours, native = (
@@ -57,8 +57,7 @@ class TestInWine:
         assert model.f.tolist() == [-0.5, 3.0 * (1.0 - 1.5**2) * -0.5 - 1.5]
         assert linearize(path, states="x2").A.shape == (1, 1)
 
-    @pytest.mark.parametrize("interface", ["CoSimulation", "ModelExchange"])
-    @pytest.mark.parametrize("kind", ["Directional", "Adjoint"])
+    @in_turn({"kind": ["Directional", "Adjoint"], "interface": ["CoSimulation", "ModelExchange"]})
     def test_of_arrays(self, tmp_path, kind, interface):
         with building_for_windows():
             test_array_derivatives.test_the_matrices_come_out(tmp_path, kind, interface)

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ import exchange_tools
 import numpy as np
 import pytest
 from fmu_tools import edited_fmu, read_fmu, write_fmu
-from process_tools import FaultyEnv, faulty_fmu, start_values
+from process_tools import FaultyEnv, faulty_fmu, start_values, wait_until
 from vector_tools import require_same_alone
 from wine_tools import exchange_fmu, for_windows
 
@@ -30,6 +31,10 @@ from fmugym.trial import opening
 from fmugym.vector import episodes
 from fmugym.wine import windows_worker
 from fmugym.wine.installation import can_run_windows
+from fmugym.wine.prefix import Wine
+
+if sys.platform != "win32":
+    import fcntl
 
 LOG = logging.getLogger("fmugym.test")
 
@@ -57,6 +62,15 @@ def open_pool(path, num_instances=1, inputs=("f",), outputs=("x", "theta"), **op
         tuple(map(fmu.variable, inputs)), tuple(map(fmu.variable, outputs)), time_step=0.05
     )
     return opening.make_pool(fmu, spec, num_instances, LOG, **options)
+
+
+def is_locked(file):
+    """Lock a file, if nobody else has."""
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 class TestWithoutWine:
@@ -264,6 +278,22 @@ class TestInWine:
         while Path(f"/proc/{worker}").exists():
             assert time.monotonic() < deadline
             time.sleep(0.05)
+
+    def test_a_server_that_takes_long_to_end(self, cart_pole, opened):
+        """Wine gives up after six seconds; then a worker is started again."""
+        folder = Wine.ready().prefix / "temporary"
+        opened(open_pool(cart_pole)).close()  # there is a server now
+        locks = list(folder.glob("wine-*/server-*/lock"))
+        if not locks:
+            pytest.skip("this Wine keeps its servers elsewhere")
+        with locks[0].open("r+b") as lock:
+            wait_until(lambda: is_locked(lock))  # the server has ended
+            release = threading.Timer(7.0, fcntl.lockf, (lock, fcntl.LOCK_UN))
+            release.start()
+            pool = opened(open_pool(cart_pole))
+            release.join()
+        _, statuses = pool.reset((), np.zeros((0, 1)))
+        assert not statuses.any()
 
     def test_an_environment_gives_the_native_results(self, cart_pole, opened):
         """The libraries differ in their sine and cosine by rounding."""

@@ -5,6 +5,7 @@ import test_value_arrays as arrays
 import test_value_sizes as sizes
 import test_value_types as types
 import values_tools
+from combinations import in_turn
 from wine_tools import building_for_windows
 
 VERSIONS = (1, 2, 3)
@@ -30,14 +31,15 @@ def sized(wine, tmp_path_factory):
 
 
 class TestInWine:
-    @pytest.mark.parametrize("version", VERSIONS)
-    @pytest.mark.parametrize(
-        "test",
-        [
-            types.test_numbers_of_every_type_come_out_as_they_went_in,
-            types.test_enumerations_are_discrete,
-            arrays.test_some_elements_are_inputs,
-        ],
+    @in_turn(
+        {
+            "test": [
+                types.test_numbers_of_every_type_come_out_as_they_went_in,
+                types.test_enumerations_are_discrete,
+                arrays.test_some_elements_are_inputs,
+            ],
+            "version": VERSIONS,
+        }
     )
     def test_values(self, feedthrough, version, test):
         test(feedthrough, version, {})
@@ -47,8 +49,7 @@ class TestInWine:
         with building_for_windows():
             types.test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, {})
 
-    @pytest.mark.parametrize("interface", ["co_simulation", "model_exchange"])
-    @pytest.mark.parametrize("probe", [None, 60.0])
+    @in_turn({"interface": ["co_simulation", "model_exchange"], "probe": [None, 60.0]})
     def test_arrays(self, state_space, sized, interface, probe):
         options = {"interface": interface, "tolerance": 1e-9}
         arrays.test_arrays_follow_the_closed_form(state_space, options)

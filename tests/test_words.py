@@ -2,9 +2,11 @@
 
 import logging
 import sys
+from itertools import product
 
 import numpy as np
 import pytest
+from combinations import in_turn
 from fmu_tools import MAJOR_VERSIONS
 from words_tools import WordsEnv, words_fmu
 
@@ -44,27 +46,26 @@ def fault(env, steps=3):
     return ""
 
 
-@all_ways
-@newer_versions
-@pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("call", ["set", "step", "discard", "get"])
+@in_turn(
+    {
+        "version,call": list(product((2, 3), ("set", "step", "discard", "get"))),
+        "way": list(WAYS),
+        "level": LEVELS,
+    }
+)
 def test_a_fault_of_a_step(make_env, caplog, way, version, level, call):
     env = make_env(version, call, way, at=2, level=level)
     assert fault(env).endswith(f"; the FMU said: the valve is stuck because of {call}")
 
 
-@all_ways
-@all_versions
-@pytest.mark.parametrize("level", LEVELS)
+@in_turn({"version,way": list(product(MAJOR_VERSIONS, WAYS)), "level": LEVELS})
 def test_an_initialization(make_env, way, version, level):
     env = make_env(version, "initialize", way, level=level)
     with pytest.raises(SimulationError, match="initialization returned Error; the FMU said: the v"):
         env.reset()
 
 
-@all_ways
-@all_versions
-@pytest.mark.parametrize("level", LEVELS)
+@in_turn({"version,way": list(product(MAJOR_VERSIONS, WAYS)), "level": LEVELS})
 def test_a_refusal(make_env, way, version, level):
     with pytest.raises(FMULoadError, match=r"refused to be instantiated.*the valve is stuck bec"):
         make_env(version, "refuse", way, level=level)
@@ -87,8 +88,7 @@ def test_an_fmu_without_a_word(make_env, version):
         assert fault(env).endswith("the step at t = 0.5 s returned Error")
 
 
-@newer_versions
-@pytest.mark.parametrize("token", ["deaf", "strict"])
+@in_turn({"token": ["deaf", "strict"], "version": [2, 3]})
 def test_an_fmu_that_cannot_be_asked_works_all_the_same(make_env, version, token):
     env = make_env(version, token)
     assert fault(env) == ""

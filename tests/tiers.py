@@ -78,7 +78,7 @@ EVERY = {
     "test_hostile_archive": 19,
     "test_licences": 23,
     "test_neighbours": 7,
-    "test_pool": 23,
+    "test_pool": 7,
     "test_slow_models": 7,
     "test_quirks": 199,
     "test_words": 61,
@@ -93,7 +93,6 @@ EVERY_IN_CI = {
     "test_export_search": 3,
     "test_declared_physical": 3,
     "test_declared_weather": 3,
-    "test_proposal": 4,
     "test_shared_data": 2,
     "test_user_mistakes": 3,
     "test_array_derivatives": 3,
@@ -102,13 +101,10 @@ EVERY_IN_CI = {
     "test_declared_sensors": 5,
     "test_declared_warm_up": 5,
     "test_events": 5,
-    "test_examples_planners": 4,
     "test_isolated_rollouts": 3,
-    "test_isolated_single": 4,
     "test_nested_fmus": 5,
-    "test_pool": 7,
-    "test_quirks": 4,
-    "test_reference_models": 17,
+    "test_pool": 5,
+    "test_reference_models": 5,
     "test_start_times": 5,
     "test_string_outputs": 5,
     "test_strings": 5,
@@ -118,22 +114,17 @@ EVERY_IN_CI = {
     "test_value_arrays": 3,
     "test_value_sizes": 3,
     "test_value_types": 3,
-    "test_vector_masks": 4,
-    "test_vector_readings": 4,
     "test_words": 5,
     "test_zoo": 5,
 }
 """By module: of each test's combinations, ``.ci/run`` takes every n-th.
 
-The numbers have no factor in common with those of FMI versions and ways of running, so that each of
-these occurs with others in turn.
+Where FMI versions and ways of running are multiplied, the numbers have no factor in common with
+theirs, so that each of these occurs with others in turn.
 """
 
-EVERY_OF_OTHERS_IN_CI = 5
-"""For the modules that are not in ``EVERY_IN_CI``."""
-
-EVERY_IN_SYSTEMS = 17
-"""The same for the contract of pools with the FMU as a component of a system."""
+EVERY_OF_OTHERS_IN_CI = 4
+"""For the modules that are not in ``EVERY_IN_CI``; their parameters take turns."""
 
 SLOW_TESTS = (
     "test_proposal.py::test_bundled",
@@ -276,5 +267,4 @@ def is_exhaustive(node_id, number):
     if node_id.startswith(EXHAUSTIVE_TESTS) or is_in_wine(node_id):
         return True
     every = EVERY_IN_CI.get(module, EVERY_OF_OTHERS_IN_CI)
-    every = EVERY_IN_SYSTEMS if "[system in " in node_id else every
     return is_slow(node_id, number) and number % every > 0

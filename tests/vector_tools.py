@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import gymnasium as gym
 import numpy as np
 import pytest
+from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import fmugym
@@ -21,9 +22,16 @@ IDS = (
     "fmugym/CloudPendulum-v0",
 )
 ABSURD = 1e308
-each_way = pytest.mark.parametrize("hooks", ["array", "per_env", "auto"])
+HOOKS = ("array", "per_env", "auto")
+each_way = pytest.mark.parametrize("hooks", HOOKS)
 each_mode = pytest.mark.parametrize("mode", AutoresetMode, ids=lambda mode: mode.name)
 CART_POLE = fmugym.envs.CartPoleEnv
+
+
+def in_each_mode(axes, hooks=HOOKS):
+    """Each way of calling hooks in each mode of autoreset, with values of others in turn."""
+    cells = {f"{way}-{mode.name}": (way, mode) for way in hooks for mode in AutoresetMode}
+    return in_turn({"hooks,mode": cells} | axes)
 
 
 def require_equal(first, second, rtol=0.0):

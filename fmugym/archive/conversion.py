@@ -51,7 +51,6 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
     """
     interface, offer = _choose(source, interface)
     experiment = source.defaultExperiment
-    _read_unsigned_limits(source, root)
     elements = {element.get("name"): element for element in root.find("ModelVariables")}
     capabilities = _capabilities(source, root, interface, offer)
     variables = {
@@ -77,8 +76,8 @@ def convert(source: Any, root: Any, interface: str | None = None) -> ModelDescri
         error_categories=_error_categories(root),
         units=_units(root),
         interface=interface,
-        has_event_mode=_offers(root, interface, "hasEventMode"),
-        model_exchange=None if interface == "co_simulation" else _model_exchange(source, root),
+        has_event_mode=interface == "co_simulation" and offer.hasEventMode,
+        model_exchange=None if interface == "co_simulation" else _model_exchange(source, offer),
     )
 
 
@@ -96,14 +95,14 @@ def _choose(source: Any, interface: str | None) -> tuple[str, Any]:
     return interface, offers[interface]
 
 
-def _model_exchange(source: Any, root: Any) -> ModelExchange:
+def _model_exchange(source: Any, offer: Any) -> ModelExchange:
     derivatives = [unknown.variable for unknown in source.derivatives]
     states = [variable.derivative for variable in derivatives]
     scalar = all(state and not state.shape for state in states)
     return ModelExchange(
         _count(source, "numberOfContinuousStates"),
         _count(source, "numberOfEventIndicators"),
-        _needs_completed_step(source, root),
+        offer.needsCompletedIntegratorStep or source.fmiVersion == "1.0",
         tuple(int(state.valueReference) for state in states) if scalar else (),
         tuple(int(variable.valueReference) for variable in derivatives) if scalar else (),
         tuple(variable.name for variable in derivatives),
@@ -111,26 +110,11 @@ def _model_exchange(source: Any, root: Any) -> ModelExchange:
     )
 
 
-def _offers(root: Any, interface: str, flag: str) -> bool:
-    """Read a flag of co-simulation in FMI 3.0."""
-    element = root.find("CoSimulation")
-    offered = element is not None and element.get(flag) in {"true", "1"}
-    return offered and interface == "co_simulation" and root.get("fmiVersion", "").startswith("3")
-
-
 def _count(source: Any, attribute: str) -> int:
     count = int(getattr(source, attribute))
     if not 0 <= count <= _MOST_EQUATIONS:
         raise FMULoadError(f"{attribute} is {count}, expected 0 to {_MOST_EQUATIONS}")
     return count
-
-
-def _needs_completed_step(source: Any, root: Any) -> bool:
-    """In FMI 3.0 an FMU says that it needs the call; in older ones, that it can do without."""
-    element = root.find("ModelExchange")
-    if source.fmiVersion.startswith("3"):
-        return element.get("needsCompletedIntegratorStep") in {"true", "1"}
-    return element is None or element.get("completedIntegratorStepNotNeeded") not in {"true", "1"}
 
 
 def _units(root: Any) -> dict[str, Unit]:
@@ -257,17 +241,10 @@ def _fmi1_capabilities(root: Any, interface: str) -> Capabilities:
     )
 
 
-def _read_unsigned_limits(source: Any, root: Any) -> None:
-    """Read min and max of unsigned integers, which FMPy leaves out."""
-    elements = {element.get("name"): element for element in root.find("ModelVariables")}
-    for variable in source.modelVariables:
-        if variable.type.startswith("UInt"):
-            element = elements[variable.name]
-            variable.min, variable.max = element.get("min"), element.get("max")
-
-
 def _convert_variable(source: Any, element: Any) -> Variable:
     _check_reference(source)
+    if source.type.startswith("UInt"):  # of which FMPy leaves out the limits
+        source.min, source.max = element.get("min"), element.get("max")
     ticking = _ticking(source, element)
     return Variable(
         name=source.name,

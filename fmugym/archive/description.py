@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, Final
 
 import fmpy
+import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.checks import integer_of
@@ -48,13 +49,10 @@ def _whole(value: Any) -> int | None:
 def _place(array: Variable, index: str) -> int | None:
     """The place of an element in row-major order; None if the array has no such element."""
     numbers = [int(number) - 1 for number in index.split(",")]
-    fits = len(numbers) == len(array.shape)
-    if not fits or not all(0 <= n < size for n, size in zip(numbers, array.shape, strict=True)):
+    try:
+        return int(np.ravel_multi_index(numbers, array.shape))
+    except ValueError:
         return None
-    place = 0
-    for number, size in zip(numbers, array.shape, strict=True):
-        place = place * size + number
-    return place
 
 
 @dataclass(frozen=True)

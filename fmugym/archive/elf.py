@@ -11,14 +11,18 @@ import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, BinaryIO, Final, NamedTuple
 
-from fmugym.archive.binary import BinaryFile
+from fmugym.errors import FMULoadError
 
-__all__ = ["ElfLibrary", "opened"]
+__all__ = ["BinaryFile", "ElfLibrary", "opened"]
+
+_MOST_BYTES: Final = 16 * 2**20
+"""No table of a library that an exporter made is longer."""
 
 _HEADER: Final = struct.Struct("<16sHHIQQQIHHHHHH")
 _SEGMENT: Final = struct.Struct("<IIQQQQQQ")
@@ -37,6 +41,41 @@ _MOST_VERSIONS: Final = 10_000
 _MOST_LIBRARIES: Final = 1_000
 _MOST_FOLDERS: Final = 100
 """No library has more of these, but a damaged one may seem to."""
+
+
+def _cut_short(name: str, size: int) -> FMULoadError:
+    """Make the error for a file that ends too early."""
+    return FMULoadError(f"{name} is cut short ({size} bytes); copy or export the FMU again")
+
+
+@dataclass(frozen=True)
+class BinaryFile:
+    """A file with its size in bytes and its name for errors."""
+
+    file: BinaryIO
+    size: int
+    name: str
+
+    def read(self, offset: int, count: int) -> bytes:
+        """Read from anywhere; fewer bytes at the end of the file."""
+        self.file.seek(min(offset, self.size))
+        return self.file.read(min(count, _MOST_BYTES))
+
+    def unpack(self, layout: struct.Struct, offset: int) -> tuple[Any, ...]:
+        """Read a structure.
+
+        Raises:
+            FMULoadError: If the file ends before.
+        """
+        content = self.read(offset, layout.size)
+        if len(content) < layout.size:
+            raise _cut_short(self.name, self.size)
+        return layout.unpack(content)
+
+    def require(self, end: int) -> None:
+        """Refuse a file that is shorter than ``end`` bytes."""
+        if end > self.size:
+            raise _cut_short(self.name, self.size)
 
 
 class Segment(NamedTuple):

@@ -16,8 +16,7 @@ from typing import BinaryIO, Final
 
 import fmpy
 
-from fmugym.archive.binary import BinaryFile
-from fmugym.archive.elf import ElfLibrary
+from fmugym.archive.elf import BinaryFile, ElfLibrary
 from fmugym.errors import FMULoadError
 
 __all__ = ["check_library"]

@@ -10,7 +10,6 @@ import copy
 import functools
 import hashlib
 import logging
-import math
 import os
 import shlex
 import weakref
@@ -29,7 +28,7 @@ from fmugym.archive.safe_zip import ArchiveLimits, SafeZip
 from fmugym.archive.structure import Feedthrough, read_feedthrough
 from fmugym.archive.temporary import folder_name, make_folder, remove_folder
 from fmugym.archive.variable import Variable
-from fmugym.checks import KnownArguments, check_mapping, check_option, check_path
+from fmugym.checks import KnownArguments, check_mapping, check_number, check_option, check_path
 from fmugym.errors import ConfigError, FMULoadError, printable, shown
 from fmugym.signals import ordinary
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
@@ -100,7 +99,8 @@ class FMU(LoadableFMU, KnownArguments):
         self.limits = ArchiveLimits() if limits is None else limits
         if not isinstance(self.limits, ArchiveLimits):
             raise ConfigError(f"limits must be ArchiveLimits, got {shown(limits)}")
-        _check_probe_timeout(probe_timeout)
+        if probe_timeout is not None:
+            check_number("probe_timeout", probe_timeout, positive=True)
         self.probe_timeout = probe_timeout
         if interface is not None:
             check_option("interface", interface, INTERFACES)
@@ -145,10 +145,15 @@ class FMU(LoadableFMU, KnownArguments):
             return source.as_fmu()
         return source.again() if isinstance(source, FMU) else cls(source)
 
-    def again(self) -> FMU:
-        """The same FMU once more, with a temporary folder of its own; it is not read again."""
+    def again(self, folder: Path | None = None) -> FMU:
+        """The same FMU once more, which is not read again.
+
+        Args:
+            folder: Where somebody has extracted it, who removes it, too; None for a temporary
+                folder of its own.
+        """
         other = copy.copy(self)
-        other._folder = other._remove_folder = None
+        other._folder, other._remove_folder = folder, None
         return other
 
     @property
@@ -358,14 +363,6 @@ def _libraries_in(places: Sequence[str], wanted: str) -> list[str]:
         if place.rpartition("/")[0].casefold() == folder.casefold()
         and place.casefold().endswith(suffix)
     ]
-
-
-def _check_probe_timeout(timeout: float | None) -> None:
-    number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
-    if timeout is not None and not (number and 0 < timeout < math.inf):
-        raise ConfigError(
-            f"probe_timeout must be positive and finite, or None, got {shown(timeout)}"
-        )
 
 
 def _absolute(libraries: Sequence[str | os.PathLike[str]]) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from fmugym.archive.dependencies import (
 from fmugym.archive.description import ModelDescription
 from fmugym.errors import FMULoadError
 
-__all__ = ["ExtractedFMU", "LoadableFMU"]
+__all__ = ["LoadableFMU"]
 
 
 class LoadableFMU(ABC):
@@ -65,7 +65,7 @@ class LoadableFMU(ABC):
     @property
     def bundled(self) -> bool:
         """Whether it comes with the package."""
-        return all(part.bundled for part in self.parts) if self.parts else is_bundled(self.path)
+        return is_bundled(self.path)
 
     def libraries_in(self, folder: Path) -> list[tuple[LoadableFMU, Path]]:
         """The FMUs of a system, or this one, and their libraries in a folder like ``extract``'s."""
@@ -158,34 +158,3 @@ class LoadableFMU(ABC):
     @abstractmethod
     def close(self) -> None:
         """Remove what ``extract`` has made; more than one call is fine."""
-
-
-class ExtractedFMU(LoadableFMU):
-    """An FMU in a folder that somebody else owns, and that stays when this object is closed.
-
-    Args:
-        path: The ``.fmu`` file.
-        description: The model description.
-        preload: See ``LoadableFMU``.
-        folder: The folder.
-        in_wine: See ``LoadableFMU``.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        description: ModelDescription,
-        preload: tuple[str, ...],
-        folder: Path,
-        *,
-        in_wine: bool = False,
-    ) -> None:
-        super().__init__(path, description, preload)
-        self._folder, self.in_wine = folder, in_wine
-
-    def extract(self) -> Path:
-        """Return the folder."""
-        return self._folder
-
-    def close(self) -> None:
-        """Leave the folder alone."""

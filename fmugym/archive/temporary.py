@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import atexit
-import functools
 import os
-import re
 import secrets
 import shutil
-import sys
 import tempfile
 from pathlib import Path
 from typing import Final
 
-from fmugym.caching import is_own
+from fmugym.caching import own_prefix, sweep
 from fmugym.errors import FMULoadError
 from fmugym.signals import Ignoring, ordinary
 
-__all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest", "sweep"]
+__all__ = ["folder_name", "make_folder", "remove_folder", "remove_rest"]
 
 _made_in: Final[dict[Path, str]] = {}
 """The working directory at the time when each folder was made."""
-
-_NAME: Final = re.compile(r"fmugym-(?P<pid>\d+)-(?P<namespace>\d+)-\w+")
 
 
 def folder_name() -> Path:
@@ -34,10 +29,10 @@ def folder_name() -> Path:
     Raises:
         FMULoadError: If the system has no folder for temporary files.
     """
-    name = f"fmugym-{os.getpid()}-{_namespace()}-{secrets.token_hex(8)}"
     try:
-        sweep()
-        return Path(tempfile.gettempdir(), name)
+        root = Path(tempfile.gettempdir())
+        sweep(root)
+        return root / f"{own_prefix()}{secrets.token_hex(8)}"
     except ordinary(OSError) as error:
         raise FMULoadError(f"no temporary folder can be made: {error}") from None
 
@@ -90,38 +85,5 @@ def _leave(folder: Path, directory: str) -> None:
 def remove_rest() -> None:
     """Remove the folders of this process that a signal at the wrong moment has left."""
     for folder in list(_made_in):
-        name = _NAME.fullmatch(folder.name)
-        if name and int(name["pid"]) == os.getpid():
+        if folder.name.startswith(own_prefix()):
             _remove(folder)
-
-
-@functools.cache
-def sweep() -> None:
-    """Remove the folders that killed processes of this user have left; once in a process."""
-    for folder in Path(tempfile.gettempdir()).glob("fmugym-*"):
-        name = _NAME.fullmatch(folder.name)
-        if name and int(name["namespace"]) == _namespace() and not _is_alive(int(name["pid"])):
-            with Ignoring(OSError):  # another process has removed it
-                if is_own(folder):
-                    shutil.rmtree(folder, ignore_errors=True)
-
-
-@functools.cache
-def _namespace() -> int:
-    """Identify the numbering of processes: containers that share a folder may number them alike."""
-    try:
-        return os.stat("/proc/self/ns/pid").st_ino
-    except ordinary(OSError):
-        return 0
-
-
-def _is_alive(pid: int) -> bool:
-    if sys.platform == "win32":  # asking would end the process there
-        return True
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):  # the number may be anybody's invention
-        return False
-    except PermissionError:
-        return True
-    return True

@@ -30,6 +30,10 @@ class Conversion:
         """Convert a value of the other unit back."""
         return (value - self.offset) / self.factor
 
+    def after(self, first: Conversion) -> Conversion:
+        """The conversion that does another one first."""
+        return Conversion(self.factor * first.factor, self(first.offset))
+
 
 IDENTITY: Final = Conversion()
 
@@ -53,14 +57,10 @@ def conversion_between(
     """
     if wanted is None or own is None or wanted == own:
         return IDENTITY
-    own_unit = definitions.get(own, Unit())
-    if wanted in own_unit.display_units:
-        return Conversion(*own_unit.display_units[wanted])
-    for dimension, to_base in _defined(wanted, definitions):
-        if dimension is not None and dimension == own_unit.dimension:
-            factor, offset = to_base
-            return Conversion(own_unit.factor / factor, (own_unit.offset - offset) / factor)
-    return _conversion_by_pint(own, definitions, wanted, definitions)
+    displays = definitions.get(own, Unit()).display_units
+    if wanted in displays:
+        return Conversion(*displays[wanted])
+    return conversion_of_link(own, definitions, wanted, definitions)
 
 
 def _defined(

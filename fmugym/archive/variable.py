@@ -10,17 +10,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from fmugym.errors import ConfigError
+import numpy as np
+
+from fmugym.checks import check_number, integer_of
+from fmugym.errors import ConfigError, shown, unknown_name
 
 __all__ = [
     "CLOCK_KINDS",
+    "LARGEST_EXACT_INTEGER",
     "MOST_ELEMENTS",
     "MOST_FRACTIONS",
     "UNKNOWN",
     "Interval",
     "Variable",
+    "checked_value",
     "unknown_rest",
     "unlisted",
 ]
@@ -40,6 +45,9 @@ _INTEGER_BITS = {"Integer": 32, "Enumeration": 64} | {f"Int{n}": n for n in (8, 
 
 
 _NO_LIMIT: Final = 1e30
+_LARGEST_FLOAT32: Final = float(np.finfo(np.float32).max)
+LARGEST_EXACT_INTEGER: Final = 2.0**53
+"""Up to here, float64 holds every integer."""
 
 MOST_ELEMENTS: Final = 100_000
 """The most elements of an array whose elements have names."""
@@ -156,6 +164,11 @@ class Variable:
     def is_number(self) -> bool:
         """Whether float64 can hold its value, or those of its elements."""
         return self.kind in {"real", "integer", "boolean", "enumeration"}
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is a scalar String."""
+        return self.kind == "string" and self.is_scalar
 
     @property
     def is_structural(self) -> bool:
@@ -293,6 +306,52 @@ class Variable:
             return 0, 2 ** int(self.type[4:]) - 1
         bits = _INTEGER_BITS[self.type]
         return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
+
+
+def checked_value(variable: Variable, value: Any) -> float:
+    """Convert a value for a variable to a number, without loss.
+
+    Of a String, this is the number of one of the texts that the variable knows.
+
+    Raises:
+        ConfigError: If the value is not finite, not of the variable's kind, or outside its type's
+            range.
+    """
+    if isinstance(value, str) and variable.items:
+        return _item_value(variable, str.__str__(value))
+    number = check_number(repr(variable.name), value, may_be_boolean=variable.kind == "boolean")
+    if variable.kind == "string" and number not in dict(variable.items).values():
+        raise ConfigError(f"{variable.name!r} is a String, got {shown(value)}")
+    if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
+        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {number}")
+    if variable.kind == "boolean" and number not in {0.0, 1.0}:
+        raise ConfigError(f"{variable.name!r} is a Boolean, got {number}")
+    if variable.kind in {"integer", "enumeration"}:
+        whole = integer_of(value)  # which no float has rounded
+        _check_integer(variable, number if whole is None else whole)
+    return number
+
+
+def _item_value(variable: Variable, name: str) -> float:
+    items = dict(variable.items)
+    if name not in items:
+        raise unknown_name(f"item of {variable.name!r}", name, items)
+    return float(items[name])
+
+
+def _check_integer(variable: Variable, number: float) -> None:
+    low, high = variable.integer_limits
+    if not float(number).is_integer() or not low <= number <= high:
+        raise ConfigError(
+            f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
+            f"{high}, got {number}"
+        )
+    if abs(number) > LARGEST_EXACT_INTEGER:
+        raise ConfigError(f"{variable.name!r}: integers beyond 2**53 are not exact, got {number}")
+    values = [value for _, value in variable.items]
+    if values and number not in values:
+        listing = ", ".join(f"{value} ({name})" for name, value in variable.items)
+        raise ConfigError(f"{variable.name!r}: expected one of {listing}, got {number:g}")
 
 
 def unlisted(variables: Sequence[Variable]) -> list[Variable]:

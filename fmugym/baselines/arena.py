@@ -144,7 +144,7 @@ class Arena:
                 result = envs.step(actions)
             else:
                 counted = running
-                result = envs.inside.engine.step(actions, None, ~running)
+                result = envs.step_around(actions, ~running)
             observations, rewards, terminated, truncated, infos = result
             costs = (infos["costs"][name] for name in self._costs)
             for total, values in zip(totals, (rewards, *costs), strict=True):

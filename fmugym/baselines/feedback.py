@@ -18,7 +18,7 @@ from fmugym.baselines.base import (
     limited,
 )
 from fmugym.errors import ConfigError
-from fmugym.lazy import scipy_module
+from fmugym.extras import imported
 from fmugym.linearization import LinearModel
 from fmugym.linearization.trajectories import discrete
 from fmugym.signals import ordinary
@@ -199,7 +199,7 @@ class LQR(Controller):
             self._check_signal("of", name)
         slopes = np.concatenate([self.model.A, self.model.B], axis=1)
         (a,), (b,) = discrete(slopes[np.newaxis], self.time_step)
-        linalg = scipy_module("linalg")
+        linalg = imported("scipy.linalg", "identification")
         try:
             cost = linalg.solve_discrete_are(a, b, self._q, self._r)
             self.gain = np.linalg.solve(self._r + b.T @ cost @ b, b.T @ cost @ a)

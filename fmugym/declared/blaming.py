@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from fmugym.declared.computed import Value, function_of
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.parts import Term
@@ -15,20 +16,18 @@ __all__ = ["explanation"]
 
 def explanation(
     terms: Mapping[str, Term],
-    codes: Mapping[str, str],
+    values: Mapping[str, Value],
     naming: Naming,
-    function: Callable[[str], Callable[[Any], Any]],
 ) -> Callable[[Any, float], str]:
     """Make a method of an environment that explains a reward.
 
     Args:
         terms: The terms of the reward by name.
-        codes: Their code, weights included.
-        naming: Makes code of what the terms read.
-        function: Makes a function of code.
+        values: Their values, weights included.
+        naming: Gives the values that the terms read.
     """
     parts = [
-        (name, term, function(codes[name]), _readers(term, naming, function))
+        (name, term, function_of(values[name]), _readers(term, naming))
         for name, term in terms.items()
     ]
 
@@ -47,12 +46,10 @@ def explanation(
     return explain
 
 
-def _readers(
-    term: Term, naming: Naming, function: Callable[[str], Callable[[Any], Any]]
-) -> dict[str, Callable[[Any], Any]]:
+def _readers(term: Term, naming: Naming) -> dict[str, Callable[[Any], Any]]:
     """Functions for the values that a term reads, by their texts."""
     return {
-        text: function(naming.code(term.entry, Expression.parse(text), Moment.JUDGED).number.text)
+        text: function_of(naming.value(term.entry, Expression.parse(text), Moment.JUDGED).number)
         for text in _read_by(term.expression)
     }
 

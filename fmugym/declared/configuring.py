@@ -8,9 +8,9 @@ from fmugym.archive.description import ModelDescription
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.entries import Entry
 from fmugym.declared.naming import CLOCK, Naming
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import read_begin, read_scenarios
 from fmugym.distributions import is_distribution
-from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = ["bounds_of", "clock_of", "samplings_of", "time_step_of", "times_of"]
 
@@ -41,7 +41,7 @@ def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
     if substeps.value is not None:
         times["substeps"] = substeps.value
     if length.value is not None:
-        times["max_episode_steps"] = _episode_steps(length, time_step)
+        times["max_episode_steps"] = steps_in(length, length.value, time_step)
     if start.value is not None:
         times["start_time"] = _start_time(declared, times.get("max_episode_steps", 0) * time_step)
     return times
@@ -58,16 +58,6 @@ def _start_time(declared: Declarations, length: float) -> Any:
             "the time of the FMU"
         )
     return found
-
-
-def _episode_steps(entry: Entry, step: float) -> int:
-    length = entry.value
-    count = whole_number_of_steps(length, step)
-    if not count:
-        raise entry.error(
-            f"episode_length must be a multiple of the time step of {step:g} s, got {length:g} s"
-        )
-    return count
 
 
 def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[str, Any]:

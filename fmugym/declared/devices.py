@@ -6,11 +6,16 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
+from fmugym.declared.computed import Value, where
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
+from fmugym.declared.mathematics import chance, clip, noise
 from fmugym.distributions import Normal, is_distribution
+from fmugym.vector.hooks.graph import Graph
 
-__all__ = ["IDEAL", "NOISE", "Device", "read_device"]
+__all__ = ["IDEAL", "NOISE", "Device", "chance_in", "first_step", "noise_in", "read_device"]
 
 NOISE: Final = "noise key"
 """The episode variable from which everything random that is no draw of a reset follows."""
@@ -58,58 +63,72 @@ class Device:
         """Whether what it gives depends on what it gave before."""
         return self.rate < math.inf or self.drop_out > 0
 
-    def distorted(self, code: str, count: str, channel: int) -> str:
-        """Code for a value with bias, noise, saturation and quantization.
+    def distorted(self, value: Value, count: Value, channel: int) -> Value:
+        """A value with bias, noise, saturation and quantization.
 
         Args:
-            code: Code for the true value.
-            count: Code for the number of the step.
+            value: The true value.
+            count: The number of the step.
             channel: The number of the device, from which what is random follows.
         """
         if is_distribution(self.bias):
-            code = f"({code} + {_drawn(self.bias, _CHANNELS_OF_BIAS + channel)})"
+            value = value + _drawn(self.bias, value.graph, _CHANNELS_OF_BIAS + channel)
         elif self.bias:
-            code = f"({code} + {self.bias!r})"
+            value = value + self.bias
         if self.noise:
-            noise = f"noise(env.variables[{NOISE!r}], {count}, {channel})"
-            code = f"({code} + {self.noise!r} * {noise})"
+            value = value + self.noise * noise_in(count, channel)
         if self.saturation is not None:
-            code = f"fn_clip({code}, {self.saturation[0]!r}, {self.saturation[1]!r})"
+            value = clip(value, *self.saturation)
         if self.quantum:
-            code = f"({self.quantum!r} * fn_round(({code} / {self.quantum!r})))"
-        return code
+            value = self.quantum * np.rint(value / self.quantum)
+        return value
 
-    def following(self, code: str, before: str, count: str, channel: int, time_step: float) -> str:
-        """Code for a value with a limited rate and drop-outs.
+    def following(
+        self, value: Value, before: Value, count: Value, channel: int, time_step: float
+    ) -> Value:
+        """A value with a limited rate and drop-outs.
 
         Args:
-            code: Code for the distorted value.
-            before: Code for the value that was given in the step before.
+            value: The distorted value.
+            before: The value that was given in the step before.
             count: As for ``distorted``.
             channel: As for ``distorted``.
             time_step: Length of a step in seconds.
         """
         if self.rate < math.inf:
             most = self.rate * time_step
-            code = f"fn_clip({code}, ({before} - {most!r}), ({before} + {most!r}))"
+            value = clip(value, before - most, before + most)
         if self.drop_out:
-            channel += _CHANNELS_OF_DROP_OUT
-            chance = f"chance(env.variables[{NOISE!r}], {count}, {channel})"
-            held = before if self.substitute is None else repr(self.substitute)
-            code = f"where(({chance} < {self.drop_out!r}), {held}, {code})"
-        return code
+            is_lost = chance_in(count, _CHANNELS_OF_DROP_OUT + channel) < self.drop_out
+            value = where(is_lost, before if self.substitute is None else self.substitute, value)
+        return value
 
 
 IDEAL: Final = Device()
 
 
-def _drawn(distribution: Any, channel: int) -> str:
-    """Code for a number that is drawn once in an episode, without the generator of resets."""
-    arguments = f"(env.variables[{NOISE!r}], (env.step_count * 0), {channel})"
+def noise_in(count: Value, channel: int) -> Value:
+    """A number of the standard normal distribution for each step; see ``mathematics.noise``."""
+    return Value.read(count.graph, "variables", NOISE).called(noise, count, channel)
+
+
+def chance_in(count: Value, channel: int) -> Value:
+    """A number from 0 to 1 for each step, all as likely; see ``mathematics.noise``."""
+    return Value.read(count.graph, "variables", NOISE).called(chance, count, channel)
+
+
+def first_step(graph: Graph) -> Value:
+    """The number 0 in each step: what is random and follows from it lasts for an episode."""
+    return Value.read(graph, "step_count", dtype=np.int64) * 0
+
+
+def _drawn(distribution: Any, graph: Graph, channel: int) -> Value:
+    """A number that is drawn once in an episode, without the generator of resets."""
     if isinstance(distribution, Normal):
-        return f"({distribution.mean!r} + {distribution.std!r} * noise{arguments})"
-    low, width = distribution.low, distribution.high - distribution.low
-    return f"({low!r} + {width!r} * chance{arguments})"
+        return distribution.mean + distribution.std * noise_in(first_step(graph), channel)
+    low: float = distribution.low
+    width: float = distribution.high - low
+    return low + width * chance_in(first_step(graph), channel)
 
 
 def read_device(entry: Entry) -> Device:

@@ -5,118 +5,78 @@ The grammar is a part of Python's: numbers, names, ``+ - * / % **``, comparisons
 ``previous(x)`` is the value of ``x`` before the step. There are no attributes, subscripts, texts or
 assignments. Each value is a number or a condition; in arithmetic a condition counts as 0 or 1.
 
-An expression becomes the code of a function of the environment. Its only names are those of the
-tables that the caller gives. It works element by element, so that the same code serves one
-environment, arrays of them, and the trace that compiles hooks.
+An expression becomes a value, see ``fmugym.declared.computed``. Its only names are those that the
+caller gives. It works element by element, so that it serves one environment, arrays of them, and
+the trace that compiles hooks.
 """
 
 from __future__ import annotations
 
 import ast
 import math
-import re
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial, reduce
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.declared.mathematics import FUNCTIONS, OPERATIONS
+from fmugym.declared.computed import Value, where
+from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.vector.hooks.graph import Graph
 
-__all__ = ["CONSTANTS", "Code", "Expression", "Names", "code_of_number", "function_of"]
+__all__ = ["CONSTANTS", "Expression", "Names"]
 
 _LONGEST: Final = 2000
 _MOST_NODES: Final = 500
 _DEEPEST: Final = 40
-_LONGEST_CODE: Final = 200_000
-_LONGEST_FUNCTION: Final = 1_000_000
 
-_BINARY: Final[Mapping[type[ast.operator], str]] = {
-    ast.Add: "({} + {})",
-    ast.Sub: "({} - {})",
-    ast.Mult: "({} * {})",
-    ast.Div: "divide({}, {})",
-    ast.Mod: "remainder({}, {})",
-    ast.Pow: "power({}, {})",
+
+def _power(base: Any, exponent: Any) -> Any:
+    if exponent.constant == 2.0:  # a product takes far less time
+        return np.square(base)
+    return np.float_power(base, exponent)
+
+
+_OPERATIONS: Final[Mapping[type[ast.AST], Callable[..., Any]]] = {
+    ast.Add: np.add,
+    ast.Sub: np.subtract,
+    ast.Mult: np.multiply,
+    ast.Div: np.divide,
+    ast.Mod: np.remainder,
+    ast.Pow: _power,
+    ast.USub: np.negative,
+    ast.And: np.bitwise_and,
+    ast.Or: np.bitwise_or,
+    ast.Lt: np.less,
+    ast.LtE: np.less_equal,
+    ast.Gt: np.greater,
+    ast.GtE: np.greater_equal,
+    ast.Eq: np.equal,
+    ast.NotEq: np.not_equal,
 }
-_COMPARISONS: Final[Mapping[type[ast.cmpop], str]] = {
-    ast.Lt: "<",
-    ast.LtE: "<=",
-    ast.Gt: ">",
-    ast.GtE: ">=",
-    ast.Eq: "==",
-    ast.NotEq: "!=",
-}
-
-_NAMESPACE: Final[dict[str, Any]] = {
-    "__builtins__": {},
-    "inf": math.inf,
-    "nan": math.nan,
-    **OPERATIONS,
-    **{f"fn_{name}": function.call for name, function in FUNCTIONS.items()},
-}
-"""What the code of expressions may call."""
-
-
-_MAY_WARN: Final = re.compile(
-    r"\b(inf\b|noise|chance|divide|remainder|power|fn_(?!abs|min|max|clip))"
-)
-"""Calls for which numpy may warn of what is not finite; it takes time to keep it quiet."""
-
-
-class Code(NamedTuple):
-    """Python code for a value.
-
-    Attributes:
-        text: The code; it may use ``env``, the environment.
-        is_flag: Whether it is a condition, not a number.
-        value: The value if it is a constant.
-    """
-
-    text: str
-    is_flag: bool = False
-    value: float | bool | None = None
-
-    @property
-    def number(self) -> Code:
-        """The same as a number: 0 or 1 for a condition."""
-        if not self.is_flag:
-            return self
-        if self.value is not None:
-            return code_of_number(float(self.value))
-        return Code(f"({self.text} * 1.0)")
-
-
-def code_of_number(value: float) -> Code:
-    """The code of a constant."""
-    text = repr(float(value))
-    return Code(f"({text})" if text.startswith("-") else text, value=float(value))
 
 
 class Names(NamedTuple):
     """What names stand for where an expression is evaluated.
 
     Attributes:
-        find: Returns the code of a name; None if there is no such name.
-        find_previous: Returns the code of a name's value before the step; None if it has none.
+        graph: Gets the nodes of expressions.
+        find: Returns the value of a name; None if there is no such name.
+        find_previous: Returns the value of a name before the step; None if it has none.
         known: The names to suggest for one that is misspelt.
     """
 
-    find: Callable[[str], Code | None]
-    find_previous: Callable[[str], Code | None]
-    known: Callable[[], list[str]]
+    graph: Graph
+    find: Callable[[str], Value | None] = lambda name: None
+    find_previous: Callable[[str], Value | None] = lambda name: None
+    known: Callable[[], list[str]] = list
 
 
-CONSTANTS: Final[Mapping[str, Code]] = {
-    "pi": code_of_number(math.pi),
-    "true": Code("True", True, True),
-    "false": Code("False", True, False),
-}
+CONSTANTS: Final[Mapping[str, float | bool]] = {"pi": math.pi, "true": True, "false": False}
 """Names that have the same value everywhere."""
-
-_ONLY_CONSTANTS: Final = Names(CONSTANTS.get, lambda name: None, lambda: list(CONSTANTS))
 
 
 @dataclass(frozen=True)
@@ -170,8 +130,8 @@ class Expression:
             if isinstance(argument, ast.Name)
         }
 
-    def code(self, names: Names = _ONLY_CONSTANTS) -> Code:
-        """Make code of it.
+    def value(self, names: Names) -> Value:
+        """Make nodes of it.
 
         Args:
             names: What the names stand for.
@@ -181,7 +141,7 @@ class Expression:
                 grammar. The text tells the column.
         """
         try:
-            return _Writer(self.text, names).write(self.tree)
+            return _Evaluation(self.text, names).evaluate(self.tree)
         except RecursionError:
             raise ConfigError("expressions read each other in too long a row") from None
 
@@ -191,7 +151,7 @@ class Expression:
         Raises:
             ConfigError: If it has names, or the value is not finite.
         """
-        value = self.code().number.value
+        value = self.value(Names(Graph())).number.constant
         if value is None or not math.isfinite(value):
             raise ConfigError(f"{self.text!r} is no finite number, but {value}")
         return float(value)
@@ -241,8 +201,8 @@ def _operands(node: ast.AST) -> list[Any]:
     return [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.expr)]
 
 
-class _Writer:
-    """Turns the nodes of an expression into code.
+class _Evaluation:
+    """Evaluates an expression: its operators and functions make nodes.
 
     Args:
         text: The expression, for errors.
@@ -252,9 +212,9 @@ class _Writer:
     def __init__(self, text: str, names: Names) -> None:
         self._text, self._names = text, names
 
-    def write(self, node: ast.expr) -> Code:
-        """Make code of a node and its operands."""
-        method = getattr(self, f"_write_{type(node).__name__.lower()}", None)
+    def evaluate(self, node: ast.expr) -> Value:
+        """The value of a part of the expression."""
+        method = getattr(self, f"_value_of_{type(node).__name__.lower()}", None)
         if isinstance(node, ast.Attribute | ast.Subscript):
             name = ast.get_source_segment(self._text.strip(), node)
             raise self._error(
@@ -265,88 +225,91 @@ class _Writer:
         if method is None:
             what = type(node).__name__.lower()
             raise self._error(node, f"{what} is not allowed here")
-        code: Code = method(node)
-        return code
+        value: Value = method(node)
+        return value
 
     def _error(self, node: ast.AST, text: object) -> ConfigError:
         offset = len(self._text.strip().encode()[: getattr(node, "col_offset", 0)].decode())
         return ConfigError(f"{text} (column {_column(self._text, offset)} of {shown(self._text)})")
 
-    def _write_constant(self, node: ast.Constant) -> Code:
+    def _value_of_constant(self, node: ast.Constant) -> Value:
         value = node.value
         if isinstance(value, bool):
-            return Code(str(value), True, value)
+            return self._constant(value)
         if isinstance(value, int | float):
             number = _as_float(value)
             if math.isfinite(number):
-                return code_of_number(number)
+                return self._constant(number)
         raise self._error(node, f"{shown(value)} is no number")
 
-    def _write_name(self, node: ast.Name) -> Code:
-        code = CONSTANTS.get(node.id) or self._names.find(node.id)
-        if code is None:
+    def _value_of_name(self, node: ast.Name) -> Value:
+        if node.id in CONSTANTS:
+            return self._constant(CONSTANTS[node.id])
+        value = self._names.find(node.id)
+        if value is None:
             raise self._error(node, unknown_name("name", node.id, self._known()))
-        return code
+        return value
+
+    def _constant(self, number: float | bool) -> Value:
+        return Value.of(self._names.graph, number)
 
     def _known(self) -> list[str]:
         return list(dict.fromkeys([*self._names.known(), *CONSTANTS]))
 
-    def _write_unaryop(self, node: ast.UnaryOp) -> Code:
-        operand = self.write(node.operand)
+    def _value_of_unaryop(self, node: ast.UnaryOp) -> Value:
+        operand = self.evaluate(node.operand)
         if isinstance(node.op, ast.Not):
-            return _folded("({} ^ True)", [self._flag(node.operand, operand)], True)
-        if isinstance(node.op, ast.USub):
-            return _folded("(-{})", [operand.number])
-        if isinstance(node.op, ast.UAdd):
-            return operand.number
-        raise self._error(node, "the operator ~ is not allowed here; write 'not'")
+            return self._flag(node.operand, operand) ^ True
+        if isinstance(node.op, ast.Invert):
+            raise self._error(node, "the operator ~ is not allowed here; write 'not'")
+        return (
+            operand.number if isinstance(node.op, ast.UAdd) else _applied(node.op, operand.number)
+        )
 
-    def _write_binop(self, node: ast.BinOp) -> Code:
-        template = _BINARY.get(type(node.op))
-        if template is None:
+    def _value_of_binop(self, node: ast.BinOp) -> Value:
+        if type(node.op) not in _OPERATIONS:
             what = shown(ast.get_source_segment(self._text.strip(), node))
             raise self._error(
                 node,
                 f"the operator in {what} is not allowed here; there are + - * / % ** (power) and "
                 "or not",
             )
-        return _folded(template, [self.write(node.left).number, self.write(node.right).number])
+        first, second = self.evaluate(node.left), self.evaluate(node.right)
+        return _applied(node.op, first.number, second.number)
 
-    def _write_boolop(self, node: ast.BoolOp) -> Code:
-        sign = "&" if isinstance(node.op, ast.And) else "|"
-        flags = [self._flag(value, self.write(value)) for value in node.values]
-        return _folded("(" + f" {sign} ".join(["{}"] * len(flags)) + ")", flags, True)
+    def _value_of_boolop(self, node: ast.BoolOp) -> Value:
+        flags = [self._flag(part, self.evaluate(part)) for part in node.values]
+        return reduce(partial(_applied, node.op), flags)
 
-    def _flag(self, node: ast.expr, code: Code) -> Code:
-        if code.is_flag:
-            return code
+    def _flag(self, node: ast.expr, value: Value) -> Value:
+        if value.is_flag:
+            return value
         raise self._error(node, "expected a condition such as 'x > 1', got a number")
 
-    def _write_compare(self, node: ast.Compare) -> Code:
-        operands = [self.write(part).number for part in (node.left, *node.comparators)]
+    def _value_of_compare(self, node: ast.Compare) -> Value:
+        operands = [self.evaluate(part).number for part in (node.left, *node.comparators)]
         parts = []
         for sign, first, second in zip(node.ops, operands, operands[1:], strict=False):
-            if type(sign) not in _COMPARISONS:
+            if type(sign) not in _OPERATIONS:
                 raise self._error(node, f"{type(sign).__name__} is not allowed here")
-            parts.append(_folded(f"({{}} {_COMPARISONS[type(sign)]} {{}})", [first, second], True))
-        return parts[0] if len(parts) == 1 else _folded(_joined(len(parts)), parts, True)
+            parts.append(_applied(sign, first, second))
+        return reduce(partial(_applied, ast.And()), parts)
 
-    def _write_ifexp(self, node: ast.IfExp) -> Code:
-        condition = self._flag(node.test, self.write(node.test))
-        first, second = self.write(node.body), self.write(node.orelse)
-        both = first.is_flag and second.is_flag
-        if both:
-            return _folded("(({0} & {1}) | (({0} ^ True) & {2}))", [condition, first, second], True)
-        return _folded("where({}, {}, {})", [condition, first.number, second.number])
+    def _value_of_ifexp(self, node: ast.IfExp) -> Value:
+        condition = self._flag(node.test, self.evaluate(node.test))
+        first, second = self.evaluate(node.body), self.evaluate(node.orelse)
+        if first.is_flag and second.is_flag:
+            return (condition & first) | ((condition ^ True) & second)
+        return where(condition, first.number, second.number)
 
-    def _write_call(self, node: ast.Call) -> Code:
+    def _value_of_call(self, node: ast.Call) -> Value:
         if not isinstance(node.func, ast.Name):
             raise self._error(node, "only functions by their names can be called")
         name = node.func.id
         if node.keywords or any(isinstance(argument, ast.Starred) for argument in node.args):
             raise self._error(node, f"{name} takes arguments by place only")
         if name == "previous":
-            return self._write_previous(node)
+            return self._value_of_previous(node)
         function = FUNCTIONS.get(name)
         if function is None:
             raise self._error(node, unknown_name("function", name, [*FUNCTIONS, "previous"]))
@@ -354,26 +317,28 @@ class _Writer:
         if count < function.fewest or (function.most is not None and count > function.most):
             few = f"at least {function.fewest}" if function.most is None else function.fewest
             raise self._error(node, f"{name} takes {few} arguments, got {count}")
-        arguments = [self.write(argument).number for argument in node.args]
-        return _folded(f"fn_{name}({', '.join(['{}'] * count)})", arguments)
+        arguments = [self.evaluate(argument).number for argument in node.args]
+        value: Value = function.call(*arguments)
+        return value
 
-    def _write_previous(self, node: ast.Call) -> Code:
+    def _value_of_previous(self, node: ast.Call) -> Value:
         names = [argument.id for argument in node.args if isinstance(argument, ast.Name)]
         if len(names) != 1 or len(node.args) != 1:
             raise self._error(node, "previous takes one name")
-        self.write(node.args[0])  # which refuses an unknown name
-        code = self._names.find_previous(names[0])
-        if code is None:
+        self.evaluate(node.args[0])  # which refuses an unknown name
+        value = self._names.find_previous(names[0])
+        if value is None:
             raise self._error(
                 node,
                 f"{names[0]!r} has no value before the step here; previous is for observed "
                 "variables and actions",
             )
-        return code
+        return value
 
 
-def _joined(count: int) -> str:
-    return "(" + " & ".join(["{}"] * count) + ")"
+def _applied(sign: ast.AST, *operands: Value) -> Value:
+    value: Value = _OPERATIONS[type(sign)](*operands)
+    return value
 
 
 def _as_float(value: float) -> float:
@@ -381,51 +346,3 @@ def _as_float(value: float) -> float:
         return float(value)
     except OverflowError:
         return math.inf
-
-
-def _folded(template: str, operands: list[Code], is_flag: bool = False) -> Code:
-    """Combine operands; what consists of constants is computed at once."""
-    text = template.format(*(operand.text for operand in operands))
-    if len(text) > _LONGEST_CODE:
-        raise ConfigError(
-            f"the expression is too long: with the expressions that it reads, its code has more "
-            f"than {_LONGEST_CODE} characters"
-        )
-    if any(operand.value is None for operand in operands):
-        return Code(text, is_flag)
-    with np.errstate(all="ignore"):
-        value: Any = eval(text, dict(_NAMESPACE))
-    if is_flag:
-        return Code(str(bool(value)), True, bool(value))
-    return code_of_number(float(value))
-
-
-def function_of(text: str, constants: Mapping[str, Any], file: str) -> Callable[[Any], Any]:
-    """Make a function of the environment from code.
-
-    Args:
-        text: Code that was made of expressions.
-        constants: Values that the code reads by name, such as tables.
-        file: A name for the code in tracebacks.
-
-    Raises:
-        ConfigError: If the code is too large.
-    """
-    too_large = ConfigError(
-        f"{file}: expressions read each other in too long a row, or have too many terms"
-    )
-    if len(text) > _LONGEST_FUNCTION:
-        raise too_large
-    try:
-        code = compile(f"lambda env: {text}", f"<{file}>", "eval")
-    except (SyntaxError, MemoryError, RecursionError):  # limits of Python's own
-        raise too_large from None
-    function: Callable[[Any], Any] = eval(code, {**_NAMESPACE, **constants})
-    if not _MAY_WARN.search(text):
-        return function
-
-    def evaluate(env: Any) -> Any:
-        with np.errstate(all="ignore"):  # a result that is not finite is a fault of the episode
-            return function(env)
-
-    return evaluate

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from fmugym.declared.computed import Value, where
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
+from fmugym.declared.mathematics import maximum, minimum
 
 __all__ = ["KPIS", "Kpi", "kpi_name", "read_kpi"]
 
@@ -26,25 +28,30 @@ class Kpi(NamedTuple):
     expression: Expression
     how: str | None
 
-    def updated(self, value: str) -> str:
-        """Code for what the task remembers of a figure after a step.
+    def updated(self, value: Value, step_count: Value) -> Value:
+        """What the task remembers of a figure after a step.
 
         Args:
-            value: Code for the value in the step.
+            value: The value in the step.
+            step_count: The number of the step.
         """
-        before = f"env.variables[{kpi_name(self.entry.name)!r}]"
+        before = self._remembered(step_count)
         match self.how:
             case "sum" | "mean":
-                return f"({before} + {value})"
-            case "min" | "max":
-                return f"where((env.step_count == 1), {value}, fn_{self.how}({before}, {value}))"
+                return before + value
+            case "min":
+                return where(step_count == 1, value, minimum(before, value))
+            case "max":
+                return where(step_count == 1, value, maximum(before, value))
         return value
 
-    @property
-    def present(self) -> str:
-        """Code for the figure, of all steps until now."""
-        value = f"env.variables[{kpi_name(self.entry.name)!r}]"
-        return f"({value} / fn_max(env.step_count, 1.0))" if self.how == "mean" else value
+    def present(self, step_count: Value) -> Value:
+        """The figure of all steps until now."""
+        value = self._remembered(step_count)
+        return value / maximum(step_count, 1.0) if self.how == "mean" else value
+
+    def _remembered(self, step_count: Value) -> Value:
+        return Value.read(step_count.graph, "variables", kpi_name(self.entry.name))
 
 
 def kpi_name(name: str) -> str:

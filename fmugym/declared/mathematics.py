@@ -1,4 +1,4 @@
-"""The functions of expressions, for numbers, arrays and symbols.
+"""The functions of expressions, and what functions of Python call to compute them.
 
 In Python all of them give one number the same value, to the last bit, as an element of an array:
 they are numpy's functions, or operators that IEEE 754 settles.
@@ -12,14 +12,30 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-__all__ = ["FUNCTIONS", "OPERATIONS", "Function"]
+__all__ = [
+    "FUNCTIONS",
+    "Function",
+    "chance",
+    "chosen",
+    "clip",
+    "divide",
+    "float32",
+    "float64",
+    "interpolated",
+    "looked_up",
+    "maximum",
+    "minimum",
+    "noise",
+    "remainder",
+    "square",
+]
 
 
 class Function(NamedTuple):
     """A function that expressions may call.
 
     Attributes:
-        call: The function.
+        call: Returns the value for some values; see ``fmugym.declared.computed``.
         fewest, most: How many arguments it takes; None for any number.
     """
 
@@ -28,50 +44,63 @@ class Function(NamedTuple):
     most: int | None = 1
 
 
-def _divide(first: Any, second: Any) -> Any:
+# What functions of Python call, with numbers, arrays or symbols.
+
+
+def divide(first: Any, second: Any) -> Any:
+    """A quotient; by 0, it is not finite."""
     try:
         return first / second
     except ZeroDivisionError:  # Python's floats raise where numpy gives an infinity or NaN
         return np.divide(first, second)
 
 
-def _remainder(first: Any, second: Any) -> Any:
+def remainder(first: Any, second: Any) -> Any:
+    """What is left of a division; by 0, it is NaN."""
     try:
         return first % second
     except ZeroDivisionError:
         return np.remainder(first, second)
 
 
-def _power(base: Any, exponent: Any) -> Any:
-    if isinstance(exponent, float) and exponent == 2.0:  # a product takes far less time
-        return np.square(base, dtype=np.float64)
-    return np.float_power(base, exponent)
-
-
-def _where(condition: Any, first: Any, second: Any) -> Any:
+def chosen(condition: Any, first: Any, second: Any) -> Any:
+    """The first number where a condition holds, otherwise the second."""
     if isinstance(condition, bool | np.bool_):
         return np.float64(first if condition else second)  # the type that numpy.where gives
-    chosen = np.where(condition, first, second)
-    return chosen if chosen.ndim else chosen[()]  # a number if all are numbers
+    values = np.where(condition, first, second)
+    return values if values.ndim else values[()]  # a number if all are numbers
 
 
-def _clip(value: Any, low: Any, high: Any) -> Any:
-    return np.minimum(np.maximum(value, low), high)
-
-
-def _float32(value: Any) -> Any:
+def float32(value: Any) -> Any:
     """Round to the nearest number that a float32 can hold."""
-    return np.positive(np.positive(value, dtype=np.float32), dtype=np.float64)
+    return np.positive(value, dtype=np.float32)
 
 
-def _float64(value: Any) -> Any:
+def float64(value: Any) -> Any:
+    """The same number as a float64."""
     return np.positive(value, dtype=np.float64)
 
 
-def _take(table: Any, index: Any) -> Any:
+def square(value: Any) -> Any:
+    """The square of a number as a float64."""
+    return np.square(value, dtype=np.float64)
+
+
+def looked_up(table: Any, index: Any) -> Any:
+    """The number with this index in a table."""
     if isinstance(index, int | np.integer):
         return float(table[index])
     return np.take(table, index)  # looked up in each call: it is replaced while hooks are traced
+
+
+def interpolated(tables: Any, key: Any, place: Any) -> Any:
+    """The number at a place of a table, on straight lines; see ``Value.interpolated``.
+
+    The table is found in each call, since another one may have taken its place.
+    """
+    table = tables[key]
+    count = len(table) // 2 - 1
+    return np.interp(place, table[:count], table[count:-2], table[-2], table[-1])
 
 
 _STEP: Final = np.int64(0x9E3779B97F4A7C15 - 2**64)
@@ -96,7 +125,7 @@ def _mixed(word: Any) -> Any:
 
 
 def _word(key: Any, count: Any, channel: int) -> Any:
-    """64 random bits that are a function of the arguments; see ``_noise``."""
+    """64 random bits that are a function of the arguments; see ``noise``."""
     episode = _mixed(np.asarray(key).astype(np.int64) + _STEP)
     return _mixed(episode + np.asarray(count).astype(np.int64) * _STEP + np.int64(channel))
 
@@ -106,12 +135,12 @@ def _fraction(word: Any) -> Any:
     return _shifted(word, 11) * _FRACTION
 
 
-def _chance(key: Any, count: Any, channel: int) -> Any:
-    """A number of the uniform distribution from 0 to 1; see ``_noise``."""
+def chance(key: Any, count: Any, channel: int) -> Any:
+    """A number of the uniform distribution from 0 to 1; see ``noise``."""
     return _fraction(_mixed(_word(key, count, channel) + _STEP))
 
 
-def _noise(key: Any, count: Any, channel: int) -> Any:
+def noise(key: Any, count: Any, channel: int) -> Any:
     """A number of the standard normal distribution, by the method of Box and Muller.
 
     It is a function of its arguments, and so needs no generator.
@@ -127,25 +156,28 @@ def _noise(key: Any, count: Any, channel: int) -> Any:
     return np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
 
 
-def _minimum(*values: Any) -> Any:
+# What expressions call, with values of a task.
+
+
+def clip(value: Any, low: Any, high: Any) -> Any:
+    """The number of a range that is nearest."""
+    return np.minimum(np.maximum(value, low), high)
+
+
+def minimum(*values: Any) -> Any:
+    """The lowest of some numbers."""
     return reduce(np.minimum, values)
 
 
-def _maximum(*values: Any) -> Any:
+def maximum(*values: Any) -> Any:
+    """The highest of some numbers."""
     return reduce(np.maximum, values)
 
 
-OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
-    "divide": _divide,
-    "remainder": _remainder,
-    "power": _power,
-    "where": _where,
-    "float64": _float64,
-    "take": _take,
-    "noise": _noise,
-    "chance": _chance,
-}
-"""What the code of expressions calls for operators and for values that it looks up."""
+def _as_float32(value: Any) -> Any:
+    """The nearest number that a float32 can hold."""
+    return value.cast(np.float32).cast(np.float64)
+
 
 _OF_NUMPY: Final = (
     *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh", "tanh"),
@@ -154,14 +186,14 @@ _OF_NUMPY: Final = (
 )
 
 FUNCTIONS: Final[dict[str, Function]] = {
-    "abs": Function(abs),
-    "min": Function(_minimum, 2, None),
-    "max": Function(_maximum, 2, None),
-    "clip": Function(_clip, 3, 3),
+    "abs": Function(np.absolute),
+    "min": Function(minimum, 2, None),
+    "max": Function(maximum, 2, None),
+    "clip": Function(clip, 3, 3),
     "hypot": Function(np.hypot, 2, 2),
     "arctan2": Function(np.arctan2, 2, 2),
     "round": Function(np.rint),
-    "float32": Function(_float32),
+    "float32": Function(_as_float32),
     **{name: Function(getattr(np, name)) for name in _OF_NUMPY},
 }
 """The functions by the names that they have in expressions."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 
+from fmugym.declared.computed import Value
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.naming import Moment, Naming
 from fmugym.errors import ConfigError
@@ -13,21 +14,21 @@ from fmugym.task.quantity import Quantity
 __all__ = ["named_values"]
 
 
-def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quantity, str]]:
+def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quantity, Value]]:
     """Find the quantities of a task, in its units.
 
     Args:
         declared: The task.
-        naming: Gives names their code.
+        naming: Gives names their values.
 
     Returns:
-        By name, the quantity and the code for its value between two steps.
+        By name, the quantity and its value between two steps.
     """
-    found: dict[str, tuple[Quantity, str]] = {}
+    found: dict[str, tuple[Quantity, Value]] = {}
     for quantity in _quantities(declared, naming):
-        code = _code(naming, quantity.name)
-        if code is not None:
-            found.setdefault(quantity.name, (quantity, code))
+        value = _value(naming, quantity.name)
+        if value is not None:
+            found.setdefault(quantity.name, (quantity, value))
     return found
 
 
@@ -97,13 +98,13 @@ def _pairs(declared: Declarations) -> Iterator[tuple[str, str]]:
                 yield names[0], names[1]
 
 
-def _code(naming: Naming, name: str) -> str | None:
-    """Code for a value between two steps; None if it only has one within a step."""
+def _value(naming: Naming, name: str) -> Value | None:
+    """The value of a name between two steps; None if it only has one within a step."""
     for moment in (Moment.SEEN, Moment.JUDGED):
         try:
-            code = naming.code_of(name, moment)
+            value = naming.value_of(name, moment)
         except ConfigError:  # an expression of what is not known at this moment
             continue
-        if code is not None:
-            return code.number.text
+        if value is not None:
+            return value.number
     return None

@@ -1,22 +1,28 @@
-"""What the names in the expressions of a task stand for: code that reads the environment."""
+"""What the names in the expressions of a task stand for: values of the environment."""
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
+from functools import reduce
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
+from fmugym.declared.computed import Value, where
 from fmugym.declared.declarations import BUILT_IN, Declarations
-from fmugym.declared.devices import NOISE
+from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
-from fmugym.declared.expressions import Code, Expression, Names, code_of_number
+from fmugym.declared.expressions import Expression, Names
+from fmugym.declared.mathematics import clip, maximum
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.variables import Record, converted
 from fmugym.errors import unknown_name
-from fmugym.pool.spec import whole_number_of_steps
-from fmugym.task.future import Lookup, Table
+from fmugym.task.future import Lookup
+from fmugym.vector.hooks.graph import Graph
 
 __all__ = ["CLOCK", "Moment", "Naming", "queue_name", "switch_names"]
 
@@ -47,7 +53,7 @@ So the rounding of times does not matter.
 """
 
 
-NO_NAMES: Final[Mapping[str, str]] = {}
+NO_NAMES: Final[Mapping[str, Value]] = {}
 
 _CHANNELS_OF_ACTUATORS: Final = 5_000
 _LONGEST_DELAY: Final = 2000
@@ -64,7 +70,7 @@ def queue_name(record: Record) -> str:
 
 
 class Naming:
-    """Gives names their code.
+    """Gives names their values.
 
     Args:
         declared: The task.
@@ -72,11 +78,11 @@ class Naming:
         warm_steps: The steps of a warm-up with moving inputs.
 
     Attributes:
+        graph: Has everything that the task computes.
         outputs: The names of the values in ``state``, in their order.
         monitors: The names of other values that are read from the FMU.
         first_step: The step count after the first step, which may be one of the warm-up.
-        constants: Tables that code reads by name.
-        lookups: Those of the series that are read.
+        lookups: The series that are read, by name.
     """
 
     def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
@@ -84,8 +90,8 @@ class Naming:
         self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
-        self._derived: dict[tuple[str, Moment, float], Code] = {}
-        self.constants: dict[str, Any] = {}
+        self._derived: dict[tuple[str, Moment, float], Value] = {}
+        self.graph = Graph()
         self.lookups: dict[str, Lookup] = {}
         self.outputs, self.monitors = self._read_names()
 
@@ -140,34 +146,48 @@ class Naming:
         aliases = [n for n in self._places if not self._is_first(n)]
         return place if name not in aliases else len(self.outputs) + aliases.index(name)
 
-    def code(
+    def read(self, attribute: str, *keys: str | int, dtype: npt.DTypeLike = np.float64) -> Value:
+        """A value that the environment has; see ``Value.read``."""
+        return Value.read(self.graph, attribute, *keys, dtype=dtype)
+
+    def constant(self, number: float | bool) -> Value:
+        """A value that is the same everywhere."""
+        return Value.of(self.graph, number)
+
+    @property
+    def step_count(self) -> Value:
+        """The steps since the reset."""
+        return self.read("step_count", dtype=np.int64)
+
+    def value(
         self,
         entry: Entry,
         expression: Expression,
         moment: Moment,
-        others: Mapping[str, str] = NO_NAMES,
-    ) -> Code:
-        """Make code of an expression.
+        others: Mapping[str, Value] = NO_NAMES,
+    ) -> Value:
+        """Evaluate an expression.
 
         Args:
             entry: Where it stands.
             expression: The expression.
             moment: When it is evaluated.
-            others: The code of more names.
+            others: The values of more names.
 
         Raises:
             ConfigError: If it has unknown names, or names that have no value at this moment.
         """
         with entry.placing():
-            return expression.code(self._names(moment, others))
+            return expression.value(self._names(moment, others))
 
-    def _names(self, moment: Moment, others: Mapping[str, str]) -> Names:
-        def find(name: str) -> Code | None:
-            return Code(others[name]) if name in others else self.code_of(name, moment)
+    def _names(self, moment: Moment, others: Mapping[str, Value]) -> Names:
+        def find(name: str) -> Value | None:
+            return others[name] if name in others else self.value_of(name, moment)
 
         return Names(
+            self.graph,
             find,
-            (lambda name: None) if moment is Moment.BEFORE else self._previous_code_of,
+            (lambda name: None) if moment is Moment.BEFORE else self._previous_value_of,
             lambda: [*others, *self._known()],
         )
 
@@ -175,24 +195,24 @@ class Naming:
         declared = self._declared
         return [*declared.own_names, *declared.parameters, *BUILT_IN, *declared.records.names()]
 
-    def code_of(self, name: str, moment: Moment) -> Code | None:
-        """The code of a name; None if there is no such name, or it has no value at this moment."""
+    def value_of(self, name: str, moment: Moment) -> Value | None:
+        """The value of a name; None if there is no such name, or it has none at this moment."""
         declared = self._declared
         if name in BUILT_IN:
             return self._built_in(name, moment)
         if name in declared.memory:
-            return self._code_of_memory(name, moment)
+            return self._value_of_memory(name, moment)
         if name in declared.series:
-            return Code(self._code_of_series(name, moment))
+            return self._value_of_series(name, moment)
         if name in declared.steps:
-            return Code(self._code_of_steps(name, moment))
+            return self._value_of_steps(name, moment)
         if name in declared.derived:
-            return self._code_of_derived(name, moment)
+            return self._value_of_derived(name, moment)
         record = declared.records.get(name)
-        return None if record is None else Code(self._code_of_record(name, record, moment))
+        return None if record is None else self._value_of_record(name, record, moment)
 
-    def forecast(self, entry: Entry, name: str, ahead: float) -> str:
-        """Code for the value of a name at another time.
+    def forecast(self, entry: Entry, name: str, ahead: float) -> Value:
+        """The value of a name at another time.
 
         Args:
             entry: Where the forecast stands.
@@ -204,88 +224,85 @@ class Naming:
         """
         self._ahead = ahead
         try:
-            code = self.code_of(name, Moment.FORECAST)
+            value = self.value_of(name, Moment.FORECAST)
         finally:
             self._ahead = 0.0
-        if code is None or code.value is not None:
+        if value is None or value.constant is not None:
             if name not in (known := self._known()):
                 raise entry.error(unknown_name("name to forecast", name, known))
             raise entry.error(_no_forecast(name))
-        return code.number.text
+        return value.number
 
-    def _code_of_memory(self, name: str, moment: Moment) -> Code:
+    def _value_of_memory(self, name: str, moment: Moment) -> Value:
         memory = self._declared.memory[name]
         if moment is Moment.FORECAST and memory.update is not None:
             raise memory.entry.error(_no_forecast(name))
-        return Code(f"env.variables[{name!r}]")
+        return self.read("variables", name)
 
-    def _code_of_series(self, name: str, moment: Moment) -> str:
+    def _value_of_series(self, name: str, moment: Moment) -> Value:
         """The value now. One that holds for a while is, after a step, that of the step."""
         series, shift = self._declared.series[name], self._ahead
         if series.is_stepped:
             shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
-        now, shift = self.clock_code(), shift - series.start
-        place = f"remainder(({now} + {shift!r}), {series.period!r})"
+        table, tables = f"series {name}", self.graph.tables
         if name not in self.lookups:
-            table = Table(series.times, series.values)
-            self.lookups[name] = self.constants[f"series_{name}"] = Lookup(
-                len(self.lookups), series.start, series.period, series.is_stepped, table
+            numbered = [float(len(self.lookups)), series.values[-1]]  # for nobody looks to the left
+            tables[table] = np.concatenate([series.times, series.values, numbered])
+            self.lookups[name] = Lookup(
+                tables, table, series.start, series.period, series.is_stepped
             )
-        return f"series_{name}({place})"
+        place = (self.clock + (shift - series.start)) % series.period
+        return place.interpolated(table)
 
-    def _code_of_steps(self, name: str, moment: Moment) -> str:
+    def _value_of_steps(self, name: str, moment: Moment) -> Value:
         """The random value now; after a step, that of the step."""
         steps = self._declared.steps[name]
-        count = whole_number_of_steps(steps.every, self._time_step)
-        if not count:
-            raise steps.entry.error(
-                f"{steps.every:g} s is no multiple of the time step of {self._time_step:g} s"
-            )
+        count = steps_in(steps.entry, steps.every, self._time_step)
         shift = round(self._ahead / self._time_step) - (moment in _OVER)
-        place = f"fn_floor((fn_max((env.step_count + {float(shift)!r}), 0.0) / {float(count)!r}))"
-        chance = f"chance(env.variables[{NOISE!r}], {place}, {steps.channel})"
+        passed = maximum(self.step_count + float(shift), 0.0)
         low, high = steps.limits
-        return f"({low!r} + {high - low!r} * {chance})"
+        return low + (high - low) * chance_in(np.floor(passed / float(count)), steps.channel)
 
-    def _built_in(self, name: str, moment: Moment) -> Code | None:
+    def _built_in(self, name: str, moment: Moment) -> Value | None:
         match name:
             case "time":
-                return Code(f"(env.time + {self._ahead!r})" if self._ahead else "env.time")
+                return self.read("time") + self._ahead if self._ahead else self.read("time")
             case "clock":
-                return Code(f"({self.clock_code()} + {self._ahead!r})")
+                return self.clock + self._ahead
             case "elapsed":
-                return Code(f"(env.step_count * {self._time_step!r} + {self._ahead!r})")
+                return self.step_count * self._time_step + self._ahead
             case "step":
-                return Code(f"(env.step_count + {self._ahead / self._time_step!r})")
+                return self.step_count + self._ahead / self._time_step
             case "done":
                 return self._done(moment)
             case "dt":
-                return code_of_number(self._time_step)
-        return code_of_number(self._time_step / _SECONDS_PER_HOUR)
+                return self.constant(self._time_step)
+        return self.constant(self._time_step / _SECONDS_PER_HOUR)
 
-    def clock_code(self) -> str:
-        """Code for the time of data now; that of the FMU if the task sets no other clock."""
+    @property
+    def clock(self) -> Value:
+        """The time of data now; that of the FMU if the task sets no other clock."""
         if self._declared.root.child("clock").value is None:
-            return "env.time"
-        return f"(env.variables[{CLOCK!r}] + env.step_count * {self._time_step!r})"
+            return self.read("time")
+        return self.read("variables", CLOCK) + self.step_count * self._time_step
 
-    def _done(self, moment: Moment) -> Code | None:
+    def _done(self, moment: Moment) -> Value | None:
         if moment is Moment.JUDGED:
-            return Code("env.done", True)
+            return self.read("done", dtype=np.bool_)
         if moment is not Moment.UPDATED:
             return None
         flags, entry = self._declared.flags, self._declared.root.child("terminated")
         if "terminated" not in flags:
-            return Code("False", True, False)
-        return self.code(entry, flags["terminated"], Moment.AFTER)
+            return self.constant(False)
+        return self.value(entry, flags["terminated"], Moment.AFTER)
 
-    def _code_of_derived(self, name: str, moment: Moment) -> Code:
+    def _value_of_derived(self, name: str, moment: Moment) -> Value:
         derived, key = self._declared.derived[name], (name, moment, self._ahead)
         if name in self._open:
             raise derived.entry.error(f"{name!r} depends on itself")
         if key not in self._derived:  # many may read it
             with self._opened(name):
-                self._derived[key] = self.code(derived.entry, derived.expression, moment)
+                self._derived[key] = self.value(derived.entry, derived.expression, moment)
         return self._derived[key]
 
     @contextmanager
@@ -296,74 +313,77 @@ class Naming:
         finally:
             self._open.pop()
 
-    def _code_of_record(self, name: str, record: Record, moment: Moment) -> str:
+    def _value_of_record(self, name: str, record: Record, moment: Moment) -> Value:
         declared = self._declared
         if moment is Moment.FORECAST:
             raise record.entry.error(_no_forecast(name))
         if record in declared.actions and record.variable is None:
-            return self.action_code(record, "action")
+            return self.action(record, "action")
         if record in declared.actions and moment is Moment.BEFORE:
-            return self.input_code(record)
+            return self.input(record)
         if name in declared.written:
-            return converted(record.conversion, f"env.inputs[{declared.written.index(name)}]")
+            return self.present(record)
         if name in declared.parameters:
             if record.variable is not None and record.variable.kind == "string":
                 raise record.entry.error(f"{name!r} is a String: expressions have numbers only")
-            return converted(record.conversion, f"env.parameters[{record.fmu_name!r}]")
-        place = self._places[name]
-        return converted(record.conversion, f"env.inside.readings.values[{place}]")
+            return converted(record.conversion, self.read("parameters", record.fmu_name))
+        value = self.read("inside.readings.values", self._places[name])
+        return converted(record.conversion, value)
 
-    def _previous_code_of(self, name: str) -> Code | None:
+    def _previous_value_of(self, name: str) -> Value | None:
         declared, record = self._declared, self._declared.records.get(name)
         if record is not None and record in declared.actions:
-            is_known = record.is_direct
-            return Code(self.action_code(record, "previous_action")) if is_known else None
+            return self.action(record, "previous_action") if record.is_direct else None
         if record is None or not self._is_output(name):
             return None
-        place = self._places[name]
-        return Code(converted(record.conversion, f"env.previous_state[{place}]"))
+        return converted(record.conversion, self.read("previous_state", self._places[name]))
 
-    def action_code(self, record: Record, attribute: str) -> str:
-        """Code for an action in the unit of the task.
+    def action(self, record: Record, attribute: str) -> Value:
+        """An action in the unit of the task.
 
         Args:
             record: The variable that the agent writes.
             attribute: ``"action"`` or ``"previous_action"``.
         """
-        declared = self._declared
-        place, is_one = declared.actions.index(record), len(declared.actions) == 1
+        declared, place = self._declared, self._place_of(record)
         if declared.is_physical or not record.levels:
-            element = f"float64(env.{attribute}[{place}])"
+            element = self.read(attribute, place, dtype=np.float32).cast(np.float64)
             if record.levels:
                 return self._nearest_level(record, element)
             return self._rescaled(record, element) if declared.rescales else element
-        self.constants[f"levels_{place}"] = np.array(record.levels)
-        element = f"env.{attribute}" if is_one else f"env.{attribute}[{place}]"
-        return f"take(levels_{place}, {element})"
+        keys = [] if len(declared.actions) == 1 else [place]
+        levels = self._table_of_levels(record, np.array(record.levels))
+        return self.read(attribute, *keys, dtype=np.int64).taken(levels)
 
-    def input_code(self, record: Record) -> str:
-        """Code for the value that an action gives an input, in the unit of the task."""
-        chosen = self.action_code(record, "action")
+    def _table_of_levels(self, record: Record, levels: npt.NDArray[Any]) -> str:
+        name = f"levels of {record.alias}"
+        self.graph.tables[name] = levels
+        return name
+
+    def input(self, record: Record) -> Value:
+        """The value that an action gives an input, in the unit of the task."""
+        chosen = self.action(record, "action")
         if record.is_direct:
             return chosen
-        now = self.present_code(record)
+        now = self.present(record)
         if record.device.delay:
             chosen = self._late(record)
         if record.delta:
             chosen = self._changed(record, chosen, now)
         device, channel = record.device, _CHANNELS_OF_ACTUATORS + self._place_of(record)
-        chosen = device.distorted(chosen, "env.step_count", channel)
-        chosen = device.following(chosen, now, "env.step_count", channel, self._time_step)
+        chosen = device.distorted(chosen, self.step_count, channel)
+        chosen = device.following(chosen, now, self.step_count, channel, self._time_step)
         if record.is_switched:
-            chosen = f"where({self.blocked_code(record, chosen)}, {now}, {chosen})"
+            chosen = where(self.blocked(record, chosen), now, chosen)
         return chosen
 
-    def _changed(self, record: Record, chosen: str, now: str) -> str:
-        """Code for an input after a change; in the physical form, towards the chosen value."""
-        value = f"({now} + {chosen})"
+    def _changed(self, record: Record, chosen: Value, now: Value) -> Value:
+        """An input after a change; in the physical form, towards the chosen value."""
+        value = now + chosen
         if self._declared.is_physical:
-            value = f"fn_clip({chosen}, ({now} - {record.delta!r}), ({now} + {record.delta!r}))"
-        return f"fn_clip({value}, {record.low!r}, {record.high!r})"
+            value = clip(chosen, now - record.delta, now + record.delta)
+        limited: Value = clip(value, record.low, record.high)
+        return limited
 
     def _place_of(self, record: Record) -> int:
         return self._declared.actions.index(record)
@@ -374,93 +394,87 @@ class Naming:
         Raises:
             ConfigError: If the delay is no multiple of the time step.
         """
-        delay = record.device.delay
-        count = whole_number_of_steps(delay, self._time_step) if delay else 0
-        if delay and (not count or count > _LONGEST_DELAY):
-            raise record.entry.child("delay").error(
-                f"{delay:g} s is no multiple of the step of {self._time_step:g} s, or more than "
-                f"{_LONGEST_DELAY} steps"
-            )
-        return count or 0
+        delay, entry = record.device.delay, record.entry.child("delay")
+        return steps_in(entry, delay, self._time_step, _LONGEST_DELAY) if delay else 0
 
-    def _late(self, record: Record) -> str:
-        """Code for what the agent chose some steps ago."""
-        count, queue = self.delay_of(record), f"env.variables[{queue_name(record)!r}]"
-        first = float(count - self._warm_steps)
-        return (
-            f"where((env.step_count < {first!r}), {self.start_code(record)}, {queue}[{count - 1}])"
-        )
+    def _late(self, record: Record) -> Value:
+        """What the agent chose some steps ago."""
+        count = self.delay_of(record)
+        queued = self.read("variables", queue_name(record), count - 1)
+        is_first = self.step_count < float(count - self._warm_steps)
+        return where(is_first, self.start(record), queued)
 
-    def start_code(self, record: Record) -> str:
-        """Code for what counts as chosen before the first action; no change for changes."""
+    def start(self, record: Record) -> Value:
+        """What counts as chosen before the first action; no change for changes."""
         if record.delta and not self._declared.is_physical:
-            return "(env.step_count * 0.0)"
+            return self.step_count * 0.0
         return self._start_of_input(record)
 
-    def _start_of_input(self, record: Record) -> str:
+    def _start_of_input(self, record: Record) -> Value:
         if record.variable is None:
-            return "(env.step_count * 0.0)"
+            return self.step_count * 0.0
         if record.alias in self._declared.parameters:
-            start = f"env.parameters[{record.fmu_name!r}]"
+            start = self.read("parameters", record.fmu_name)
         else:
-            start = f"(env.step_count * 0.0 + {record.variable.start_number!r})"
+            start = self.step_count * 0.0 + record.variable.start_number
         return converted(record.conversion, start)
 
-    def present_code(self, record: Record) -> str:
-        """Code for the value that an input has now, in the unit of the task."""
-        place = self._declared.written.index(record.alias)
-        return converted(record.conversion, f"env.inputs[{place}]")
+    def present(self, record: Record) -> Value:
+        """The value that an input has now, in the unit of the task."""
+        return converted(record.conversion, self._written(record))
 
-    def blocked_code(self, record: Record, chosen: str) -> str:
-        """Code for whether it is too early to switch to a value.
+    def _written(self, record: Record) -> Value:
+        return self.read("inputs", self._declared.written.index(record.alias))
+
+    def blocked(self, record: Record, chosen: Value) -> Value:
+        """Whether it is too early to switch to a value.
 
         Args:
             record: A variable with a least time on or off.
-            chosen: Code for the value.
+            chosen: The value.
         """
-        state, since = (f"env.variables[{name!r}]" for name in switch_names(record))
+        state, since = (self.read("variables", name) for name in switch_names(record))
         on, off = (np.ceil(t / self._time_step - _JUST) for t in (record.min_on, record.min_off))
-        stays_on = f"(({state} > 0.5) & ({chosen} == 0.0) & ({since} < {float(on)!r}))"
-        stays_off = f"(({state} < 0.5) & ({chosen} != 0.0) & ({since} < {float(off)!r}))"
-        return f"({stays_on} | {stays_off})"
+        stays_on = (state > 0.5) & (chosen == 0.0) & (since < float(on))
+        stays_off = (state < 0.5) & (chosen != 0.0) & (since < float(off))
+        return stays_on | stays_off
 
-    def switch_codes(self, record: Record) -> tuple[str, str]:
-        """Code for the new values of the variables that ``switch_names`` names."""
-        state, since = (f"env.variables[{name!r}]" for name in switch_names(record))
-        is_on = f"((env.inputs[{self._declared.written.index(record.alias)}] != 0.0) * 1.0)"
-        return is_on, f"where({is_on} == {state}, ({since} + 1.0), 1.0)"
+    def switched(self, record: Record) -> tuple[Value, Value]:
+        """The new values of the variables that ``switch_names`` names."""
+        state, since = (self.read("variables", name) for name in switch_names(record))
+        is_on = (self._written(record) != 0.0) * 1.0
+        return is_on, where(is_on == state, since + 1.0, 1.0)
 
-    def _rescaled(self, record: Record, element: str) -> str:
-        """Code that turns an action from -1 to 1 into one from the lowest to the highest value."""
+    def _rescaled(self, record: Record, element: Value) -> Value:
+        """Turn an action from -1 to 1 into one from the lowest to the highest value."""
         if record.delta:
-            return f"({record.delta!r} * {element})"
+            return record.delta * element
         middle, half = (record.low + record.high) / 2, (record.high - record.low) / 2
-        return f"({middle!r} + {half!r} * {element})"
+        return middle + half * element
 
-    def _nearest_level(self, record: Record, element: str) -> str:
-        """Code for the level that is nearest to a value, the lower one of two."""
+    def _nearest_level(self, record: Record, element: Value) -> Value:
+        """The level that is nearest to a value, the lower one of two."""
         levels = np.sort(record.levels)
-        table = f"levels_{self._place_of(record)}"
-        self.constants[table] = levels
         middles = ((levels[1:] + levels[:-1]) / 2).tolist()
-        return f"take({table}, {' + '.join(f'({element} > {m!r}) * 1' for m in middles)})"
+        place: Value = reduce(operator.add, [(element > middle) * 1 for middle in middles])
+        return place.taken(self._table_of_levels(record, levels))
 
-    def kept(self, name: str) -> tuple[str, str] | None:
-        """Code for what a history adds to a name's values in each step.
+    def kept(self, name: str) -> tuple[Value, Value] | None:
+        """What a history adds to a name's values in each step.
 
         Returns:
-            Code for the value to add, and for the older values in the first step; None if there is
-            no history of this name.
+            The value to add, and the older values in the first step; None if there is no history of
+            this name.
         """
         declared, record = self._declared, self._declared.records.get(name)
         if record is None or not (record in declared.actions or self._is_output(name)):
             return None
         if record not in declared.actions:
-            before = self._previous_code_of(name)
-            return None if before is None else (before.text, before.text)
-        now = self._code_of_record(name, record, Moment.AFTER)
+            before = self._previous_value_of(name)
+            return None if before is None else (before, before)
+        now = self._value_of_record(name, record, Moment.AFTER)
         if record.variable is None:
-            return now, self.action_code(record, "previous_action")
+            return now, self.action(record, "previous_action")
         return now, self._start_of_input(record)
 
 

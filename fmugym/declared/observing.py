@@ -9,13 +9,14 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from fmugym.declared.computed import Value, where
 from fmugym.declared.declarations import Declarations
-from fmugym.declared.devices import NOISE
+from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.variables import Record
-from fmugym.pool.spec import whole_number_of_steps
 
 __all__ = [
     "History",
@@ -65,14 +66,14 @@ class Seen(NamedTuple):
     Attributes:
         entry: Where it is declared.
         name: What it is the value of.
-        code: Its code.
+        value: Its value.
         low, high: Its limits.
         place: Which value of a forecast or history it is, such as ``"[+3600 s]"``.
     """
 
     entry: Entry
     name: str
-    code: str
+    value: Value
     low: float
     high: float
     place: str = ""
@@ -85,17 +86,17 @@ class History(NamedTuple):
         name: The name.
         variable: The episode variable that holds them, the latest first.
         length: How many they are.
-        now: Code for the value that is added when the FMU has stepped.
-        fill: Code for the other values in the first step.
-        first: Code for all values at the beginning of an episode.
+        now: The value that is added when the FMU has stepped.
+        fill: The other values in the first step.
+        first: All values at the beginning of an episode.
     """
 
     name: str
     variable: str
     length: int
-    now: str
-    fill: str
-    first: str
+    now: Value
+    fill: Value
+    first: Value
 
 
 def histories(declared: Declarations, naming: Naming, time_step: float) -> list[History]:
@@ -108,7 +109,7 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
         ConfigError: If a name has no value before the step.
     """
     entry = declared.root.child("agent").child("history")
-    length = _count(entry.child("length"), time_step) if declared.remembered else 0
+    length = _kept_steps(declared, time_step) if declared.remembered else 0
     lengths = dict.fromkeys(declared.remembered, length)
     for name in declared.measured:
         record = _sensor_of(declared, name)
@@ -121,21 +122,27 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     return [*kept, *(_queue(naming, record) for record in late_ones)]
 
 
+def _kept_steps(declared: Declarations, time_step: float) -> int:
+    """How many values of a name the agent sees that are of the past."""
+    entry = declared.root.child("agent").child("history").child("length")
+    return steps_in(entry, entry.value, time_step, _MOST_VALUES)
+
+
 def _queue(naming: Naming, record: Record) -> History:
     """What the agent has chosen for an action with a delay."""
-    name, start = queue_name(record), naming.start_code(record)
-    chosen = naming.action_code(record, "action")
+    name, start = queue_name(record), naming.start(record)
+    chosen = naming.action(record, "action")
     return History(name, name, naming.delay_of(record), chosen, start, start)
 
 
 def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
-    present, codes = naming.code_of(name, Moment.SEEN), naming.kept(name)
-    if present is None or codes is None:
+    present, values = naming.value_of(name, Moment.SEEN), naming.kept(name)
+    if present is None or values is None:
         raise entry.error(
             f"there is no history of {name!r}: it is kept for variables of the FMU, actions, "
             "data and schedules"
         )
-    return History(name, f"history of {name}", length, *codes, present.text)
+    return History(name, f"history of {name}", length, *values, present)
 
 
 def _sensor_of(declared: Declarations, name: str) -> Record | None:
@@ -154,7 +161,7 @@ def observed_values(
 
     Args:
         declared: The task.
-        naming: Gives names their code.
+        naming: Gives names their values.
         kept: The histories.
         time_step: Length of a step in seconds.
         are_filled: Whether a warm-up has filled the histories when an episode begins.
@@ -200,26 +207,30 @@ class _Past:
         self._measured: dict[str, History] = {}
         self._histories = {history.name: history for history in kept}
 
-    def measured(self, entry: Entry, name: str, ago: int) -> str:
-        """Code for what the agent measured some steps ago."""
+    def measured(self, entry: Entry, name: str, ago: int) -> Value:
+        """What the agent measured some steps ago."""
         record = _sensor_of(self._declared, name)
         deviation = self._declared.deviations.get(name)
         if deviation is not None:
             setpoint, of = (self.measured(entry, one, ago) for one in deviation)
-            return f"({setpoint} - {of})"
+            return setpoint - of
         if record is None:
             return self._true(entry, name, ago)
         fresh = self._fresh(entry, record, ago)
         if not record.device.remembers:
             return fresh
-        past = f"env.variables[{self._kept(entry, record, ago)!r}][{ago}]"
-        return past if self._are_filled else f"where(env.step_count == 0, {fresh}, {past})"
+        past = self._naming.read("variables", self._kept(entry, record, ago), ago)
+        return self._unless_first(fresh, past)
 
-    def _fresh(self, entry: Entry, record: Record, ago: int) -> str:
-        """Code for a measurement, whatever was measured before."""
+    def _unless_first(self, first: Value, past: Value) -> Value:
+        """A value of the past; another one at the beginning of an episode, which has no past."""
+        return past if self._are_filled else where(self._naming.step_count == 0, first, past)
+
+    def _fresh(self, entry: Entry, record: Record, ago: int) -> Value:
+        """A measurement, whatever was measured before."""
         name, device = record.alias, record.device
-        code = self._true(entry, name, ago + self._naming.delay_of(record))
-        return device.distorted(code, f"(env.step_count - {ago})", self._channel(name))
+        value = self._true(entry, name, ago + self._naming.delay_of(record))
+        return device.distorted(value, self._naming.step_count - ago, self._channel(name))
 
     def _channel(self, name: str) -> int:
         return self._naming.channel_of(name)
@@ -227,16 +238,13 @@ class _Past:
     def _kept(self, entry: Entry, record: Record, ago: int) -> str:
         """The variable with what a sensor with a memory has given, the latest first."""
         name, variable = record.alias, f"measured {record.alias}"
+        naming, fill = self._naming, self._fresh(entry, record, 1)
         length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
         first = self._fresh(entry, record, 0)
-        is_first = f"(env.step_count == {self._naming.first_step})"
-        before = (
-            f"where({is_first}, {self._fresh(entry, record, 1)}, env.variables[{variable!r}][0])"
-        )
-        now = record.device.following(
-            first, before, "env.step_count", self._channel(name), self._time_step
-        )
-        fill = self._fresh(entry, record, 1)
+        is_first = naming.step_count == naming.first_step
+        before = where(is_first, fill, naming.read("variables", variable, 0))
+        channel = self._channel(name)
+        now = record.device.following(first, before, naming.step_count, channel, self._time_step)
         self._measured[name] = History(name, variable, length, now, fill, first)
         return variable
 
@@ -245,18 +253,16 @@ class _Past:
         """What sensors with a memory have given; to be updated after the histories."""
         return list(self._measured.values())
 
-    def _true(self, entry: Entry, name: str, ago: int) -> str:
+    def _true(self, entry: Entry, name: str, ago: int) -> Value:
         if ago == 0:
-            code = self._naming.code_of(name, Moment.SEEN)
-            if code is None or code.value is not None:
+            value = self._naming.value_of(name, Moment.SEEN)
+            if value is None or value.constant is not None:
                 raise entry.error(f"{name!r} is a constant, which an agent need not observe")
-            return code.number.text
+            return value.number
         if name in self._histories:
             history = self._histories[name]
-            past = f"env.variables[{history.variable!r}][{ago - 1}]"
-            if self._are_filled:
-                return past
-            return f"where(env.step_count == 0, {history.first}, {past})"
+            past = self._naming.read("variables", history.variable, ago - 1)
+            return self._unless_first(history.first, past)
         return self._naming.forecast(entry, name, -ago * self._time_step)
 
 
@@ -268,16 +274,18 @@ def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
     for entry in _forecasts_in(declared):
         step = entry.value.get("step", time_step)
-        count = _count(entry.child("horizon"), step)
+        horizon = entry.child("horizon")
+        count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
         error = _error_of(entry.child("error").value)
         for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
             name = one.value
             for index in range(1, count + 1):
                 ahead = index * step
-                code = naming.forecast(one, name, ahead)
+                value = naming.forecast(one, name, ahead)
                 if error is not None:
-                    code = error.added(code, index / count, round(ahead / time_step), channel)
-                yield Seen(one, name, code, *declared.limits_of(name), f"[+{ahead:g} s]")
+                    later = naming.step_count + round(ahead / time_step)
+                    value = error.added(value, index / count, later, channel)
+                yield Seen(one, name, value, *declared.limits_of(name), f"[+{ahead:g} s]")
 
 
 class ForecastError(NamedTuple):
@@ -295,25 +303,24 @@ class ForecastError(NamedTuple):
     growth: float = 0.5
     relative: bool = False
 
-    def added(self, code: str, part: float, ahead: int, channel: int) -> str:
-        """Code for a forecast with errors.
+    def added(self, value: Value, part: float, count: Value, channel: int) -> Value:
+        """A forecast with errors.
 
         The errors belong to the time that the forecast is made for: forecasts of one time err in
         the same direction, and less and less as the time comes near.
 
         Args:
-            code: Code for the true value.
+            value: The true value.
             part: The time ahead as a part of the horizon.
-            ahead: The time ahead in steps.
+            count: The number of the step that the forecast is made for.
             channel: The number of the forecast.
         """
-        size, key = part**self.growth, f"env.variables[{NOISE!r}]"
-        count = f"(env.step_count + {ahead})"
-        error = f"({self.std * size!r} * noise({key}, {count}, {channel}))"
+        size: float = part**self.growth
+        error = self.std * size * noise_in(count, channel)
         if self.bias:
-            lasting = f"noise({key}, (env.step_count * 0), {channel + _CHANNELS_OF_BIASES})"
-            error = f"({error} + {self.bias * size!r} * {lasting})"
-        return f"({code} + {code} * {error})" if self.relative else f"({code} + {error})"
+            channel += _CHANNELS_OF_BIASES
+            error = error + self.bias * size * noise_in(first_step(value.graph), channel)
+        return value + value * error if self.relative else value + error
 
 
 def _error_of(given: Mapping[str, Any] | None) -> ForecastError | None:
@@ -338,19 +345,9 @@ def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterat
     entry = declared.root.child("agent").child("history")
     for name in declared.remembered:
         limits = declared.limits_of(name)
-        for ago in range(1, 1 + _count(entry.child("length"), time_step)):
-            code = past.measured(entry, name, ago)
-            yield Seen(entry, name, code, *limits, f"[-{ago * time_step:g} s]")
-
-
-def _count(entry: Entry, step: float) -> int:
-    length = entry.value
-    count = whole_number_of_steps(length, step) if step > 0 else 0
-    if not count:
-        raise entry.error(f"{length:g} s is no multiple of the step of {step:g} s")
-    if count > _MOST_VALUES:
-        raise entry.error(f"{length:g} s are {count} steps of {step:g} s, at most {_MOST_VALUES}")
-    return count
+        for ago in range(1, 1 + _kept_steps(declared, time_step)):
+            value = past.measured(entry, name, ago)
+            yield Seen(entry, name, value, *limits, f"[-{ago * time_step:g} s]")
 
 
 def normalized(seen: Seen, nominal: float | None) -> Seen:
@@ -363,8 +360,8 @@ def normalized(seen: Seen, nominal: float | None) -> Seen:
         raise seen.entry.error(
             f"{seen.name!r} has no nominal value: give it 'nominal', or 'min' and 'max'"
         )
-    code, low, high = f"({seen.code} / {nominal!r})", seen.low / nominal, seen.high / nominal
-    return seen._replace(code=code, low=low, high=high)
+    low, high = seen.low / nominal, seen.high / nominal
+    return seen._replace(value=seen.value / nominal, low=low, high=high)
 
 
 def scaled(seen: Seen) -> Seen:
@@ -378,7 +375,7 @@ def scaled(seen: Seen) -> Seen:
             f"{seen.name!r} needs 'min' and 'max' so that observations can be normalized"
         )
     middle, half = (seen.low + seen.high) / 2, (seen.high - seen.low) / 2
-    return seen._replace(code=f"(({seen.code} - {middle!r}) / {half!r})", low=-1.0, high=1.0)
+    return seen._replace(value=(seen.value - middle) / half, low=-1.0, high=1.0)
 
 
 def remember(

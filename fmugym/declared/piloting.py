@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from ast import literal_eval
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
+from fmugym.declared.computed import Value, function_of
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.expressions import Expression
 from fmugym.declared.naming import Moment, Naming
@@ -20,21 +19,34 @@ from fmugym.declared.warming import signals_of
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
 from fmugym.task.warm_up import WarmUp
+from fmugym.vector.hooks.graph import Graph, Node
 
 if TYPE_CHECKING:
     from fmugym.baselines import Controller
 
 __all__ = ["DeclaredWarmUp", "WarmUpMaker"]
 
-_VARIABLE: Final = re.compile(r"""env\.variables\[('[^']*'|"[^"]*")\]""")
-
 Hook = Callable[[Any], Any]
 
 
-def variables_in(codes: Sequence[str]) -> tuple[str, ...]:
-    """The episode variables that code reads."""
-    found = (literal_eval(text) for code in codes for text in _VARIABLE.findall(code))
+def variables_in(nodes: Sequence[Node]) -> tuple[str, ...]:
+    """The episode variables that nodes read."""
+    rows: list[Any] = [node.what for node in nodes if node.kind == "row"]
+    found = (names[0] for attribute, *names in rows if attribute == "variables")
     return tuple(dict.fromkeys(found))
+
+
+def _described(graph: Graph, roots: Sequence[int]) -> list[Any]:
+    """What nodes of a graph compute, in a form that is the same in every process."""
+    order = graph.needed(roots)
+    places = {number: place for place, number in enumerate(order)}
+    described: list[Any] = [places[root] for root in roots]
+    for number in order:
+        kind, what, operands, dtype = graph.nodes[number]
+        what = getattr(what, "__name__", what)
+        table = graph.tables[what].tobytes() if kind in ("take", "interpolate") else b""
+        described.append((kind, what, [places[one] for one in operands], dtype.str, table))
+    return described
 
 
 class Pilot(NamedTuple):
@@ -130,8 +142,7 @@ class DeclaredWarmUp(WarmUp):
         pilots: What acts.
         inputs: A function of the environment that returns the FMU's inputs.
         updates: Functions that write episode variables when the FMU has stepped.
-        codes: All code that these functions consist of.
-        constants: The tables that the code reads.
+        values: All values that these functions return.
         writes: The episode variables that are written.
         caches: Whether to keep the states that it leads to.
     """
@@ -143,18 +154,17 @@ class DeclaredWarmUp(WarmUp):
         pilots: Sequence[Pilot],
         inputs: Hook,
         updates: Sequence[Hook],
-        codes: Sequence[str],
-        constants: Mapping[str, Any],
+        values: Sequence[Value],
         writes: tuple[str, ...],
         caches: bool,
     ) -> None:
         self.steps, self._time_step = steps, time_step
         self._pilots, self._inputs, self._updates = pilots, inputs, updates
         self.writes, self.caches = writes, caches
-        self.depends_on = variables_in(codes)
+        graph, roots = values[0].graph, [value.node for value in values]
+        self.depends_on = variables_in([graph.nodes[number] for number in graph.needed(roots)])
         told = [repr((p.record.alias, type(p.controller), vars(p.controller))) for p in pilots]
-        tables = [(n, table.tobytes()) for n, table in sorted(constants.items())]
-        content = repr((steps, time_step, told, list(codes), tables))
+        content = repr((steps, time_step, told, _described(graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()
         self.begin(1)  # which finds mistakes
 
@@ -181,28 +191,20 @@ class WarmUpMaker:
 
     Args:
         declared: The task.
-        naming: Gives names their code.
+        naming: Gives names their values.
         time_step: Length of a step in seconds.
-        function: Makes a function of the environment of code.
     """
 
-    def __init__(
-        self,
-        declared: Declarations,
-        naming: Naming,
-        time_step: float,
-        function: Callable[[str], Hook],
-    ) -> None:
-        self._declared, self._naming = declared, naming
-        self._time_step, self._function = time_step, function
+    def __init__(self, declared: Declarations, naming: Naming, time_step: float) -> None:
+        self._declared, self._naming, self._time_step = declared, naming, time_step
 
     def make(
         self,
         steps: int,
-        inputs: Sequence[str],
+        inputs: Sequence[Value],
         updates: Sequence[Hook],
         histories: Sequence[History],
-        switches: Mapping[str, str],
+        switches: Mapping[str, Value],
         variables: Mapping[str, Any],
         start_time: Any,
     ) -> DeclaredWarmUp:
@@ -210,10 +212,10 @@ class WarmUpMaker:
 
         Args:
             steps: Its steps.
-            inputs: Code for the FMU's inputs.
+            inputs: The FMU's inputs.
             updates: Functions that write histories and what ``switches`` has.
             histories: The histories that are written.
-            switches: Code for other episode variables by name.
+            switches: The new values of other episode variables by name.
             variables: All episode variables of the config.
             start_time: That of the config.
 
@@ -222,17 +224,16 @@ class WarmUpMaker:
         """
         table = self._declared.warm_up
         pilots = [self._pilot(record) for record in self._declared.actions]
-        kept = [text for history in histories for text in (history.now, history.fill)]
-        signals = [self._signal_code(name) for name in table.signals()]
+        kept = [value for history in histories for value in (history.now, history.fill)]
+        signals = [self._signal(name) for name in table.signals()]
         with table.entry.placing():
             warm_up = DeclaredWarmUp(
                 steps,
                 self._time_step,
                 [pilot for pilot in pilots if pilot is not None],
-                self._function(_tuple(inputs)),
+                function_of(tuple(inputs)),
                 updates,
-                [*inputs, *signals, *switches.values(), *kept, self._naming.clock_code()],
-                self._naming.constants,
+                [*inputs, *signals, *switches.values(), *kept, self._naming.clock],
                 (*(history.variable for history in histories), *switches),
                 table.caches,
             )
@@ -260,24 +261,20 @@ class WarmUpMaker:
         if controller is None:
             return None
         names = signals_of(controller)
-        present = self._function(self._naming.present_code(record)) if record.delta else None
+        present = function_of(self._naming.present(record)) if record.delta else None
         return Pilot(
             record,
             self._declared.actions.index(record),
             controller,
             tuple(names),
-            self._function(_tuple(map(self._signal_code, names))),
-            self._function(self._naming.clock_code()),
+            function_of(tuple(map(self._signal, names))),
+            function_of(self._naming.clock),
             present,
             self._declared.rescales,
             self._declared.is_physical,
         )
 
-    def _signal_code(self, name: str) -> str:
+    def _signal(self, name: str) -> Value:
         entry = self._declared.warm_up.entry.child("controller")
         expression = Expression.parse(name)
-        return self._naming.code(entry, expression, Moment.SEEN).number.text
-
-
-def _tuple(codes: Iterable[str]) -> str:
-    return "(" + "".join(f"{code}, " for code in codes) + ")"
+        return self._naming.value(entry, expression, Moment.SEEN).number

@@ -2,14 +2,39 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from fmugym.checks import check_mapping, check_number, number_of
+from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
 from fmugym.distributions import as_distribution, is_distribution
+from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["finite", "number", "number_or_distribution"]
+__all__ = ["finite", "number", "number_or_distribution", "steps_in"]
+
+
+def steps_in(entry: Entry, length: float, step: float, most: float = math.inf) -> int:
+    """The number of steps in a duration.
+
+    Args:
+        entry: Where the duration stands.
+        length: The duration in seconds.
+        step: The length of a step in seconds.
+        most: There may be at most so many.
+
+    Raises:
+        ConfigError: If it is no positive multiple of the step, or there are more.
+    """
+    count = whole_number_of_steps(length, step) if step > 0 else None
+    if not count:
+        raise entry.error(
+            f"expected a positive multiple of the step of {step:g} s, got {length:g} s"
+        )
+    if count > most:
+        raise entry.error(f"{length:g} s are {count} steps of {step:g} s, at most {most}")
+    return count
 
 
 def number(what: str, value: Any) -> float:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import cached_property, partial
+import operator
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import cached_property, partial, reduce
 from typing import Any, Final
 
 import numpy as np
@@ -11,6 +12,7 @@ from gymnasium import spaces
 
 from fmugym.archive.description import ModelDescription
 from fmugym.declared.blaming import explanation
+from fmugym.declared.computed import Computed, Value, function_of, where
 from fmugym.declared.configuring import (
     bounds_of,
     clock_of,
@@ -21,8 +23,8 @@ from fmugym.declared.configuring import (
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
 from fmugym.declared.entries import gathered
-from fmugym.declared.expressions import function_of
 from fmugym.declared.kpis import kpi_name
+from fmugym.declared.mathematics import minimum
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
 from fmugym.declared.observing import (
@@ -38,12 +40,12 @@ from fmugym.declared.observing import (
 )
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
+from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
-from fmugym.pool.spec import whole_number_of_steps
 from fmugym.task.future import Future
 from fmugym.task.quantity import Quantities
 
@@ -110,7 +112,7 @@ class ResolvedTask:
         data = self._root.child("data").value or {}
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
-        clock = self._function(self._naming.clock_code())
+        clock = function_of(self._naming.clock)
         held_out = held_out_times((self._task.outside or self._task).root)
         return Future(lookups, keys, clock, tuple((one.start, one.length) for one in held_out))
 
@@ -123,14 +125,14 @@ class ResolvedTask:
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
         found = named_values(self._declared, self._naming)
-        read = self._function(_tuple(code for _, code in found.values()))
+        read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
     def _makers(self) -> Iterator[Callable[[], Any]]:
-        """Functions that make code of each expression, so that one error tells all mistakes."""
+        """Functions that evaluate each expression, so that one error tells all mistakes."""
         declared = self._declared
         for name in declared.derived:
-            yield partial(self._naming.code_of, name, Moment.JUDGED)
+            yield partial(self._naming.value_of, name, Moment.JUDGED)
         for name, term in {**declared.costs, **declared.rewards}.items():
             yield partial(self._terms, {name: term})
         for name in declared.flags:
@@ -140,26 +142,18 @@ class ResolvedTask:
 
     def _steps_of_warm_up(self) -> int:
         """The steps of a warm-up with moving inputs; 0 if there is none."""
-        table, step = self._declared.warm_up, self._time_step
-        if not (table.controllers or table.caches or self._declared.inputs):
-            return 0
-        count = whole_number_of_steps(table.period, step)
-        if count is None:
-            raise table.entry.error(
-                f"the warm-up must be a multiple of the time step of {step:g} s, got "
-                f"{table.period:g} s"
-            )
-        return count
+        table = self._declared.warm_up
+        moves = table.controllers or table.caches or self._declared.inputs
+        return steps_in(table.entry, table.period, self._time_step) if moves and table.period else 0
 
     def _make_warm_up(self) -> DeclaredWarmUp:
-        switches = dict(self._switch_codes())
-        maker = WarmUpMaker(self._declared, self._naming, self._time_step, self._function)
+        maker = WarmUpMaker(self._declared, self._naming, self._time_step)
         return maker.make(
             self._warm_steps,
-            self._input_codes(self._declared.warm_up.controllers),
+            self._input_values(self._declared.warm_up.controllers),
             [*self._updates_of_histories(), *self._updates_of_switches()],
             [*self._kept, *self._sensors],
-            switches,
+            self._switched(),
             self.config["episode_variables"],
             self.config.get("start_time"),
         )
@@ -186,7 +180,7 @@ class ResolvedTask:
         kept = [*self._kept, *self._sensors]
         histories = {one.variable: np.zeros(one.length) for one in kept}
         switches: dict[str, float] = {}
-        for record in self._switched:
+        for record in self._switched_actions:
             state, since = switch_names(record)
             switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
@@ -213,7 +207,7 @@ class ResolvedTask:
         return {NOISE: NoiseKey(draws=not draws)}
 
     @property
-    def _switched(self) -> list[Record]:
+    def _switched_actions(self) -> list[Record]:
         """The actions with a least time on or off."""
         return [record for record in self._declared.actions if record.is_switched]
 
@@ -230,7 +224,8 @@ class ResolvedTask:
         own, rewards = self._root.child("config").child("fault_reward"), self._declared.rewards
         if own.value is not None or not rewards:
             return False
-        return any(not _is_number(code) for code in self._terms(rewards).values())
+        values = self._terms(rewards)
+        return any(values[n].constant is None or rewards[n].weight != 1.0 for n in rewards)
 
     # Spaces, and what leads into and out of them.
 
@@ -262,42 +257,44 @@ class ResolvedTask:
 
     def _inputs(self) -> Hook:
         """Write the FMU's inputs, in their units."""
-        codes = self._input_codes()
-        return self._function(codes[0] if len(codes) == 1 else _tuple(codes))
+        values = self._input_values()
+        return function_of(values[0] if len(values) == 1 else values)
 
-    def _input_codes(self, acting: Collection[str] | None = None) -> list[str]:
-        """Code for the FMU's inputs, in their units.
+    def _input_values(self, acting: Collection[str] | None = None) -> list[Value]:
+        """The FMU's inputs, in their units.
 
         Args:
             acting: The aliases of the actions that are chosen, the others keep their values; None
                 for all.
         """
-        declared, codes = self._declared, list[str]()
+        declared, values = self._declared, list[Value]()
         for record in declared.actions:
             if record.variable is None:
                 continue
-            code = inverted(record.conversion, self._naming.input_code(record))
+            value = inverted(record.conversion, self._naming.input(record))
             is_kept = acting is not None and record.alias not in acting
-            codes.append(f"env.inputs[{len(codes)}]" if is_kept else code)
+            values.append(self._naming.read("inputs", len(values)) if is_kept else value)
         for name, (record, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
-            value = self._naming.code(entry, expression, Moment.BEFORE).number.text
-            codes.append(inverted(record.conversion, value))
-        if not codes:
+            value = self._naming.value(entry, expression, Moment.BEFORE).number
+            values.append(inverted(record.conversion, value))
+        if not values:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
             )
-        return codes
+        return values
 
     def _action_masks(self) -> Hook | None:
-        codes = []
+        naming, values = self._naming, list[Value]()
         for record in self._declared.actions:
-            for level in record.levels:
-                blocked = self._naming.blocked_code(record, repr(level))
-                codes.append(f"({blocked} ^ True)" if record.is_switched else "True")
-        if not codes:
+            for level in map(naming.constant, record.levels):
+                is_switched = record.is_switched
+                values.append(
+                    naming.blocked(record, level) ^ True if is_switched else naming.constant(True)
+                )
+        if not values:
             return None
-        masks = self._function(_tuple(codes))
+        masks = function_of(values)
         return lambda env: np.array(masks(env), dtype=np.bool_)
 
     def _observation_space(self) -> spaces.Space[Any] | None:
@@ -323,7 +320,7 @@ class ResolvedTask:
         return self._seen
 
     def _observation(self) -> Hook:
-        values = self._function(_tuple(seen.code for seen in self._normalized))
+        values = function_of([seen.value for seen in self._normalized])
         return lambda env: np.array(values(env), dtype=np.float32)
 
     # What follows a step.
@@ -345,11 +342,11 @@ class ResolvedTask:
             hooks["_is_truncated"] = self._condition("truncated")
         if declared.rewards:
             terms = self._terms(declared.rewards)
-            hooks["_reward_policy"] = self._function(_sum(terms))
-            hooks["_explain"] = explanation(declared.rewards, terms, self._naming, self._function)
+            hooks["_reward_policy"] = function_of(_sum(terms))
+            hooks["_explain"] = explanation(declared.rewards, terms, self._naming)
             hooks["_fault_reward"] = self._fault_reward()
         if declared.costs or declared.has_reward_terms or declared.kpis:
-            hooks["_get_info"] = self._function(self._info())
+            hooks["_get_info"] = function_of(self._info())
         return hooks
 
     def _updates_of_histories(self) -> list[Hook]:
@@ -357,68 +354,72 @@ class ResolvedTask:
         return [self._remembering(kept) for kept in (self._kept, self._sensors) if kept]
 
     def _remembering(self, kept: list[History]) -> Hook:
-        values = self._function(_tuple(history.now for history in kept))
-        fills = self._function(_tuple(history.fill for history in kept))
+        values = function_of([history.now for history in kept])
+        fills = function_of([history.fill for history in kept])
         return remember(kept, values, fills, self._naming.first_step)
 
     def _updates_of_switches(self) -> list[Hook]:
-        return self._assignments(dict(self._switch_codes()))
+        return self._assignments(self._switched())
 
-    def _switch_codes(self) -> Iterator[tuple[str, str]]:
-        for record in self._switched:
-            yield from zip(switch_names(record), self._naming.switch_codes(record), strict=True)
+    def _switched(self) -> dict[str, Value]:
+        """What the task remembers of actions with a least time on or off, by variables."""
+        values: dict[str, Value] = {}
+        for record in self._switched_actions:
+            values |= zip(switch_names(record), self._naming.switched(record), strict=True)
+        return values
 
     def _updates_of_worst(self) -> list[Hook]:
         if not self._has_worst:
             return []
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
-        return self._assignments({WORST: f"fn_min(env.variables[{WORST!r}], {reward})"})
+        worst = self._naming.read("variables", WORST)
+        return self._assignments({WORST: minimum(worst, reward)})
 
     def _updates_of_kpis(self) -> list[Hook]:
-        terms, codes = self._term_codes(Moment.UPDATED), dict[str, str]()
+        terms, values = self._term_values(Moment.UPDATED), dict[str, Value]()
         for name, kpi in self._declared.kpis.items():
             if kpi.how is not None:
-                value = self._naming.code(kpi.entry, kpi.expression, Moment.UPDATED, terms)
-                codes[kpi_name(name)] = kpi.updated(value.number.text)
-        return self._assignments(codes)
+                value = self._naming.value(kpi.entry, kpi.expression, Moment.UPDATED, terms)
+                values[kpi_name(name)] = kpi.updated(value.number, self._naming.step_count)
+        return self._assignments(values)
 
-    def _kpi_codes(self) -> dict[str, str]:
-        """Code for the figures of the episode until now."""
-        kpis = self._declared.kpis
-        known = {name: kpi.present for name, kpi in kpis.items() if kpi.how is not None}
-        names = self._term_codes(Moment.JUDGED) | known
+    def _kpi_values(self) -> dict[str, Value]:
+        """The figures of the episode until now."""
+        kpis, step_count = self._declared.kpis, self._naming.step_count
+        known = {name: kpi.present(step_count) for name, kpi in kpis.items() if kpi.how is not None}
+        names = self._term_values(Moment.JUDGED) | known
         others = {
-            name: self._naming.code(kpi.entry, kpi.expression, Moment.JUDGED, names).number.text
+            name: self._naming.value(kpi.entry, kpi.expression, Moment.JUDGED, names).number
             for name, kpi in kpis.items()
             if kpi.how is None
         }
         return {name: (known | others)[name] for name in kpis}
 
-    def _term_codes(self, moment: Moment) -> dict[str, str]:
-        """Code for rewards and costs by their names, for the figures that use them."""
+    def _term_values(self, moment: Moment) -> dict[str, Value]:
+        """Rewards and costs by their names, for the figures that use them."""
         declared = self._declared
         if not declared.kpis:
             return {}
         terms = {**declared.rewards, **declared.costs}
-        return {name: code for name, code in self._terms(terms, moment).items() if name}
+        return {name: value for name, value in self._terms(terms, moment).items() if name}
 
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""
-        codes = {
-            name: self._naming.code(memory.entry, memory.update, Moment.AFTER).number.text
+        values = {
+            name: self._naming.value(memory.entry, memory.update, Moment.AFTER).number
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
-        return self._assignments(codes)
+        return self._assignments(values)
 
-    def _assignments(self, codes: Mapping[str, str]) -> list[Hook]:
+    def _assignments(self, values: Mapping[str, Value]) -> list[Hook]:
         """A function that writes variables; none if there are no variables."""
-        if not codes:
+        if not values:
             return []
-        names, values = list(codes), self._function(_tuple(codes.values()))
+        names, function = list(values), function_of(list(values.values()))
 
         def update(env: Any) -> None:
-            for name, value in zip(names, values(env), strict=True):
+            for name, value in zip(names, function(env), strict=True):
                 env.variables[name] = value
 
         return [update]
@@ -430,42 +431,44 @@ class ResolvedTask:
             return lambda env: env.config.fault_reward
         if self._has_worst:
             return lambda env: env.variables[WORST]
-        reward = self._function(_sum(self._terms(self._declared.rewards)))
+        reward = function_of(_sum(self._terms(self._declared.rewards)))
         return lambda env: min(0.0, reward(env))
 
     def _condition(self, name: str) -> Hook:
         entry = self._root.child(name)
         moment = Moment.AFTER if name == "terminated" else Moment.JUDGED
-        code = self._naming.code(entry, self._declared.flags[name], moment)
-        if not code.is_flag:
+        value = self._naming.value(entry, self._declared.flags[name], moment)
+        if not value.is_flag:
             raise entry.error(
                 f"expected a condition such as 'x > 1', got {shown(entry.value.text)}"
             )
-        return self._function(code.text)
+        return function_of(value)
 
-    def _terms(self, terms: Mapping[str, Term], moment: Moment = Moment.JUDGED) -> dict[str, str]:
-        """Code for rewards or costs by name, weights included."""
-        codes = {}
+    def _terms(self, terms: Mapping[str, Term], moment: Moment = Moment.JUDGED) -> dict[str, Value]:
+        """Rewards or costs by name, weights included."""
+        values = {}
         for name, term in terms.items():
-            code = self._naming.code(term.entry, term.expression, moment).number.text
-            codes[name] = code if term.weight == 1.0 else f"({term.weight!r} * {code})"
-        return codes
+            value = self._naming.value(term.entry, term.expression, moment).number
+            values[name] = value if term.weight == 1.0 else term.weight * value
+        return values
 
-    def _info(self) -> str:
-        """Code for the info: terms of the reward, costs, and figures of the episode."""
+    def _info(self) -> dict[str, Computed]:
+        """The info: terms of the reward, costs, and figures of the episode."""
         rewards, costs = self._terms(self._declared.rewards), self._terms(self._declared.costs)
-        parts: dict[str, str] = {}
+        parts: dict[str, Computed] = {}
         if self._declared.has_reward_terms:
-            parts["reward_terms"] = _dict({name: _in_steps(c) for name, c in rewards.items()})
+            parts["reward_terms"] = self._in_steps(rewards)
         if costs:
-            parts["cost"] = _in_steps(_sum(costs))
-            parts["costs"] = _dict({name: _in_steps(code) for name, code in costs.items()})
+            parts |= self._in_steps({"cost": _sum(costs)})
+            parts["costs"] = self._in_steps(costs)
         if self._declared.kpis:
-            parts["kpis"] = _dict({n: _in_steps(code) for n, code in self._kpi_codes().items()})
-        return _dict(parts)
+            parts["kpis"] = self._in_steps(self._kpi_values())
+        return parts
 
-    def _function(self, text: str) -> Hook:
-        return function_of(text, self._naming.constants, self._task.name)
+    def _in_steps(self, values: Mapping[str, Value]) -> dict[str, Value]:
+        """Zeros before the first step, which has no rewards and costs yet."""
+        has_stepped = self._naming.step_count > 0
+        return {name: where(has_stepped, value, 0.0) for name, value in values.items()}
 
 
 def _in_turn(updates: list[Hook]) -> Hook:
@@ -476,32 +479,10 @@ def _in_turn(updates: list[Hook]) -> Hook:
     return update
 
 
-def _is_number(code: str) -> bool:
-    """Whether code is a constant."""
-    try:
-        float(code.strip("()"))
-    except ValueError:
-        return False
-    return True
-
-
 def _box(limits: list[tuple[float, float]]) -> spaces.Box:
     low, high = np.array(limits, dtype=np.float32).T
     return spaces.Box(low, high, dtype=np.float32)
 
 
-def _tuple(codes: Iterable[str]) -> str:
-    return "(" + "".join(f"{code}, " for code in codes) + ")"
-
-
-def _dict(codes: Mapping[str, str]) -> str:
-    return "{" + ", ".join(f"{name!r}: {code}" for name, code in codes.items()) + "}"
-
-
-def _sum(codes: Mapping[str, str]) -> str:
-    return "(" + " + ".join(codes.values()) + ")"
-
-
-def _in_steps(code: str) -> str:
-    """Zero before the first step, which has no rewards and costs yet."""
-    return f"where(env.step_count > 0, {code}, 0.0)"
+def _sum(values: Mapping[str, Value]) -> Value:
+    return reduce(operator.add, values.values())

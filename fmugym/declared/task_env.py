@@ -7,8 +7,8 @@ from types import MethodType
 from typing import Any, Final, Never
 
 from fmugym.declared.resolved_task import ResolvedTask
-from fmugym.declared.systems import describe, fmu_of
 from fmugym.declared.task import Task
+from fmugym.declared.task_fmu import describe, fmu_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
 from fmugym.task.alone import alone
@@ -66,7 +66,9 @@ class TaskEnv(FMUEnv):
         self.task = Task.of(config)
         source = fmu_of(self.task, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
-        resolved = ResolvedTask(self.task, describe(self.task, source), needs_reward)
+        description = describe(self.task, source)
+        with self.task.root.placing():
+            resolved = ResolvedTask(self.task, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
         self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up

@@ -10,6 +10,7 @@ from typing import Any, Final
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
+from fmugym.declared.computed import Value
 from fmugym.declared.devices import IDEAL, Device, read_device
 from fmugym.declared.entries import Entry, gathered
 from fmugym.declared.quantities import number_or_distribution
@@ -269,18 +270,18 @@ def _own_nominal(variable: Variable | None, conversion: Conversion) -> float | N
     return None if not own or conversion.offset else abs(own * conversion.factor)
 
 
-def converted(conversion: Conversion, text: str) -> str:
-    """Code that turns a value of the FMU into one of the task."""
+def converted(conversion: Conversion, value: Value) -> Value:
+    """Turn a value of the FMU into one of the task."""
     if conversion.factor != 1.0:
-        text = f"({text} * {conversion.factor!r})"
-    return text if conversion.offset == 0.0 else f"({text} + {conversion.offset!r})"
+        value = value * conversion.factor
+    return value if conversion.offset == 0.0 else value + conversion.offset
 
 
-def inverted(conversion: Conversion, text: str) -> str:
-    """Code that turns a value of the task into one of the FMU."""
+def inverted(conversion: Conversion, value: Value) -> Value:
+    """Turn a value of the task into one of the FMU."""
     if conversion.offset != 0.0:
-        text = f"({text} - {conversion.offset!r})"
-    return text if conversion.factor == 1.0 else f"({text} / {conversion.factor!r})"
+        value = value - conversion.offset
+    return value if conversion.factor == 1.0 else value / conversion.factor
 
 
 def is_plain(record: Record) -> bool:

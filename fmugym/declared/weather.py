@@ -82,8 +82,10 @@ _MEANS: Final = (
 """The fields that are means of the time since the row before."""
 
 _WIDTH: Final = len(_DATES) + len(_CODES)
-_PERIODS: Final = re.compile(r"DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,|$)")
-_TABLE: Final = re.compile(r"\s*(?:double|float)\s+([^\s(]+)\s*\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\)")
+_PERIODS: Final = re.compile(r"^DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,.*)?$", re.M)
+_TABLE: Final = re.compile(
+    r"^\s*(?:double|float)\s+([^\s(]+)\s*\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\).*$", re.M
+)
 _SEPARATORS: Final = str.maketrans(",;", "  ")
 
 
@@ -116,21 +118,20 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
         ConfigError: If they are no such weather.
     """
     try:
-        per_hour, rows = _records(lines)
-        times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(rows)]
-        cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
-        dates, fields = np.split(np.array(cells, np.float64), [len(_DATES)], axis=1)
+        per_hour, numbers = _records("\n".join(lines))
+        times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(numbers)]
     except ordinary(ValueError) as error:
         raise ConfigError(f"{name} is no weather of EnergyPlus: {reason(error)}") from None
+    dates, fields = np.split(numbers, [len(_DATES)], axis=1)
     return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields, _CODES)
 
 
-def _records(lines: Sequence[str]) -> tuple[int, list[list[str]]]:
-    """How many there are in an hour, and their cells, without those of a leap day."""
-    heads = ((i, _PERIODS.match(line)) for i, line in enumerate(lines))
-    last, head = next(((i, head) for i, head in heads if head), (len(lines), None))
-    rows = [line.split(",")[:_WIDTH] for line in lines[last + 1 :] if line.strip()]
-    rows = [row for row in rows if [cell.strip() for cell in row[1:3]] != ["2", "29"]]
+def _records(text: str) -> tuple[int, FloatArray]:
+    """How many there are in an hour, and their numbers, without those of a leap day."""
+    head = _PERIODS.search(text)
+    lines = text[head.end() :].splitlines() if head else []
+    rows = [[*map(str.strip, line.split(",")[:_WIDTH])] for line in lines if line.strip()]
+    rows = [row for row in rows if row[1:3] != ["2", "29"]]
     if head is None or not rows:
         raise ValueError(
             "expected rows below a line such as 'DATA PERIODS,1,1,Data,Sunday,1/1,12/31'"
@@ -138,10 +139,11 @@ def _records(lines: Sequence[str]) -> tuple[int, list[list[str]]]:
     width = len(rows[0])
     if width <= len(_DATES) or any(len(row) != width for row in rows):
         raise ValueError(f"expected rows of {_WIDTH} cells")
-    return int(head[1]), rows
+    cells = [[cell or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
+    return int(head[1]), np.array(cells, np.float64)
 
 
-def _end_of(row: Sequence[str], part: int, parts: int) -> float:
+def _end_of(row: FloatArray, part: int, parts: int) -> float:
     """When a record ends. Hour 1 is the first of a day; minutes mean several things in practice."""
     month, day, hour = map(int, row[1:4])
     if not 1 <= hour <= 24:
@@ -179,36 +181,27 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
         ConfigError: If there is no table, or its numbers are not as many as it says.
     """
     is_weather = any(line.startswith("#LOCATION,") for line in lines)
-    found: dict[str, tuple[tuple[int, int], list[str]]] = {}
-    cells: list[str] = []
-    for line in lines:
-        text = line.partition("#")[0]
-        if head := _TABLE.match(text):
-            cells = []
-            found[head[1]] = (int(head[2]), int(head[3])), cells
-        else:
-            cells += text.translate(_SEPARATORS).split()
-    if not found:
+    _, *parts = _TABLE.split("\n".join(line.partition("#")[0] for line in lines))
+    if not parts:
         raise ConfigError(f"{name} has no table, such as 'double tab1(8760,2)'")
     return {
-        key: _modelica_table(f"the table {shown(key)} of {name}", shape, cells, is_weather)
-        for key, (shape, cells) in found.items()
+        key: _modelica_table(f"the table {shown(key)} of {name}", (rows, width), cells, is_weather)
+        for key, rows, width, cells in zip(*(parts[i::4] for i in range(4)), strict=True)
     }
 
 
-def _modelica_table(
-    what: str, shape: tuple[int, int], cells: Sequence[str], is_weather: bool
-) -> Table:
+def _modelica_table(what: str, shape: tuple[str, str], cells: str, is_weather: bool) -> Table:
+    rows, width = map(int, shape)
     try:
-        numbers = np.array(cells, np.float64).reshape(shape)
+        numbers = np.array(cells.translate(_SEPARATORS).split(), np.float64).reshape(rows, width)
     except ordinary(ValueError) as error:
         raise ConfigError(f"{what} is damaged: {reason(error)}") from None
     if not numbers.size:
         raise ConfigError(f"{what} has no rows")
     times = _with_jumps(numbers[:, 0])
-    if is_weather and shape[1] == 1 + len(_CODES):
+    if is_weather and width == 1 + len(_CODES):
         return _weather({"time": times}, times, numbers[:, 1:], _CODES_OF_TABLES)
-    columns = {str(i + 1) if i else "time": numbers[:, i] for i in range(shape[1])}
+    columns = {str(i + 1) if i else "time": numbers[:, i] for i in range(width)}
     period = float(numbers[-1, 0] - numbers[0, 0])
     return Table({**columns, "time": times}, period or _DAY)
 

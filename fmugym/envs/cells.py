@@ -10,6 +10,7 @@ import importlib
 import logging
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fmugym.checks import check_number, check_text, has_method
@@ -86,6 +87,7 @@ def paced_cells(
     return Paced(lease, RealClock() if lab is None else lab.clock)
 
 
+@dataclass(eq=False, repr=False)  # which would show the tokens
 class Lease:
     """The source of the cells' sessions. A call with a number returns that many cells.
 
@@ -98,45 +100,41 @@ class Lease:
         session_time: Longest time of an episode, in s.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        user_token: str | None,
-        gym_token: str | None,
-        gym_time: float | None,
-        session_time: float,
-    ) -> None:
-        self._client = client
-        self._user_token, self._gym_token = user_token, gym_token
-        self._gym_time, self._session_time = gym_time, session_time
-        self._is_own = gym_token is None
-        self._count = 0
+    client: Any
+    user_token: str | None
+    gym_token: str | None
+    gym_time: float | None
+    session_time: float
+    _count: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._is_own = self.gym_token is None
 
     def __call__(self, count: int) -> list[Cell]:
         """Make backends for a number of cells."""
         self._count = count
-        if count > 1 and self._gym_time is None:
-            self._gym_time = _DEFAULT_GYM_TIME
-        return [Cell(self, _like(self._client)) for _ in range(count)]
+        if count > 1 and self.gym_time is None:
+            self.gym_time = _DEFAULT_GYM_TIME
+        return [Cell(self, _like(self.client)) for _ in range(count)]
 
     def open(self) -> None:
         """Make the lease if one is needed and there is none."""
-        if self._gym_time is not None and self._gym_token is None:
-            cell_types = [_cell_type(self._client)] * self._count
-            self._gym_token = self._client.start_gym(self._user_token, self._gym_time, cell_types)
+        if self.gym_time is not None and self.gym_token is None:
+            cell_types = [_cell_type(self.client)] * self._count
+            self.gym_token = self.client.start_gym(self.user_token, self.gym_time, cell_types)
 
     def close(self) -> None:
         """Stop the lease if it was made here."""
-        if self._is_own and self._gym_token is not None:
-            gym_token, self._gym_token = self._gym_token, None
-            self._client.stop_gym(gym_token)
+        if self._is_own and self.gym_token is not None:
+            gym_token, self.gym_token = self.gym_token, None
+            self.client.stop_gym(gym_token)
 
     def start(self, client: Any, angle: float) -> tuple[str, bool]:
         """Start a session at an angle in rad; returns its token and whether a lease has it."""
-        is_leased = self._gym_token is not None
+        is_leased = self.gym_token is not None
         start = client.start_episode if is_leased else client.start_experiment
-        owner = self._gym_token if is_leased else self._user_token
-        token, _ = start(owner, EXPERIMENT, self._session_time, 0.0, initial_position=[angle])
+        owner = self.gym_token if is_leased else self.user_token
+        token, _ = start(owner, EXPERIMENT, self.session_time, 0.0, initial_position=[angle])
         return token, is_leased
 
 

@@ -161,30 +161,11 @@ class DymolaCSCartPoleEnv(ModelicaCartPoleEnv, FMI1CSEnv):
         m_load: Any = 1.0,
         phi1_start: Any = THETA_0,
         w1_start: Any = 0.0,
-        time_step: float = 0.05,
-        positive_reward: float = 1.0,
-        negative_reward: float = -100.0,
-        force: float = 12.0,
-        log_level: int = logging.WARNING,
-        fmu_path: str | os.PathLike[str] | None = None,
-        *,
-        render_mode: str | None = None,
+        *task: Any,
         **options: Any,
     ) -> None:
         super().__init__(
-            m_trolley,
-            m_load,
-            phi1_start,
-            w1_start,
-            time_step,
-            positive_reward,
-            negative_reward,
-            force,
-            log_level,
-            fmu_path,
-            fmi_version="1.0",
-            render_mode=render_mode,
-            **options,
+            m_trolley, m_load, phi1_start, w1_start, *task, fmi_version="1.0", **options
         )
 
     def _variable_names(self, own_fmu: bool) -> dict[str, Any]:

@@ -21,7 +21,6 @@ from fmugym.series.intervals import confidence
 __all__ = [
     "HELD_OUT_SEED",
     "Score",
-    "each_score",
     "evaluate",
     "plot_scores",
     "table",
@@ -96,7 +95,7 @@ def evaluate(
     scenario: str | None = None,
     advance: Advance = no_progress,
     wrap: Wrap = lambda env: env,
-) -> list[Score]:
+) -> Iterator[Score]:
     """Let players play the same episodes.
 
     Args:
@@ -108,22 +107,9 @@ def evaluate(
         advance: Is told of each step.
         wrap: Puts wrappers around the environment, such as a recorder.
 
-    Returns:
-        A score for each player, in their order.
+    Yields:
+        A score for each player, in their order, as soon as it is known.
     """
-    return list(each_score(make_env, players, seeds, most_steps, scenario, advance, wrap))
-
-
-def each_score(
-    make_env: Callable[..., FMUEnv],
-    players: Mapping[str, Player],
-    seeds: Iterable[int],
-    most_steps: int,
-    scenario: str | None = None,
-    advance: Advance = no_progress,
-    wrap: Wrap = lambda env: env,
-) -> Iterator[Score]:
-    """Yield each score of ``evaluate`` as soon as it is known."""
     seeds = list(seeds)
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form

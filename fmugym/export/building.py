@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-import platform
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -12,10 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from fmugym.errors import ConfigError
-from fmugym.extras import installation
+import fmpy
 
-__all__ = ["PLATFORMS", "Platform", "compiled", "header_folder", "own_platform"]
+from fmugym.errors import ConfigError
+from fmugym.extras import c_compiler
+
+__all__ = ["PLATFORMS", "Platform", "compiled"]
 
 
 class Platform(NamedTuple):
@@ -45,33 +44,7 @@ _OPTIONS: Final = (
     *("-std=c99", "-O2", "-g0", "-ffp-contract=off", "-Wno-unused-parameter", "-shared", "-fPIC"),
     *("-fvisibility=hidden",),
 )
-_COMPILERS: Final = ("cc", "gcc", "clang")
 _LONGEST_MESSAGE: Final = 800
-
-
-def own_platform() -> str:
-    """The platform of this machine.
-
-    Raises:
-        ConfigError: If there is no compiler for it here.
-    """
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(
-        platform.machine().lower(), platform.machine().lower()
-    )
-    system = {"win32": "windows", "darwin": "darwin"}.get(sys.platform, "linux")
-    if f"{machine}-{system}" not in PLATFORMS:
-        raise ConfigError(
-            f"an FMU cannot be built for {machine}-{system}, only for {', '.join(PLATFORMS)}"
-        )
-    return f"{machine}-{system}"
-
-
-def header_folder() -> Path:
-    """The folder with the headers of FMI, which come with fmpy."""
-    spec = importlib.util.find_spec("fmpy")
-    if spec is None or spec.origin is None:
-        raise ConfigError("the headers of FMI come with fmpy, which is not installed")
-    return Path(spec.origin).parent / "c-code"
 
 
 def compiled(folder: Path, files: list[str], name: str, where: str) -> bytes:
@@ -103,12 +76,6 @@ def compiled(folder: Path, files: list[str], name: str, where: str) -> bytes:
 
 
 def _compiler(where: str) -> list[str]:
-    """The compiler of this system for this platform; ziglang for all others."""
-    found = next(filter(None, map(shutil.which, _COMPILERS)), None)
-    if found is not None and where == own_platform() and sys.platform != "win32":
-        return [found]
-    if importlib.util.find_spec("ziglang") is None:
-        raise ConfigError(
-            f"there is no compiler for {where}; one is ziglang: {installation('windows')}"
-        )
-    return [sys.executable, "-m", "ziglang", "cc", "-target", PLATFORMS[where].target]
+    """The compiler of this system for this platform; ziglang for all others, and on Windows."""
+    is_own = sys.platform != "win32" and where == fmpy.platform_tuple
+    return c_compiler(f"the library for {where}", PLATFORMS[where].target, is_own=is_own)

@@ -13,10 +13,10 @@ import numpy as np
 
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError
 from fmugym.export.exportable import Agent
 from fmugym.export.layers import array, bare, c_type, network_lines
-from fmugym.export.names import identifiers
+from fmugym.export.names import identifiers, new_file
 from fmugym.export.operations import HELPERS, TYPES, constant, expression
 from fmugym.vector.hooks.graph import Node
 
@@ -82,8 +82,13 @@ def header(agent: Agent) -> str:
 
 def _comment(agent: Agent) -> list[str]:
     lines = [f"The agent {agent.name!r}, exported by fmugym {agent.version}.", *agent.notes]
-    safe = [re.sub(r"\*/|/\*|[^ -~]", "?", line) for line in lines]
-    return [f"/* {safe[0]}", *(f" * {line}".rstrip() for line in safe[1:]), " */"]
+    first, *others = map(_safe, lines)
+    return [f"/* {first}", *(f" * {line}".rstrip() for line in others), " */"]
+
+
+def _safe(text: str) -> str:
+    """A text that may stand in a comment."""
+    return re.sub(r"\*/|/\*|[^ -~]", "?", text)
 
 
 def _enumeration(prefix: str, variables: Sequence[Variable]) -> list[str]:
@@ -97,7 +102,7 @@ def _enumeration(prefix: str, variables: Sequence[Variable]) -> list[str]:
 
 def _unit(variable: Variable) -> str:
     told = ", ".join(filter(None, [variable.unit, variable.description]))
-    return f" /* {re.sub(r'[*]/|/[*]|[^ -~]', '?', told)} */" if told else ""
+    return f" /* {_safe(told)} */" if told else ""
 
 
 def field_names(agent: Agent) -> list[str]:
@@ -169,13 +174,12 @@ class _Source:
 
     def _evaluated(self, numbers: Iterable[int]) -> Iterator[str]:
         """The lines that compute some nodes, and those that they need."""
-        closure = self._closure(numbers)
-        for number in sorted(closure):
+        needed = set(self._graph.needed(numbers, self._logic.loads))
+        for number in sorted(needed - self._texts.keys()):
             node = self._graph.nodes[number]
             letter = node.dtype.char
             if node.kind == "constant":
-                value = self._value(node)
-                self._texts[number] = constant(value, letter)
+                self._texts[number] = constant(node.number, letter)
                 continue
             if node.kind == "take":
                 yield from self._checked_place(node)
@@ -187,21 +191,6 @@ class _Source:
                 continue
             self._texts[number] = f"t{number}"
             yield f"    const {c_type(node.dtype)} t{number} = {bare(text)};"
-
-    def _closure(self, numbers: Iterable[int]) -> set[int]:
-        found: set[int] = set()
-        waiting = list(numbers)
-        while waiting:
-            number = waiting.pop()
-            if number not in found and number not in self._texts:
-                found.add(number)
-                if number not in self._logic.loads:
-                    waiting.extend(self._graph.nodes[number].operands)
-        return found
-
-    def _value(self, node: Node) -> Any:
-        bits: Any = node.what
-        return np.frombuffer(bits, node.dtype)[0]
 
     def _expression(self, number: int, node: Node) -> str:
         if number in self._logic.loads:
@@ -322,9 +311,9 @@ class _Source:
         features, network = self._logic.features, self._agent.network
         if network is not None:
             yield from self._evaluated(features)
-            yield f"    {network.c_type} features[{len(features)}];"
+            yield f"    {c_type(network.dtype)} features[{len(features)}];"
             yield f"    {c_type(network.gives)} given[{len(network.parts)}];"
-            yield from self._stored("features", features, network.c_type)
+            yield from self._stored("features", features, c_type(network.dtype))
             yield f"    {self._name}_network(features, given);"
 
     def _stored(self, array: str, nodes: Sequence[int], kind: str) -> Iterator[str]:
@@ -353,13 +342,7 @@ def write_c(agent: Agent, folder: str | os.PathLike[str]) -> list[Path]:
         ConfigError: If the task computes what cannot be written in C; the text names it.
         FileExistsError: If a file exists.
     """
-    place = check_path("folder", folder)
-    if not place.is_dir():
-        raise ConfigError(f"{shown(str(place))} is no folder")
-    texts = {f"{agent.name}.h": header(agent), f"{agent.name}.c": source(agent)}
-    for name in texts:
-        if (place / name).exists():
-            raise FileExistsError(f"{place / name} exists")
-    for name, text in texts.items():
-        (place / name).write_text(text, encoding="ascii", newline="\n")
-    return [place / name for name in texts]
+    files = [new_file(check_path("folder", folder) / f"{agent.name}.{end}") for end in "hc"]
+    for file, text in zip(files, (header(agent), source(agent)), strict=True):
+        file.write_text(text, encoding="ascii", newline="\n")
+    return files

@@ -12,13 +12,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Final
 
-from fmugym.checks import check_option, check_path
-from fmugym.errors import ConfigError, shown
-from fmugym.export.building import PLATFORMS, compiled, header_folder, own_platform
+import fmpy
+
+from fmugym.checks import check_option
+from fmugym.errors import ConfigError
+from fmugym.export.building import PLATFORMS, compiled
 from fmugym.export.c99 import field_names, header, source
 from fmugym.export.exportable import Agent
 from fmugym.export.layers import c_type
 from fmugym.export.model_description import Port, kind_of, model_description, ports_of
+from fmugym.export.names import new_file
 from fmugym.export.operations import constant
 
 __all__ = ["FMI_VERSIONS", "write_fmu"]
@@ -58,22 +61,17 @@ def write_fmu(
             cannot be written in C.
         FileExistsError: If the file exists.
     """
-    file = check_path("path", path)
+    file = new_file(path)
     check_option("fmi_version", fmi_version, FMI_VERSIONS)
-    names = [own_platform()] if platforms is None else list(platforms)
+    names = [str(fmpy.platform_tuple)] if platforms is None else list(platforms)
     for name in names:
         check_option("platform", name, PLATFORMS)
-    if file.exists():
-        raise FileExistsError(f"{file} exists")
-    if not file.parent.is_dir():
-        raise ConfigError(f"{shown(str(file.parent))} is no folder")
     with tempfile.TemporaryDirectory(prefix="fmugym-export-") as scratch:
         folder = Path(scratch)
         token = _write_sources(agent, fmi_version, folder)
         files = {f"sources/{one.name}": one.read_bytes() for one in sorted(folder.iterdir())}
         files |= _binaries(agent, fmi_version, folder, names)
-    units = agent.units
-    files["modelDescription.xml"] = model_description(agent, fmi_version, token, units)
+    files["modelDescription.xml"] = model_description(agent, fmi_version, token)
     _write_archive(file, files)
     return file
 
@@ -93,7 +91,7 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="ascii", newline="\n")
     for name in _HEADERS[fmi_version]:
-        shutil.copy(header_folder() / name, folder / name)
+        shutil.copy(Path(fmpy.__file__).parent / "c-code" / name, folder / name)
     return token
 
 

@@ -9,7 +9,7 @@ what the agent remembers.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -110,11 +110,11 @@ class Logic:
     time_step: float
 
     @property
-    def needed(self) -> frozenset[int]:
+    def needed(self) -> set[int]:
         """The nodes that one sample computes."""
         updates = (node for kept in self.kept for node in kept.updates)
         roots = [*self.features, *self.input_nodes, *updates]
-        return _closure(self.graph, roots, self.loads)
+        return set(self.graph.needed(roots, self.loads))
 
 
 def logic_of(
@@ -257,7 +257,7 @@ class _ControllerTracer(Tracer):
             self._contents = Contents(env)
             found.append(self._call("_get_inputs", self._input_nodes))
         are_chosen = (
-            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in _closure(self._graph, [node]))
+            any(_is_row(self._graph.nodes[n], _ANY_ACTION) for n in self._graph.needed([node]))
             for node in found[0]
         )
         return tuple(are_chosen), tuple(found[1])
@@ -299,10 +299,10 @@ class _Assembly:
     def logic(self) -> Logic:
         """Find all that the features and the inputs depend on, from sample to sample."""
         roots = [*self._traced.features, *(node for _, node in self._inputs)]
-        needed = self._closure(roots)
+        needed = set(self._graph.needed(roots, self._external))
         while True:
             found = [*roots, *self._next_values(needed)]
-            longer = self._closure(found)
+            longer = set(self._graph.needed(found, self._external))
             if longer == needed:
                 break
             needed = longer
@@ -326,9 +326,6 @@ class _Assembly:
             tuple(self._parameters),
             env.inside.interface.time_step,
         )
-
-    def _closure(self, roots: Iterable[int]) -> frozenset[int]:
-        return _closure(self._graph, roots, self._external)
 
     def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:
         return (self._graph.nodes[number] for number in sorted(needed))
@@ -366,7 +363,7 @@ class _Assembly:
 
     # What is kept.
 
-    def _add_fields(self, needed: frozenset[int], places: list[int]) -> None:
+    def _add_fields(self, needed: set[int], places: list[int]) -> None:
         nodes = list(self._nodes(needed))
         if any(_is_row(node, "kept") for node in nodes):
             outputs = [self._output_node(place) for place in places]
@@ -471,15 +468,3 @@ class _Assembly:
 def _is_row(node: Node, kind: str) -> bool:
     what: Any = node.what
     return node.kind == "row" and what[0] == kind
-
-
-def _closure(graph: Graph, roots: Iterable[int], known: Container[int] = ()) -> frozenset[int]:
-    """Some nodes, and all that they are computed from, as far as they are not known."""
-    found: set[int] = set()
-    waiting = list(roots)
-    while waiting:
-        number = waiting.pop()
-        if number not in found:
-            found.add(number)
-            waiting.extend(() if number in known else graph.nodes[number].operands)
-    return frozenset(found)

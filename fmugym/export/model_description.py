@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 from xml.etree import ElementTree
@@ -31,6 +31,7 @@ _KINDS: Final[Mapping[str, str]] = {
 }
 """Types of FMI 2.0 and 3.0, and their letters in the C sources."""
 
+_FLOATS: Final = ("Real", "Float64", "Float32")
 _OF_FMI_2: Final = {"real": "Real", "boolean": "Boolean"}
 _OF_FMI_3: Final = {"Real": "Float64", "Integer": "Int32", "Enumeration": "Int64"}
 
@@ -86,32 +87,33 @@ def _port(variable: Variable, causality: str, fmi_version: str, start: float | N
         kind = _OF_FMI_2.get(variable.kind, "Integer")
     else:
         kind = _OF_FMI_3.get(variable.type, variable.type)
-    is_continuous = kind in {"Real", "Float64", "Float32"} and causality == "input"
+    is_continuous = kind in _FLOATS and causality == "input"
     variability = "continuous" if is_continuous else "discrete"
     return Port(variable.name, causality, variability, kind, start, variable)
 
 
-def model_description(
-    agent: Agent, fmi_version: str, token: str, units: Mapping[str, Unit]
-) -> bytes:
+def model_description(agent: Agent, fmi_version: str, token: str) -> bytes:
     """Write a model description.
 
     Args:
         agent: The agent.
         fmi_version: ``"2.0"`` or ``"3.0"``.
         token: The GUID or instantiation token.
-        units: The units of the plant.
     """
     ports = ports_of(agent, fmi_version)
-    writer = _Writer2() if fmi_version == "2.0" else _Writer3()
+    writer: _Writer2 | _Writer3 = _Writer2() if fmi_version == "2.0" else _Writer3()
     root = writer.root(agent, token)
-    _add_units(root, ports, units)
+    _add_units(root, ports, agent.units)
     categories = ElementTree.SubElement(root, "LogCategories")
     ElementTree.SubElement(categories, "Category", name="logStatusError")
     step = repr(agent.logic.time_step)
     ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
-    writer.add_variables(ElementTree.SubElement(root, "ModelVariables"), ports)
-    writer.add_structure(ElementTree.SubElement(root, "ModelStructure"), ports)
+    time = Port("time", "independent", "continuous", writer.number, None, None)
+    variables = ElementTree.SubElement(root, "ModelVariables")
+    for reference, port in enumerate([time, *ports]):
+        writer.add_variable(variables, port, _facts(port, reference))
+    outputs = [number for number, port in enumerate(ports, 1) if port.causality == "output"]
+    writer.add_structure(ElementTree.SubElement(root, "ModelStructure"), outputs)
     ElementTree.indent(root)
     text = ElementTree.tostring(root, "unicode")
     return f'<?xml version="1.0" encoding="UTF-8"?>\n{text}\n'.encode()
@@ -135,60 +137,22 @@ def _add_units(root: Any, ports: Sequence[Port], units: Mapping[str, Unit]) -> N
         ElementTree.SubElement(element, "BaseUnit", facts)
 
 
-class _Writer2:
-    """FMI 2.0."""
+class _Writer:
+    """What both FMI versions have."""
+
+    version: str
+    number: str
+    """The type of numbers."""
+    token: str
+    """What the token is called."""
+    state: str
+    """How the names of functions for states end."""
 
     def root(self, agent: Agent, token: str) -> Any:
         facts = {
-            "fmiVersion": "2.0",
+            "fmiVersion": self.version,
             "modelName": agent.name,
-            "guid": token,
-            "description": agent.notes[0] if agent.notes else "",
-            "generationTool": f"fmugym {agent.version}",
-            "variableNamingConvention": "flat",
-            "numberOfEventIndicators": "0",
-        }
-        root = ElementTree.Element("fmiModelDescription", facts)
-        abilities = {
-            "modelIdentifier": agent.name,
-            "canHandleVariableCommunicationStepSize": "true",
-            "canNotUseMemoryManagementFunctions": "true",
-            "canGetAndSetFMUstate": "true",
-            "canSerializeFMUstate": "true",
-        }
-        interface = ElementTree.SubElement(root, "CoSimulation", abilities)
-        files = ElementTree.SubElement(interface, "SourceFiles")
-        for name in (f"{agent.name}.c", "fmi2.c"):
-            ElementTree.SubElement(files, "File", name=name)
-        return root
-
-    def add_variables(self, section: Any, ports: Sequence[Port]) -> None:
-        clock = {"name": "time", "valueReference": "0", "causality": "independent"}
-        first = ElementTree.SubElement(
-            section, "ScalarVariable", {**clock, "variability": "continuous"}
-        )
-        ElementTree.SubElement(first, "Real")
-        for reference, port in enumerate(ports, 1):
-            facts = _facts(port, reference)
-            element = ElementTree.SubElement(section, "ScalarVariable", facts)
-            ElementTree.SubElement(element, port.type, _of_type(port))
-
-    def add_structure(self, section: Any, ports: Sequence[Port]) -> None:
-        for name in ("Outputs", "InitialUnknowns"):
-            group = ElementTree.SubElement(section, name)
-            for index in _outputs(ports):  # the time is the first variable
-                facts = {"index": str(index + 1)} | _dependencies(name)
-                ElementTree.SubElement(group, "Unknown", facts)
-
-
-class _Writer3:
-    """FMI 3.0."""
-
-    def root(self, agent: Agent, token: str) -> Any:
-        facts = {
-            "fmiVersion": "3.0",
-            "modelName": agent.name,
-            "instantiationToken": token,
+            self.token: token,
             "description": agent.notes[0] if agent.notes else "",
             "generationTool": f"fmugym {agent.version}",
             "variableNamingConvention": "flat",
@@ -197,22 +161,50 @@ class _Writer3:
         abilities = {
             "modelIdentifier": agent.name,
             "canHandleVariableCommunicationStepSize": "true",
-            "canGetAndSetFMUState": "true",
-            "canSerializeFMUState": "true",
+            f"canGetAndSet{self.state}": "true",
+            f"canSerialize{self.state}": "true",
         }
         ElementTree.SubElement(root, "CoSimulation", abilities)
         return root
 
-    def add_variables(self, section: Any, ports: Sequence[Port]) -> None:
-        clock = {"name": "time", "valueReference": "0", "causality": "independent"}
-        ElementTree.SubElement(section, "Float64", {**clock, "variability": "continuous"})
-        for reference, port in enumerate(ports, 1):
-            facts = _facts(port, reference) | _of_type(port)
-            ElementTree.SubElement(section, port.type, facts)
 
-    def add_structure(self, section: Any, ports: Sequence[Port]) -> None:
+class _Writer2(_Writer):
+    """FMI 2.0."""
+
+    version, number, token, state = "2.0", "Real", "guid", "FMUstate"
+
+    def root(self, agent: Agent, token: str) -> Any:
+        root = super().root(agent, token)
+        root.set("numberOfEventIndicators", "0")
+        root[0].set("canNotUseMemoryManagementFunctions", "true")
+        files = ElementTree.SubElement(root[0], "SourceFiles")
+        for name in (f"{agent.name}.c", "fmi2.c"):
+            ElementTree.SubElement(files, "File", name=name)
+        return root
+
+    def add_variable(self, section: Any, port: Port, facts: dict[str, str]) -> None:
+        element = ElementTree.SubElement(section, "ScalarVariable", facts)
+        ElementTree.SubElement(element, port.type, _of_type(port))
+
+    def add_structure(self, section: Any, outputs: Sequence[int]) -> None:
+        for name in ("Outputs", "InitialUnknowns"):
+            group = ElementTree.SubElement(section, name)
+            for number in outputs:  # the time is the first variable
+                facts = {"index": str(number + 1)} | _dependencies(name)
+                ElementTree.SubElement(group, "Unknown", facts)
+
+
+class _Writer3(_Writer):
+    """FMI 3.0."""
+
+    version, number, token, state = "3.0", "Float64", "instantiationToken", "FMUState"
+
+    def add_variable(self, section: Any, port: Port, facts: dict[str, str]) -> None:
+        ElementTree.SubElement(section, port.type, facts | _of_type(port))
+
+    def add_structure(self, section: Any, outputs: Sequence[int]) -> None:
         for name in ("Output", "InitialUnknown"):
-            for reference in _outputs(ports):
+            for reference in outputs:
                 facts = {"valueReference": str(reference)} | _dependencies(name)
                 ElementTree.SubElement(section, name, facts)
 
@@ -220,11 +212,6 @@ class _Writer3:
 def _dependencies(section: str) -> dict[str, str]:
     """Outputs depend on all inputs in the initialization, and on none between two steps."""
     return {} if section.startswith("Initial") else {"dependencies": ""}
-
-
-def _outputs(ports: Sequence[Port]) -> Iterator[int]:
-    """The value references of the outputs."""
-    return (number for number, port in enumerate(ports, 1) if port.causality == "output")
 
 
 def _facts(port: Port, reference: int) -> dict[str, str]:
@@ -249,7 +236,7 @@ def _of_type(port: Port) -> dict[str, str]:
     low, high = port.variable.minimum, port.variable.maximum
     limits = {"min": low, "max": high} if low < high else {}
     facts |= {k: _written(v, port.type) for k, v in limits.items() if math.isfinite(v)}
-    if port.type in {"Real", "Float64", "Float32"} and port.variable.unit:
+    if port.type in _FLOATS and port.variable.unit:
         facts["unit"] = port.variable.unit
     return facts
 
@@ -257,4 +244,4 @@ def _of_type(port: Port) -> dict[str, str]:
 def _written(value: float, kind: str) -> str:
     if kind == "Boolean":
         return "true" if value else "false"
-    return repr(float(value)) if kind in {"Real", "Float64", "Float32"} else str(int(value))
+    return repr(float(value)) if kind in _FLOATS else str(int(value))

@@ -1,12 +1,17 @@
-"""Names of C for the names of variables."""
+"""Names of C for the names of variables, and names of new files."""
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final
 
-__all__ = ["identifier", "identifiers"]
+from fmugym.checks import check_path
+from fmugym.errors import ConfigError, shown
+
+__all__ = ["identifier", "identifiers", "new_file"]
 
 _WORDS: Final = """
 alignas alignof and and_eq asm auto bitand bitor bool break case catch char class compl
@@ -37,3 +42,18 @@ def identifiers(texts: Iterable[str]) -> list[str]:
             name, number = f"{identifier(text)}_{number}", number + 1
         found.append(name)
     return found
+
+
+def new_file(path: str | os.PathLike[str]) -> Path:
+    """Check the path of a file to write.
+
+    Raises:
+        ConfigError: If it is no path, or its folder does not exist.
+        FileExistsError: If the file exists.
+    """
+    file = check_path("path", path)
+    if not file.parent.is_dir():
+        raise ConfigError(f"{shown(str(file.parent))} is no folder")
+    if file.exists():
+        raise FileExistsError(f"{file} exists")
+    return file

@@ -132,11 +132,6 @@ class Network:
             )
 
     @property
-    def c_type(self) -> str:
-        """The type of its numbers in C."""
-        return "float" if self.dtype == np.float32 else "double"
-
-    @property
     def width(self) -> int:
         """How many values it takes."""
         return int(self.layers[0].weights.shape[1])

@@ -11,13 +11,14 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.checks import check_path
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError
 from fmugym.export.c99 import field_names
 from fmugym.export.exportable import Agent
+from fmugym.export.names import new_file
 from fmugym.export.network import Activation, Network, Scaling
-from fmugym.export.onnx_nodes import Nodes, imported_onnx
+from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import computed, interpolated
+from fmugym.extras import imported
 from fmugym.vector.hooks.graph import Node
 
 __all__ = ["onnx_model", "write_onnx"]
@@ -51,12 +52,8 @@ def write_onnx(agent: Agent, path: str | os.PathLike[str]) -> Path:
             cannot be written in ONNX.
         FileExistsError: If the file exists.
     """
-    file = check_path("path", path)
-    if not file.parent.is_dir():
-        raise ConfigError(f"{shown(str(file.parent))} is no folder")
-    content = onnx_model(agent).SerializeToString()
-    with file.open("xb") as stream:
-        stream.write(content)
+    file = new_file(path)
+    file.write_bytes(onnx_model(agent).SerializeToString())
     return file
 
 
@@ -70,7 +67,7 @@ class _Model:
 
     def __init__(self, agent: Agent) -> None:
         self._agent, self._logic, self._graph = agent, agent.logic, agent.logic.graph
-        self._onnx, self._nodes = imported_onnx(), Nodes()
+        self._onnx, self._nodes = imported("onnx", "onnx"), Nodes()
         self._fields = field_names(agent)
         self._names: dict[int, str] = {}
         self._given: list[str] = []
@@ -142,15 +139,8 @@ class _Model:
     # The program around the network. A value has the shape (N,), a constant none.
 
     def _evaluate(self, numbers: Iterable[int]) -> None:
-        closure: set[int] = set()
-        waiting = list(numbers)
-        while waiting:
-            number = waiting.pop()
-            if number not in closure and number not in self._names:
-                closure.add(number)
-                if number not in self._logic.loads:
-                    waiting.extend(self._graph.nodes[number].operands)
-        for number in sorted(closure):
+        needed = set(self._graph.needed(numbers, self._logic.loads))
+        for number in sorted(needed - self._names.keys()):
             self._names[number] = self._expression(number, self._graph.nodes[number])
 
     def _expression(self, number: int, node: Node) -> str:
@@ -159,8 +149,7 @@ class _Model:
         operands, what, nodes = [self._names[one] for one in node.operands], node.what, self._nodes
         match node.kind:
             case "constant":
-                bits: Any = what
-                return nodes.constant(np.frombuffer(bits, node.dtype)[0], node.dtype)
+                return nodes.constant(node.number, node.dtype)
             case "ufunc":
                 return computed(nodes, what, operands, self._graph.nodes[node.operands[0]].dtype)
             case "cast":

@@ -9,16 +9,7 @@ import numpy.typing as npt
 
 from fmugym.extras import imported
 
-__all__ = ["Nodes", "imported_onnx"]
-
-
-def imported_onnx() -> Any:
-    """Import the package onnx.
-
-    Raises:
-        ConfigError: If it is missing.
-    """
-    return imported("onnx", "onnx")
+__all__ = ["Nodes"]
 
 
 class Nodes:
@@ -30,7 +21,7 @@ class Nodes:
     """
 
     def __init__(self) -> None:
-        self._onnx = imported_onnx()
+        self._onnx = imported("onnx", "onnx")
         self.nodes: list[Any] = []
         self.tensors: list[Any] = []
         self._known: dict[Any, str] = {}

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.errors import ConfigError
-from fmugym.export.network import Layer, Network, Scaling, network_of
+from fmugym.export.network import Activation, Layer, Network, Scaling, network_of
 
 __all__ = ["network_of_model"]
 
@@ -74,8 +74,6 @@ def _of_sac(policy: Any) -> Network:
 
 
 def _squashed(network: Network) -> Network:
-    from fmugym.export.network import Activation
-
     *others, last = network.layers
     last = replace(last, activations=(*last.activations, Activation("tanh")))
     return replace(network, layers=(*others, last))
@@ -156,7 +154,7 @@ def _require_same(model: Any, normalization: Any, network: Network) -> None:
         observation = _sample(space, rng)
         seen = observation if normalization is None else normalization.normalize_obs(observation)
         wanted = np.ravel(model.predict(seen, deterministic=True)[0])
-        flat = _flat_observation(observation, space)
+        flat: Any = spaces.flatten(space, observation)
         own = network.action(flat)
         if isinstance(network.space, spaces.Box):
             size = np.ravel(network.space.high - network.space.low)
@@ -185,9 +183,3 @@ def _sample(space: spaces.Space[Any], rng: np.random.Generator) -> Any:
             f"a policy that observes {space} cannot be exported; a Box can be, or a Dict"
         )
     return rng.normal(size=space.shape).astype(space.dtype)
-
-
-def _flat_observation(observation: Any, space: spaces.Space[Any]) -> npt.NDArray[Any]:
-    if not isinstance(space, spaces.Dict):
-        return np.ravel(observation)
-    return np.concatenate([np.ravel(observation[name]) for name in space.spaces])

@@ -18,53 +18,32 @@ import numpy as np
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.checks import check_flag, check_integer, check_mapping, check_number, check_text
 from fmugym.distributions import Normal
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.problem import Experiment, Limits, Problem
-from fmugym.identification.statistics import confidence_intervals, normal_distributions
+from fmugym.identification.statistics import Estimate, normal_distributions
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.pool.base import FloatArray
-from fmugym.signals import ordinary
 
 __all__ = ["FitResult", "fit_parameters"]
 
 
 @dataclass(frozen=True, eq=False)
-class FitResult:
-    """The result of ``fit_parameters``.
+class FitResult(Estimate):
+    """The result of ``fit_parameters``; the values are in the form of ``model_parameters``.
 
     Attributes:
-        values: The fitted values by name, in the form of ``model_parameters``.
-        standard_errors: Standard errors by name, in the units of the values; infinite for a value
-            that the data do not determine.
-        covariance: Covariance of the values, in their order, shape (k, k).
         bounds: Lower and upper bound of each value by name.
-        degrees_of_freedom: Degrees of freedom of the confidence intervals.
         comparison: The fitted trajectories and their simulation.
         converged: Whether the optimization converged within its limit of evaluations.
         message: Why the optimization ended.
     """
 
-    values: dict[str, float]
-    standard_errors: dict[str, float]
-    covariance: FloatArray
     bounds: dict[str, tuple[float, float]]
-    degrees_of_freedom: int
     comparison: Comparison
     converged: bool
     message: str
     experiment: Experiment
     """The settings, which predictions need."""
-
-    def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return lower and upper end by name; they may exceed the bounds.
-
-        Raises:
-            ConfigError: If the level is not between 0 and 1.
-        """
-        return confidence_intervals(
-            self.values, self.standard_errors, self.degrees_of_freedom, level
-        )
 
     def distributions(self) -> dict[str, Normal]:
         """Return each value as a normal distribution, truncated at its bounds.
@@ -195,7 +174,7 @@ def fit_parameters(
     if not wanted:
         raise ConfigError("there is no parameter to fit")
     experiment = Experiment(
-        _opened(fmu),
+        FMU.of(fmu),
         _mapping("initial_states", initial_states),
         _mapping("fixed", fixed),
         _mapping("scales", scales),
@@ -210,15 +189,6 @@ def fit_parameters(
         return _result(experiment, problem, problem.solve(max_evaluations), clustered)
 
 
-def _opened(fmu: Any) -> FMU:
-    if not isinstance(fmu, FMU | StandsForFMU):
-        try:
-            fmu = check_text("fmu", os.fspath(fmu))
-        except ordinary(Exception):  # a path may be any object
-            raise ConfigError(f"fmu must be a path or an FMU, not {shown(fmu)}") from None
-    return FMU.of(fmu)
-
-
 def _mapping(what: str, value: Any) -> dict[Any, Any]:
     return {} if value is None else check_mapping(what, value)
 
@@ -226,10 +196,8 @@ def _mapping(what: str, value: Any) -> dict[Any, Any]:
 def _result(experiment: Experiment, problem: Problem, solution: Any, clustered: bool) -> FitResult:
     """Collect the results of the optimization."""
     covariance, freedom = problem.covariance(solution, clustered)
-    names = list(problem.bounds)
     return FitResult(
-        values=dict(zip(names, solution.x.tolist(), strict=True)),
-        standard_errors=dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True)),
+        values=dict(zip(problem.bounds, solution.x.tolist(), strict=True)),
         covariance=covariance,
         bounds=problem.bounds,
         degrees_of_freedom=freedom,

@@ -19,11 +19,11 @@ from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, check_text, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
 from fmugym.identification.simulator import Simulator
 from fmugym.identification.statistics import information_inverse
 from fmugym.identification.trajectory import Trajectory, common_names
-from fmugym.lazy import scipy_module
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Experiment", "Limits", "Problem"]
@@ -159,7 +159,7 @@ class Problem:
         """Minimize the residuals, and return SciPy's result."""
         self.compare(self.start, refit=False)  # fails early with the FMU's reason
         count = len(self.start)
-        return scipy_module("optimize").least_squares(
+        return imported("scipy.optimize", "identification").least_squares(
             self._residuals,
             self.start,
             jac=self._jacobian,

@@ -8,13 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
 from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.task.starting import checked_value
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Simulator"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,12 +11,12 @@ import numpy as np
 from fmugym.checks import check_number
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError
-from fmugym.lazy import scipy_module
+from fmugym.extras import imported
 from fmugym.pool.base import FloatArray, MaskArray
 
 __all__ = [
+    "Estimate",
     "Inverse",
-    "confidence_intervals",
     "information_inverse",
     "newey_west",
     "normal_distributions",
@@ -72,28 +73,50 @@ def newey_west(scores: Sequence[FloatArray], lags: int) -> FloatArray:
     return np.asarray(total)
 
 
-def confidence_intervals(
-    values: Mapping[str, float], errors: Mapping[str, float], freedom: int, level: float
-) -> dict[str, tuple[float, float]]:
-    """Compute intervals from Student's t distribution.
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Estimated values and their uncertainty.
 
-    Args:
-        values: Estimates by name.
-        errors: Standard errors by name.
-        freedom: Degrees of freedom.
-        level: Probability that an interval covers the true value, between 0 and 1.
-
-    Returns:
-        Lower and upper end by name.
-
-    Raises:
-        ConfigError: If the level is not between 0 and 1.
+    Attributes:
+        values: The values by name.
+        covariance: Covariance of the values, in their order, shape (k, k).
+        degrees_of_freedom: Degrees of freedom of the confidence intervals.
     """
-    level = check_number("level", level, positive=True)
-    if level >= 1.0:
-        raise ConfigError(f"level must be less than 1, not {level:g}")
-    factor = float(scipy_module("stats").t.ppf(0.5 + level / 2, freedom))
-    return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in values.items()}
+
+    values: dict[str, float]
+    covariance: FloatArray
+    degrees_of_freedom: int
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors by name; infinite for a value that the data do not determine."""
+        errors = np.sqrt(np.diag(self.covariance)).tolist()
+        return dict(zip(self.values, errors, strict=True))
+
+    def factor(self, level: float) -> float:
+        """Half the width of an interval in standard errors, by Student's t distribution.
+
+        Args:
+            level: Probability that an interval covers the true value, between 0 and 1.
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
+        level = check_number("level", level, positive=True)
+        if level >= 1.0:
+            raise ConfigError(f"level must be less than 1, not {level:g}")
+        freedom = self.degrees_of_freedom
+        student = imported("scipy.stats", "identification").t
+        return float(student.ppf(0.5 + level / 2, freedom))
+
+    def confidence_intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return lower and upper end by name; they may exceed the bounds.
+
+        Raises:
+            ConfigError: If the level is not between 0 and 1.
+        """
+        factor, errors = self.factor(level), self.standard_errors
+        return {n: (v - factor * errors[n], v + factor * errors[n]) for n, v in self.values.items()}
 
 
 def normal_distributions(

@@ -13,12 +13,12 @@ from fmugym.checks import check_flag, check_number, float_or_nan
 from fmugym.distributions import Normal
 from fmugym.errors import ConfigError, shown
 from fmugym.identification.statistics import (
-    confidence_intervals,
+    Estimate,
     information_inverse,
     newey_west,
     normal_distributions,
 )
-from fmugym.identification.trajectory import float_array, is_repeat
+from fmugym.identification.trajectory import Trajectory, float_array
 from fmugym.pool.base import FloatArray
 from fmugym.signals import ordinary
 
@@ -28,22 +28,16 @@ Signals = npt.ArrayLike | Sequence[npt.ArrayLike]
 
 
 @dataclass(frozen=True, eq=False)
-class SwingFit:
+class SwingFit(Estimate):
     """The result of ``fit_swing``.
 
+    The values are ``p1`` [1/s], ``p2`` [1/s^2] and, with Coulomb friction, ``p3`` [rad/s^2].
+
     Attributes:
-        values: ``p1`` [1/s], ``p2`` [1/s^2] and, with Coulomb friction, ``p3`` [rad/s^2].
-        standard_errors: Standard errors by name, in the units of the values.
-        covariance: Covariance of the values, in their order, shape (k, k).
-        degrees_of_freedom: Number of samples minus number of values.
         rms: Root mean square of the residuals of the acceleration, in rad/s^2.
         g: Acceleration due to gravity, in m/s^2.
     """
 
-    values: dict[str, float]
-    standard_errors: dict[str, float]
-    covariance: FloatArray
-    degrees_of_freedom: int
     rms: float
     g: float
 
@@ -58,10 +52,8 @@ class SwingFit:
         Raises:
             ConfigError: If the level is not between 0 and 1.
         """
-        values = {**self.values, "l": self.l}
-        error = self.l / self.values["p2"] * self.standard_errors["p2"]
-        errors = {**self.standard_errors, "l": abs(error)}
-        return confidence_intervals(values, errors, self.degrees_of_freedom, level)
+        half = abs(self.l / self.values["p2"] * self.standard_errors["p2"]) * self.factor(level)
+        return super().confidence_intervals(level) | {"l": (self.l - half, self.l + half)}
 
     def parameters(self, mass: float) -> dict[str, float]:
         """Convert to parameters of the bundled pendulum, a point mass with I = m l^2.
@@ -150,7 +142,7 @@ def fit_swing(
     coulomb, g = check_flag("coulomb", coulomb), check_number("g", g, positive=True)
     v_c = check_number("v_c", v_c, positive=True)
     correlation_time = check_number("correlation_time", correlation_time, 0.0)
-    swings = [_regression(*swing, coulomb, v_c) for swing in _swings(time, q, q_dot)]
+    swings = [_regression(swing, coulomb, v_c) for swing in _swings(time, q, q_dot)]
     regressors = np.concatenate([x for x, _, _ in swings])
     inverse = information_inverse(regressors)
     names = ["p1", "p2", "p3"][: regressors.shape[1]]
@@ -161,67 +153,51 @@ def fit_swing(
     scores = [x * r[:, np.newaxis] for (x, _, _), r in zip(swings, residuals, strict=True)]
     lags = min(round(correlation_time / swings[0][2]), max(map(len, scores)) // 2)
     covariance = inverse.matrix @ newey_west(scores, lags) @ inverse.matrix
-    return _result(names, estimate, covariance, np.concatenate(residuals), g)
-
-
-def _result(
-    names: list[str], estimate: FloatArray, covariance: FloatArray, residual: FloatArray, g: float
-) -> SwingFit:
-    errors = np.sqrt(np.diag(covariance)).tolist()
+    residual = np.concatenate(residuals)
     return SwingFit(
-        values=dict(zip(names, estimate.tolist(), strict=True)),
-        standard_errors=dict(zip(names, errors, strict=True)),
-        covariance=covariance,
-        degrees_of_freedom=len(residual) - len(names),
+        dict(zip(names, estimate.tolist(), strict=True)),
+        covariance,
+        len(residual) - len(names),
         rms=float(np.sqrt(np.mean(residual**2))),
         g=g,
     )
 
 
-def _swings(
-    time: float | Signals, q: Signals, q_dot: Signals
-) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """Return time, angles and velocities of each swing, without stale samples."""
-    angles, velocities = _rows("q", q), _rows("q_dot", q_dot)
+def _swings(time: float | Signals, q: Signals, q_dot: Signals) -> list[Trajectory]:
+    """Return each swing without stale samples."""
+    angles, velocities = _several("q", q), _several("q_dot", q_dot)
     if np.isnan(interval := float_or_nan(time)):
-        times = _rows("time", time)
+        times = _several("time", time)
     else:
         period = check_number("time", interval, positive=True)
-        times = [np.arange(len(angle), dtype=np.float64) * period for angle in angles]
+        times = [np.arange(angle.size, dtype=np.float64) * period for angle in angles]
     if len(times) == 1:
         times *= len(angles)
-    shapes = [[array.shape for array in arrays] for arrays in (times, angles, velocities)]
-    if not shapes[0] == shapes[1] == shapes[2]:
-        raise ConfigError(f"time, q and q_dot must have the same shapes, got {shapes}")
+    counts = [len(arrays) for arrays in (times, angles, velocities)]
+    if len(set(counts)) > 1:
+        raise ConfigError(f"time, q and q_dot must be of the same swings, got {counts} of them")
     together = zip(times, angles, velocities, strict=True)
-    return [_fresh(np.stack(swing)) for swing in together]
+    swings = [Trajectory(t, {"q": x, "q_dot": v}).without_repeats() for t, x, v in together]
+    if min(map(len, swings)) < 3:
+        raise ConfigError("a swing needs at least three samples")
+    return swings
 
 
-def _fresh(swing: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    time, q, q_dot = swing[:, ~is_repeat(swing[1:])]
-    if len(time) < 3 or not (np.diff(time) > 0).all():
-        raise ConfigError("a swing needs at least three samples, at increasing times")
-    return time, q, q_dot
-
-
-def _rows(what: str, signals: Any) -> list[FloatArray]:
+def _several(what: str, signals: Any) -> list[FloatArray]:
     """Return one array for each swing."""
     try:
         several = len(signals) > 0 and all(np.ndim(row) == 1 for row in signals)
         rows = list(signals) if several else [signals]
     except ordinary(Exception):  # objects may do anything when numpy looks at them
         raise ConfigError(f"{what} must be an array or a list, not {shown(signals)}") from None
-    arrays = [float_array(what, row) for row in rows]
-    for array in arrays:
-        if array.ndim != 1 or len(array) < 3:
-            raise ConfigError(f"{what}: a swing needs three samples, not shape {array.shape}")
-    return arrays
+    return [float_array(what, row) for row in rows]
 
 
 def _regression(
-    time: FloatArray, q: FloatArray, q_dot: FloatArray, coulomb: bool, v_c: float
+    swing: Trajectory, coulomb: bool, v_c: float
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the regressors, the accelerations, and the sampling interval in s of one swing."""
+    time, q, q_dot = swing.time, swing.outputs["q"], swing.outputs["q_dot"]
     velocity = q_dot[1:-1]
     columns = [-velocity, -np.sin(q[1:-1])]
     if coulomb:

@@ -15,10 +15,8 @@ To run a program for the real lab here, change its import::
 delay, and ``Lab(clock=ManualClock())`` has a clock that the program moves.
 """
 
-from fmugym.lab.client import Client
-from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
-from fmugym.lab.lab import Lab, current_lab
-from fmugym.lab.lab_error import LabError
+from fmugym.lab.client import Client, Lab, current_lab
+from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, LabError, UserInfo
 from fmugym.lab.presets import HARDWARE, IDEAL, Options
 from fmugym.lab.users import User
 from fmugym.pool.backend.clocks import Clock, ManualClock, RealClock

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from typing import Final, TypeVar
 
 from fmugym.lab.cell import Cell
-from fmugym.lab.data import CellType
-from fmugym.lab.lab_error import LabError
-from fmugym.lab.request_checks import Request
+from fmugym.lab.data import CellType, LabError
+from fmugym.lab.request_checks import Request, text_of
 from fmugym.lab.sessions import Gym, Session
 
 __all__ = ["Bookings", "new_token"]
@@ -52,9 +51,9 @@ class Bookings:
             kind: "gym", "experiment", "episode", or "session" for both of the latter.
 
         Raises:
-            LabError: If the token is unknown or stands for something else.
+            LabError: If the token is no text, is unknown, or stands for something else.
         """
-        owner = self.get(token)
+        owner = self.get(text_of(kind, token))
         if owner is None:
             raise LabError(f"this {kind} token is not valid: it is unknown or has long expired")
         if not isinstance(owner, owner_type) or kind not in (owner.kind, "session"):

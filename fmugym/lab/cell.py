@@ -13,20 +13,20 @@ import numpy as np
 
 from fmugym.archive.bundled import bundled_fmu
 from fmugym.archive.fmu import FMU
+from fmugym.archive.variable import checked_value
 from fmugym.checks import check_mapping
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.lab.data import CellType
+from fmugym.lab.data import CellType, LabError
 from fmugym.lab.disturbance import Acting, Disturbance
 from fmugym.lab.drive import HOLD_DAMPING, Drive
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
-from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
 from fmugym.lab.sensors import Sensors
-from fmugym.lab.video_files import Recording
+from fmugym.lab.videos import Recording
 from fmugym.pool import Pool, PoolSpec
 from fmugym.signals import ordinary
-from fmugym.task.starting import checked_value, start_variable
+from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 
 __all__ = ["Cell", "checked_parameters"]
@@ -50,6 +50,7 @@ class Cell:
     Attributes:
         cell_id: The cell's number.
         cell_type: The cell's type.
+        options: What is simulated.
         plant: Its FMU and the names of the variables.
         position: True angles, in rad.
         velocity: True angular velocities, in rad/s.
@@ -69,7 +70,7 @@ class Cell:
     ) -> None:
         self.cell_id, self.cell_type = cell_id, cell_type
         self.plant = PLANTS[cell_type]
-        self._options = options
+        self.options = options
         self._parameters = dict(self.plant.parameters)
         if self.plant.coulomb_friction is not None:
             friction = float(rng.uniform(*options.coulomb_friction))
@@ -86,7 +87,7 @@ class Cell:
         joints = self.plant.joints
         self.position, self.velocity = [0.0] * joints, [0.0] * joints
         self.torque = [0.0] * joints
-        self.drive = Drive(self._options, [True] * joints)
+        self.drive = Drive(self.options, [True] * joints)
         self.fault: str | None = None
         self.recording: Recording | None = None
         self._steps = 0
@@ -114,11 +115,11 @@ class Cell:
         spec = EXPERIMENTS[experiment]
         with self._simulating:
             self._reset(position, spec.parameters)
-            if math.isfinite(self._options.hold_stiffness):
+            if math.isfinite(self.options.hold_stiffness):
                 self._hold(position)
         self.velocity = [0.0] * self.plant.joints
         self.torque = [0.0] * self.plant.joints
-        self.drive = Drive(self._options, spec.driven)
+        self.drive = Drive(self.options, spec.driven)
         self._disturbances = [Acting(each) for each in disturbances]
         self.recording = recording
         self.sensors.restart(self.position)
@@ -130,7 +131,7 @@ class Cell:
         Args:
             elapsed: Time since the start, in s.
         """
-        goal = math.floor(elapsed / self._options.drive_step + 1e-6)
+        goal = math.floor(elapsed / self.options.drive_step + 1e-6)
         with self._simulating:
             while self._steps < goal and self.fault is None:
                 self._step()
@@ -138,7 +139,7 @@ class Cell:
     @property
     def time(self) -> float:
         """Simulated time of the session, in s."""
-        return self._steps * self._options.drive_step
+        return self._steps * self.options.drive_step
 
     def close(self) -> None:
         """Free the instance for good; a second call does nothing."""
@@ -156,7 +157,7 @@ class Cell:
             spec = PoolSpec(
                 inputs=tuple(map(fmu.variable, self.plant.torques)),
                 outputs=tuple(map(fmu.variable, self.plant.positions + self.plant.velocities)),
-                time_step=self._options.drive_step,
+                time_step=self.options.drive_step,
             )
             names = (*self.plant.start_positions, *self._parameters)
             self._start_variables = tuple(map(fmu.variable, names))
@@ -174,11 +175,11 @@ class Cell:
 
     def _hold(self, position: Sequence[float]) -> None:
         """Hold the arm without gravity compensation until it is at rest, so that it sags."""
-        hold = Drive(self._options, [True] * self.plant.joints)
+        hold = Drive(self.options, [True] * self.plant.joints)
         hold.position = list(position)
-        hold.kp = [self._options.hold_stiffness] * self.plant.joints
+        hold.kp = [self.options.hold_stiffness] * self.plant.joints
         hold.kd = [HOLD_DAMPING] * self.plant.joints
-        for step in range(round(_HOLD_TIME / self._options.drive_step)):
+        for step in range(round(_HOLD_TIME / self.options.drive_step)):
             self._push(hold.evaluate(self.position, self.velocity))
             if step % 100 == 99 and max(map(abs, self.velocity)) < _AT_REST:
                 break
@@ -215,7 +216,7 @@ class Cell:
             self.recording.observe(self.time, self.position, self.torque)
 
     def _check_limits(self) -> None:
-        options = self._options
+        options = self.options
         for kind, values, limit in (
             ("Position", self.position, options.position_limit),
             ("Velocity", self.velocity, options.velocity_limit),

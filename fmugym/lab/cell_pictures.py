@@ -25,10 +25,12 @@ from fmugym.rendering._pygame import pygame
 from fmugym.rendering.canvas import direction
 from fmugym.rendering.window import Window
 
-__all__ = ["ArmScene", "CellFrame", "CellPicture", "CellScene", "LiveView"]
+__all__ = ["CellFrame", "CellPicture", "CellScene", "LiveView"]
 
 _THICKNESS: Final = 0.09  # of a link, in lengths of the arm
 _SCALE: Final = 0.15  # N m, for arrows where the torque limit is 0 or infinite
+
+_SIZE: Final = (240, 240)  # of each cell in a live view, in pixels
 
 _drawing = threading.Lock()
 """Only one thread may draw at a time, as pygame's fonts are not thread-safe."""
@@ -51,17 +53,29 @@ class CellFrame:
 
 
 @dataclass(frozen=True)
-class ArmScene:
-    """Two links in series, with the torques at their joints as curved arrows.
+class CellScene:
+    """A cell with its caption: a pendulum, or two links with the torques at their joints.
 
     Args:
+        cell_type: The type of cell.
         torque_limit: The torque whose arrow sweeps 150 degrees, in N m.
     """
 
+    cell_type: CellType
     torque_limit: float
     world = World(-1.5, -1.4, 1.5, 1.75)
 
     def draw(self, canvas: Canvas, frame: CellFrame) -> None:
+        """Draw the arm, and the caption in the upper left corner."""
+        if self.cell_type is CellType.SINGLE:
+            pendulum = PendulumFrame(frame.position[0] - math.pi, frame.torque[0])
+            PendulumScene(self.torque_limit).draw(canvas, pendulum)
+        else:
+            self._draw_links(canvas, frame)
+        height = canvas.size[1]
+        canvas.caption((height // 20, height // 20), frame.caption, height // 12, palette.MUTED)
+
+    def _draw_links(self, canvas: Canvas, frame: CellFrame) -> None:
         """Draw the circle of the tip, the torques and the links."""
         canvas.ring((0.0, 0.0), 1.0, 0.014, palette.FAINT)
         start: Point = (0.0, 0.0)
@@ -83,30 +97,6 @@ class ArmScene:
         canvas.circle(joint, 0.09, palette.INK)
         canvas.circle(tip, 0.09, palette.INK)
         return tip
-
-
-@dataclass(frozen=True)
-class CellScene:
-    """A cell with its caption.
-
-    Args:
-        cell_type: The type of cell.
-        torque_limit: The torque whose arrow sweeps 150 degrees, in N m.
-    """
-
-    cell_type: CellType
-    torque_limit: float
-    world = World(-1.5, -1.4, 1.5, 1.75)
-
-    def draw(self, canvas: Canvas, frame: CellFrame) -> None:
-        """Draw the arm, and the caption in the upper left corner."""
-        if self.cell_type is CellType.SINGLE:
-            pendulum = PendulumFrame(frame.position[0] - math.pi, frame.torque[0])
-            PendulumScene(self.torque_limit).draw(canvas, pendulum)
-        else:
-            ArmScene(self.torque_limit).draw(canvas, frame)
-        height = canvas.size[1]
-        canvas.caption((height // 20, height // 20), frame.caption, height // 12, palette.MUTED)
 
 
 class CellPicture:
@@ -157,20 +147,18 @@ class LiveView:
 
     Args:
         pictures: The picture of each cell, from left to right.
-        height: Height of the picture, in pixels.
     """
 
-    def __init__(self, pictures: Sequence[CellPicture], height: int = 240) -> None:
-        self._pictures, self._height = pictures, height
+    def __init__(self, pictures: Sequence[CellPicture]) -> None:
+        self._pictures = pictures
         self._window: Window | None = None
 
     def draw(
         self, moments: Sequence[tuple[Sequence[float], Sequence[float], float]]
     ) -> npt.NDArray[np.uint8]:
         """Draw the given angles [rad], torques [N m] and time [s] of each cell."""
-        size = (self._height, self._height)
         pairs = zip(self._pictures, moments, strict=True)
-        return np.concatenate([picture.draw(*moment, size) for picture, moment in pairs], axis=1)
+        return np.concatenate([one.draw(*moment, _SIZE) for one, moment in pairs], axis=1)
 
     def show(self, picture: npt.NDArray[np.uint8]) -> None:
         """Show a picture in the window, at most 25 per second."""

@@ -1,20 +1,34 @@
-"""The client: the interface of a program to the lab."""
+"""The lab, and the client: the interface of a program to it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
 
+import numpy as np
+
+from fmugym.checks import check_dict, check_integer
 from fmugym.errors import ConfigError, shown
-from fmugym.lab.current import CURRENT
-from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
+from fmugym.lab.cell import Cell, checked_parameters
+from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, LabError, UserInfo
 from fmugym.lab.disturbance import Disturbance
-from fmugym.lab.lab_error import LabError
+from fmugym.lab.presets import Options, make_options
 from fmugym.lab.request_checks import Request
 from fmugym.lab.service import Service
+from fmugym.lab.sessions import Session
+from fmugym.lab.users import User
+from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.signals import ordinary
 
-__all__ = ["Client"]
+__all__ = ["Client", "Lab", "current_lab"]
+
+_CELLS: Final = {CellType.SINGLE: 4, CellType.DOUBLE: 2}
+_FIRST_ID: Final = {CellType.SINGLE: 101, CellType.DOUBLE: 201}
+_MOST_CELLS: Final = 100  # of a type, so that the numbers of the types do not overlap
+_LARGEST_SEED: Final = 2**128 - 1
 
 Disturbances = str | Disturbance | Sequence[Disturbance] | None
 Reading = float | list[float]
@@ -34,13 +48,13 @@ class Client:
         ConfigError: If the argument is not a lab.
     """
 
-    def __init__(self, lab: Service | None = None) -> None:
-        if lab is not None and not isinstance(lab, Service):
+    def __init__(self, lab: Lab | None = None) -> None:
+        if lab is not None and not isinstance(lab, Lab):
             raise ConfigError(f"a client needs a Lab, not {shown(lab)}")
-        self._lab = CURRENT.get() if lab is None else lab
+        self._lab = current_lab() if lab is None else lab
 
     @property
-    def lab(self) -> Service:
+    def lab(self) -> Lab:
         """The lab that this client uses."""
         return self._lab
 
@@ -172,42 +186,42 @@ class Client:
 
     def get_position(self, token: str) -> Reading:
         """Return the angle in rad: a float for one actuator, a list for two."""
-        return self._lab.read(token, "position")
+        return self._lab.ask(token, Session.read, "position")
 
     def get_velocity(self, token: str) -> Reading:
         """Return the angular velocity in rad/s: a float for one actuator, a list for two."""
-        return self._lab.read(token, "velocity")
+        return self._lab.ask(token, Session.read, "velocity")
 
     def get_torque(self, token: str) -> Reading:
         """Return the motor's torque in N m: a float for one actuator, a list for two."""
-        return self._lab.read(token, "torque")
+        return self._lab.ask(token, Session.read, "torque")
 
     def set_position(self, position: Any, token: str) -> None:
         """Set the target of the stiffness, in rad; a None entry leaves a joint unchanged."""
-        self._lab.command(token, "position", position)
+        self._lab.tell(token, Session.command, "position", position)
 
     def set_velocity(self, velocity: Any, token: str) -> None:
         """Set the target of the damping, in rad/s; a None entry leaves a joint unchanged."""
-        self._lab.command(token, "velocity", velocity)
+        self._lab.tell(token, Session.command, "velocity", velocity)
 
     def set_torque(self, torque: Any, token: str) -> None:
         """Set the feed-forward torque, in N m; a None entry leaves a joint unchanged."""
-        self._lab.command(token, "torque", torque)
+        self._lab.tell(token, Session.command, "torque", torque)
 
     def set_impedance_controller_params(self, kp: Any, kd: Any, token: str) -> None:
         """Set stiffness in N m/rad and damping in N m s/rad. Torque control is 0 and 0.
 
         The drive's torque is tau = kp (q* - q) + kd (qd* - qd) + tau_ff, within its limits.
         """
-        self._lab.set_gains(token, kp, kd)
+        self._lab.tell(token, Session.set_gains, kp, kd)
 
     def get_actuator_info(self, token: str) -> list[ActuatorInfo]:
         """Return a description of each joint's actuator."""
-        return self._lab.actuator_info(token)
+        return self._lab.ask(token, Session.actuators)
 
     def get_logs(self, token: str) -> str:
         """Return the events of the session so far, one per line."""
-        return self._lab.logs(token)
+        return self._lab.ask(token, Session.events)
 
 
 def _start_position(position: Sequence[float] | float | None, state: Any) -> Any:
@@ -221,3 +235,138 @@ def _start_position(position: Sequence[float] | float | None, state: Any) -> Any
     except ordinary(Exception):  # objects may do anything when they are looked at
         raise LabError(f"initial_state must be a list of numbers, not {shown(state)}") from None
     return entries[:half] if has_velocities else entries
+
+
+class Lab(Service):
+    """A lab with simulated cells.
+
+    `Client(lab)` uses it. Within ``with lab:`` every new `Client()` uses it too, in all threads.
+    The end of the block closes the lab.
+
+    Args:
+        preset: ``"hardware"``, ``"ideal"``, or your own options.
+        clock: The lab's time; by default a `RealClock`.
+        speed: Speed of the default clock: 2 is twice as fast as real time.
+        users: The users by their tokens. By default every token but an empty one is valid and has
+            the rights of ``User()``.
+        cells: The number of cells of each type; by default four single and two double ones.
+        seed: Seed of noise, friction and delays; None for a random one.
+        parameters: Parameters of the cells' FMUs, by type of cell.
+        video_folder: The folder of videos. By default a temporary folder, which is removed when
+            the lab is closed.
+        **changes: Options that differ from the preset's; see `Options`.
+
+    Attributes:
+        options: What is simulated.
+        clock: The lab's time.
+
+    Raises:
+        ConfigError: If an argument has a wrong type or is out of its range.
+    """
+
+    def __init__(
+        self,
+        preset: str | Options = "hardware",
+        *,
+        clock: Clock | None = None,
+        speed: float = 1.0,
+        users: Mapping[str, User] | None = None,
+        cells: Mapping[CellType, int] | None = None,
+        seed: int | None = None,
+        parameters: Mapping[CellType, Mapping[str, float]] | None = None,
+        video_folder: str | Path | None = None,
+        **changes: Any,
+    ) -> None:
+        options = make_options(preset, **changes)
+        if seed is not None:
+            seed = check_integer("seed", seed, 0, _LARGEST_SEED)
+        seeds = np.random.SeedSequence(seed)
+        rng = _rng(seeds)
+        super().__init__(
+            options,
+            RealClock(speed) if clock is None else clock,
+            _make_cells(options, seeds, _numbers(cells), _parameters(parameters)),
+            users,
+            rng,
+            video_folder,
+        )
+
+    def __enter__(self) -> Lab:
+        with _choosing:
+            _blocks.append(self)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with _choosing:
+            _blocks.remove(self)
+            is_outermost = self not in _blocks
+        if is_outermost:
+            self.close()
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Lab:
+        """Return the lab itself, so that copies of an environment's arguments use this lab."""
+        return self
+
+    def client(self) -> Client:
+        """Return a new client of this lab."""
+        return Client(self)
+
+
+_choosing = threading.RLock()
+_blocks: list[Lab] = []
+"""The labs of the open blocks ``with lab:``, the innermost last."""
+_default: list[Lab] = []
+"""The default lab, if there is one."""
+
+
+def current_lab() -> Lab:
+    """Return the lab of the innermost ``with lab:``, or else the default lab of the process."""
+    with _choosing:
+        if _blocks:
+            return _blocks[-1]
+        if not _default or _default[0].is_closed:
+            _default[:] = [Lab()]
+        return _default[0]
+
+
+def _make_cells(
+    options: Options,
+    seeds: np.random.SeedSequence,
+    numbers: Mapping[CellType, int],
+    parameters: Mapping[CellType, Mapping[str, float]],
+) -> list[Cell]:
+    return [
+        Cell(_FIRST_ID[kind] + i, kind, options, _rng(seeds), parameters.get(kind, {}))
+        for kind in CellType
+        for i in range(numbers.get(kind, 0))
+    ]
+
+
+def _numbers(cells: Any) -> Mapping[CellType, int]:
+    numbers = _by_type("cells", _CELLS if cells is None else cells)
+    return {
+        kind: check_integer(f"cells: the number of {kind.name} cells", count, 0, _MOST_CELLS)
+        for kind, count in numbers.items()
+    }
+
+
+def _parameters(parameters: Any) -> dict[CellType, dict[str, float]]:
+    by_type = _by_type("parameters", {} if parameters is None else parameters)
+    return {kind: checked_parameters(kind, values) for kind, values in by_type.items()}
+
+
+def _by_type(what: str, value: Any) -> dict[CellType, Any]:
+    entries = check_dict(what, value)
+    for kind in entries:
+        if not isinstance(kind, CellType):
+            raise ConfigError(f"{what}: expected a CellType as a key, not {shown(kind)}")
+    return entries
+
+
+def _rng(seeds: np.random.SeedSequence) -> np.random.Generator:
+    return np.random.default_rng(seeds.spawn(1)[0])

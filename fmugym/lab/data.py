@@ -1,12 +1,16 @@
-"""Data types of the client's methods."""
+"""What the client's methods give: data, and the error that they raise."""
 
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 
-__all__ = ["ActuatorInfo", "CellInfo", "CellType", "UserInfo"]
+from fmugym.errors import FMUGymError
+
+__all__ = ["ActuatorInfo", "CellInfo", "CellType", "LabError", "UserInfo", "as_lab_error"]
 
 
 class CellType(enum.Enum):
@@ -84,3 +88,26 @@ class ActuatorInfo:
     torque_limit: float
     velocity_limit: float
     position_limit: float
+
+
+class LabError(FMUGymError, RuntimeError):
+    """The lab refuses a request, or a session has ended.
+
+    Programs for the real lab expect a `RuntimeError`, and look for these texts:
+
+    * ``Velocity Limit Violation`` and ``VelocityLimitViolation;value=...``, and the same for
+      position and torque: the cell was brought to rest and the session ended.
+    * ``outside the limits``: an argument is out of its range.
+    * ``Too many requests ... try again in N seconds``: too many starts, or an empty bucket.
+    """
+
+
+@contextmanager
+def as_lab_error() -> Iterator[None]:
+    """Turn other errors of this package into a `LabError` with the same text."""
+    try:
+        yield
+    except LabError:
+        raise
+    except FMUGymError as error:
+        raise LabError(str(error)) from None

@@ -13,8 +13,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Final, Protocol
 
-from fmugym.checks import check_number
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.checks import check_number, check_option
+from fmugym.errors import ConfigError, shown
 from fmugym.lab.drive import HOLD_DAMPING
 from fmugym.signals import ordinary
 
@@ -62,7 +62,19 @@ class Disturbance(Protocol):
         ...
 
 
-class _Pull:
+class _Checked:
+    """What the disturbances of this module share: they check their arguments."""
+
+    def __post_init__(self) -> None:
+        """Check the arguments, and keep lists as tuples."""
+        for field in fields(self):  # type: ignore[arg-type]  # the classes below are dataclasses
+            value = getattr(self, field.name)
+            if value is not None or field.default is not None:
+                value = _checked(f"{type(self).__name__}: {field.name}", field.name, value)
+            object.__setattr__(self, field.name, value)
+
+
+class _Pull(_Checked):
     """What the disturbances share that pull the joints to a position."""
 
     disturbance_position: Sequence[float] | None
@@ -74,8 +86,22 @@ class _Pull:
         return self.disturbance_position or (0.0, 0.0)
 
 
+class _Near:
+    """What the disturbances share that begin when the joints first come near a position."""
+
+    trigger_position: Sequence[float]
+    tolerance: float
+    earliest: float
+
+    def is_due(self, time: float, position: Sequence[float]) -> bool:
+        """See ``Disturbance.is_due``."""
+        pairs = zip(position, self.trigger_position, strict=False)
+        is_near = all(abs(math.remainder(q - aim, math.tau)) <= self.tolerance for q, aim in pairs)
+        return time >= self.earliest and is_near
+
+
 @dataclass(frozen=True)
-class TimedTorqueDisturbance:
+class TimedTorqueDisturbance(_Checked):
     """An external torque at a fixed time.
 
     Args:
@@ -91,9 +117,6 @@ class TimedTorqueDisturbance:
     duration: float
     torque: Sequence[float]
     position = None
-
-    def __post_init__(self) -> None:
-        _check_fields(self)
 
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""
@@ -117,16 +140,13 @@ class TimedPositionDisturbance(_Pull):
     disturbance_position: Sequence[float] | None = None
     duration: float = 0.5
 
-    def __post_init__(self) -> None:
-        _check_fields(self)
-
     def is_due(self, time: float, position: Sequence[float]) -> bool:
         """See ``Disturbance.is_due``."""
         return time >= self.trigger_time
 
 
 @dataclass(frozen=True)
-class StateDependentTorqueDisturbance:
+class StateDependentTorqueDisturbance(_Near, _Checked):
     """An external torque that begins when the joints first come near a position.
 
     Args:
@@ -147,17 +167,9 @@ class StateDependentTorqueDisturbance:
     earliest: float = 0.0
     position = None
 
-    def __post_init__(self) -> None:
-        _check_fields(self)
-
-    def is_due(self, time: float, position: Sequence[float]) -> bool:
-        """See ``Disturbance.is_due``."""
-        near = _is_near(position, self.trigger_position, self.tolerance)
-        return time >= self.earliest and near
-
 
 @dataclass(frozen=True)
-class StateDependentPositionDisturbance(_Pull):
+class StateDependentPositionDisturbance(_Near, _Pull):
     """A pull to a position that begins when the joints first come near another position.
 
     Args:
@@ -177,33 +189,12 @@ class StateDependentPositionDisturbance(_Pull):
     tolerance: float = 0.1
     earliest: float = 0.0
 
-    def __post_init__(self) -> None:
-        _check_fields(self)
 
-    def is_due(self, time: float, position: Sequence[float]) -> bool:
-        """See ``Disturbance.is_due``."""
-        near = _is_near(position, self.trigger_position, self.tolerance)
-        return time >= self.earliest and near
-
-
-def _is_near(position: Sequence[float], goal: Sequence[float], tolerance: float) -> bool:
-    pairs = zip(position, goal, strict=False)
-    return all(abs(math.remainder(q - aim, math.tau)) <= tolerance for q, aim in pairs)
-
-
-def _check_fields(disturbance: Any) -> None:
-    """Check the arguments of a disturbance, and keep lists as tuples."""
-    for field in fields(disturbance):
-        what = f"{type(disturbance).__name__}: {field.name}"
-        value = getattr(disturbance, field.name)
-        if field.name not in _VECTORS:
-            low = 0.0 if field.name in ("duration", "tolerance") else -_LARGEST
-            checked: Any = check_number(what, value, low, _LARGEST)
-        elif value is None and field.default is None:
-            checked = None
-        else:
-            checked = _vector(what, value)
-        object.__setattr__(disturbance, field.name, checked)
+def _checked(what: str, name: str, value: Any) -> float | tuple[float, ...]:
+    if name in _VECTORS:
+        return _vector(what, value)
+    low = 0.0 if name in ("duration", "tolerance") else -_LARGEST
+    return check_number(what, value, low, _LARGEST)
 
 
 def _vector(what: str, entries: Any) -> tuple[float, ...]:
@@ -238,10 +229,7 @@ def resolve(
     if disturbances is None:
         return ()
     if isinstance(disturbances, str):
-        name = str.__str__(disturbances)
-        if name not in PRESETS:
-            raise unknown_name("disturbance preset", name, PRESETS)
-        disturbances = PRESETS[name]
+        disturbances = PRESETS[check_option("disturbance preset", disturbances, PRESETS)]
     try:
         found = _several(disturbances)
         for disturbance in found:

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from fmugym.checks import check_flag, check_integer, check_number
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.checks import check_flag, check_integer, check_number, check_option
+from fmugym.errors import ConfigError, shown
 
 __all__ = ["HARDWARE", "IDEAL", "PRESETS", "Options", "make_options"]
 
@@ -168,14 +168,9 @@ def make_options(preset: str | Options, **changes: Any) -> Options:
     Raises:
         ConfigError: If the preset or an option does not exist, or a value is out of its range.
     """
-    if isinstance(preset, Options):
-        options = preset
-    elif isinstance(preset, str) and (name := str.__str__(preset)) in PRESETS:
-        options = PRESETS[name]
-    else:
-        raise unknown_name("preset", preset, PRESETS)
+    if not isinstance(preset, Options):
+        preset = PRESETS[check_option("preset", preset, PRESETS)]
     known = [field.name for field in dataclasses.fields(Options)]
     for name in changes:
-        if name not in known:
-            raise unknown_name("option of the lab", name, known)
-    return dataclasses.replace(options, **changes)
+        check_option("option of the lab", name, known)
+    return dataclasses.replace(preset, **changes)

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from fmugym.checks import check_flag, check_number, float_or_nan
-from fmugym.errors import shown, unknown_name
-from fmugym.lab.data import CellType
+from fmugym.checks import check_flag, check_number, check_option, check_text, float_or_nan
+from fmugym.errors import shown
+from fmugym.lab.data import CellType, LabError, as_lab_error
 from fmugym.lab.disturbance import Disturbance, resolve
 from fmugym.lab.experiments import EXPERIMENTS, PLANTS
-from fmugym.lab.lab_error import LabError, as_lab_error
 from fmugym.signals import ordinary
 
 __all__ = ["Request", "cell_types_of", "check_range", "entries_of", "gains_of", "text_of"]
@@ -48,11 +47,9 @@ class Request:
     disturbances: str | Disturbance | Sequence[Disturbance] | None = None
 
     def __post_init__(self) -> None:
-        kind = self.experiment_type
-        if not isinstance(kind, str) or str.__str__(kind) not in EXPERIMENTS:
-            raise LabError(str(unknown_name("experiment type", kind, EXPERIMENTS)))
-        object.__setattr__(self, "experiment_type", str.__str__(kind))
         with as_lab_error():
+            kind = check_option("experiment type", self.experiment_type, EXPERIMENTS)
+            object.__setattr__(self, "experiment_type", kind)
             object.__setattr__(self, "record", check_flag("record", self.record))
             if self.cell_id is not None:
                 object.__setattr__(self, "cell_id", check_number("cell_id", self.cell_id))
@@ -100,9 +97,8 @@ def text_of(kind: str, token: object) -> str:
     Raises:
         LabError: If the token is not a text.
     """
-    if not isinstance(token, str):
-        raise LabError(f"{kind} token must be a text, not {shown(token)}")
-    return str.__str__(token)  # a subclass may have its own hash
+    with as_lab_error():
+        return check_text(f"{kind} token", token)
 
 
 def cell_types_of(value: Any) -> list[CellType]:

@@ -7,39 +7,37 @@ and ends what should have ended since the last request.
 from __future__ import annotations
 
 import logging
+import math
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.errors import unknown_name
-from fmugym.lab import controls
-from fmugym.lab.admission import check_lease, check_request
+from fmugym.checks import check_option
 from fmugym.lab.bookings import Bookings, new_token
 from fmugym.lab.cell import Cell
 from fmugym.lab.cell_pictures import CellPicture, LiveView
-from fmugym.lab.controls import Quantity
-from fmugym.lab.data import ActuatorInfo, CellInfo, CellType, UserInfo
-from fmugym.lab.delays import Delays
-from fmugym.lab.lab_error import LabError, as_lab_error
+from fmugym.lab.data import CellInfo, CellType, LabError, UserInfo, as_lab_error
 from fmugym.lab.presets import Options
-from fmugym.lab.request_checks import Request, cell_types_of, text_of
+from fmugym.lab.request_checks import Request, cell_types_of, check_range, text_of
 from fmugym.lab.sessions import Gym, Session
-from fmugym.lab.timekeeper import Timekeeper
-from fmugym.lab.users import Account, Accounts
-from fmugym.lab.video_files import Recording
-from fmugym.lab.videos import VideoFolder
+from fmugym.lab.timekeeper import Delays, Timekeeper
+from fmugym.lab.users import Account, Accounts, User
+from fmugym.lab.videos import Recording, VideoFolder
 from fmugym.pool.backend.clocks import Clock
 
 __all__ = ["Service"]
 
 logger = logging.getLogger(__name__)
 
+_LONGEST_PREPARATION: Final = 60.0  # s
 _POLL: Final = 0.02  # s between two attempts to get a cell
 _RENDER_MODES: Final = ("rgb_array", "human")
+
+_Answer = TypeVar("_Answer")
 
 
 class Service:
@@ -124,7 +122,7 @@ class Service:
         kinds = cell_types_of(wanted)
         with self._lock:
             account = self._account(user_token)
-            seconds = check_lease(self._bookings, account.user, length, kinds)
+            seconds = self._checked_lease(account.user, length, kinds)
             account.take_gym(self._now())
         while (gym := self._lease(account, seconds, kinds)) is None:
             self._time.wait(_POLL)
@@ -136,7 +134,7 @@ class Service:
         self._delays.wait_for_setter()
         with self._lock:
             account = self._account(user_token)
-            self._admit(account, request, None)
+            self._admit(account.user, request, None)
             account.take_experiment(self._now())
         return self._start_session(request, None)
 
@@ -145,7 +143,7 @@ class Service:
         self._delays.wait_for_setter()
         with self._lock:
             gym = self._open_gym(gym_token)
-            self._admit(gym.account, request, gym)
+            self._admit(gym.account.user, request, gym)
             gym.account.take_start(self._now())
         return self._start_session(request, gym)
 
@@ -155,7 +153,7 @@ class Service:
         """See ``Client.stop_experiment`` and ``Client.stop_episode``."""
         self._delays.wait_for_setter()
         with self._lock:
-            session = self._bookings.find(text_of(kind, token), Session, kind)
+            session = self._bookings.find(token, Session, kind)
             session.bring_to(self._now())
             session.stop()
             self._bookings.settle(self._now())
@@ -170,7 +168,7 @@ class Service:
         self._delays.wait_for_setter()
         with self._lock:
             now = self._now()
-            gym = self._bookings.find(text_of("gym", gym_token), Gym, "gym")
+            gym = self._bookings.find(gym_token, Gym, "gym")
             self._bookings.settle(now)
             gym.stop()
             self._bookings.end_all("its gym was stopped", gym)
@@ -178,35 +176,17 @@ class Service:
 
     # Requests to a session. Each one is a heartbeat.
 
-    def read(self, token: str, quantity: Quantity) -> float | list[float]:
-        """Return the newest reading of a cell: a float for one actuator, a list for two."""
+    def ask(self, token: str, question: Callable[..., _Answer], *arguments: Any) -> _Answer:
+        """Call a method of a running session that only reads something."""
         self._delays.wait_for_getter()
         with self._lock:
-            return controls.read(self._session(token), quantity)
+            return question(self._session(token), *arguments)
 
-    def command(self, token: str, quantity: Quantity, value: Any) -> None:
-        """Set a target of the drive, or its torque; None entries leave a joint unchanged."""
+    def tell(self, token: str, command: Callable[..., None], *arguments: Any) -> None:
+        """Call a method of a running session that changes something."""
         self._delays.wait_for_setter()
         with self._lock:
-            controls.command(self._session(token), self.options, quantity, value)
-
-    def set_gains(self, token: str, kp: Any, kd: Any) -> None:
-        """Set the drive's stiffness in N m/rad and damping in N m s/rad."""
-        self._delays.wait_for_setter()
-        with self._lock:
-            controls.set_gains(self._session(token), kp, kd)
-
-    def actuator_info(self, token: str) -> list[ActuatorInfo]:
-        """See ``Client.get_actuator_info``."""
-        self._delays.wait_for_getter()
-        with self._lock:
-            return controls.actuators(self._session(token), self.options)
-
-    def logs(self, token: str) -> str:
-        """See ``Client.get_logs``."""
-        self._delays.wait_for_getter()
-        with self._lock:
-            return "\n".join(self._session(token).log)
+            command(self._session(token), *arguments)
 
     # Pictures.
 
@@ -229,8 +209,7 @@ class Service:
             ConfigError: If the mode does not exist.
             LabError: If the lease does not exist or has ended, or there is no display.
         """
-        if not isinstance(render_mode, str) or str.__str__(render_mode) not in _RENDER_MODES:
-            raise unknown_name("render mode", render_mode, _RENDER_MODES)
+        mode = check_option("render mode", render_mode, _RENDER_MODES)
         with self._lock:
             gym = self._open_gym(gym_token)
             if gym.view is None:
@@ -238,7 +217,7 @@ class Service:
             view = gym.view
             moments = [(cell.position, cell.torque, cell.time) for cell in gym.cells]
         picture = view.draw(moments)
-        if str.__str__(render_mode) == "rgb_array":
+        if mode == "rgb_array":
             return picture
         with as_lab_error():
             view.show(picture)
@@ -278,14 +257,14 @@ class Service:
     def _session(self, token: str) -> Session:
         """Find a running session, and bring its cell to the present."""
         now = self._now()
-        session = self._bookings.find(text_of("session", token), Session, "session")
+        session = self._bookings.find(token, Session, "session")
         session.request(now)
         return session
 
     def _open_gym(self, token: str) -> Gym:
         """Find a running lease, and bring everything to the present."""
         now = self._now()
-        gym = self._bookings.find(text_of("gym", token), Gym, "gym")
+        gym = self._bookings.find(token, Gym, "gym")
         self._bookings.settle(now)
         if gym.ended is not None:
             raise LabError(gym.ended)
@@ -296,8 +275,29 @@ class Service:
 
     # Parts of a start.
 
-    def _admit(self, account: Account, request: Request, gym: Gym | None) -> None:
-        check_request(self._bookings, account.user, self.options, request, gym)
+    def _checked_lease(self, user: User, length: Any, wanted: Sequence[CellType]) -> float:
+        """Refuse what no lease can have; returns the length in s."""
+        checked = check_range("gym_time", length, user.max_gym_length if user.gym else math.inf)
+        for kind in CellType:
+            available = sum(cell.cell_type is kind for cell in self._bookings.cells)
+            number = sum(each is kind for each in wanted)
+            if number > available:
+                raise LabError(f"the lab has {available} cells of type {kind.name}, not {number}")
+        return checked
+
+    def _admit(self, user: User, request: Request, gym: Gym | None) -> None:
+        """Refuse a start that the user has no right to, or that does not fit the lab."""
+        kind, limit = request.experiment_type, self.options.position_limit
+        if kind not in user.experiment_types:
+            raise LabError(f"user {user.name!r} may not start experiments of type {kind!r}")
+        if not self._bookings.fitting(request, gym):
+            number = "" if request.cell_id is None else f" and number {request.cell_id:g}"
+            raise LabError(f"no cell of type {request.cell_type.name}{number} for {kind} exists")
+        check_range("the experiment's time", request.length, user.max_experiment_length)
+        check_range("preparation_time", request.preparation_time, _LONGEST_PREPARATION, 0.0)
+        for angle in request.angles:
+            check_range("initial_position", angle, limit, -limit)
+        _ = request.acting  # raises for a disturbance that does not fit
         if request.record:
             self._videos.prepare()
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 from fmugym.lab.cell import Cell
 from fmugym.lab.cell_pictures import LiveView
-from fmugym.lab.lab_error import LabError
+from fmugym.lab.data import ActuatorInfo, LabError
+from fmugym.lab.experiments import EXPERIMENTS
+from fmugym.lab.request_checks import entries_of, gains_of
 from fmugym.lab.users import Account
-from fmugym.lab.video_files import Recording
+from fmugym.lab.videos import Recording
 
 __all__ = ["Gym", "Session"]
+
+Quantity = Literal["position", "velocity", "torque"]
 
 
 @dataclass(eq=False)
@@ -154,6 +160,66 @@ class Session:
         """
         _stop(self)
 
+    # What a program asks for while it runs.
+
+    def read(self, quantity: Quantity) -> float | list[float]:
+        """Return the newest reading: a float for one actuator, a list for two."""
+        values: list[float] = getattr(self.cell.sensors.sample, quantity)
+        return values[0] if len(values) == 1 else list(values)
+
+    def command(self, quantity: Quantity, value: Any) -> None:
+        """Set a target of the drive, or its torque.
+
+        Args:
+            quantity: What to set.
+            value: One number for each joint; None leaves a joint unchanged.
+
+        Raises:
+            LabError: If the value does not fit the joints, or is refused because of a limit.
+        """
+        entries = entries_of(value, self.cell.plant.joints, quantity)
+        limited = [self._limited(entry, quantity) for entry in entries]
+        _update(getattr(self.cell.drive, quantity), limited)
+
+    def set_gains(self, kp: Any, kd: Any) -> None:
+        """Set the drive's stiffness in N m/rad and damping in N m s/rad.
+
+        Raises:
+            LabError: If the values do not fit the joints, or are negative.
+        """
+        joints, drive = self.cell.plant.joints, self.cell.drive
+        stiffness, damping = gains_of(kp, joints, "kp"), gains_of(kd, joints, "kd")
+        _update(drive.kp, stiffness)
+        _update(drive.kd, damping)
+        self.note(f"kp {drive.kp} N m/rad, kd {drive.kd} N m s/rad")
+
+    def actuators(self) -> list[ActuatorInfo]:
+        """Describe the actuator of each joint."""
+        options, driven = self.cell.options, EXPERIMENTS[self.experiment].driven
+        return [
+            ActuatorInfo(
+                name=name,
+                motor="T-Motor GL35 (simulated)",
+                drive="MAB MD80 (simulated)",
+                torque_limit=options.torque_limit if is_driven else 0.0,
+                velocity_limit=options.velocity_limit,
+                position_limit=options.position_limit,
+            )
+            for name, is_driven in zip(self.cell.plant.joint_names, driven, strict=True)
+        ]
+
+    def events(self) -> str:
+        """The log as a text."""
+        return "\n".join(self.log)
+
+    def _limited(self, value: float | None, quantity: Quantity) -> float | None:
+        limit: float = getattr(self.cell.options, f"{quantity}_limit")
+        if value is None or abs(value) <= limit:
+            return value
+        if self.cell.options.clamp_setters:
+            return math.copysign(limit, value)
+        raise LabError(f"{quantity} {value:g} is outside the limits of +-{limit:g}")
+
     def _deadline(self) -> tuple[float, str]:
         deadlines = [
             (self.began + self.length + self.grace, f"its time of {self.length:g} s is over"),
@@ -169,3 +235,7 @@ def _stop(owner: Gym | Session) -> None:
         raise LabError(f"the {owner.kind} was stopped before")
     owner.is_stopped = True
     owner.end("it was stopped")
+
+
+def _update(target: list[float], entries: Sequence[float | None]) -> None:
+    target[:] = [old if new is None else new for old, new in zip(target, entries, strict=True)]

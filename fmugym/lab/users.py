@@ -9,11 +9,10 @@ from dataclasses import dataclass, fields
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from fmugym.checks import check_flag, check_integer, check_number
-from fmugym.errors import ConfigError, shown, unknown_name
-from fmugym.lab.data import UserInfo
+from fmugym.checks import check_flag, check_integer, check_number, check_option, check_text
+from fmugym.errors import ConfigError, shown
+from fmugym.lab.data import LabError, UserInfo
 from fmugym.lab.experiments import EXPERIMENTS
-from fmugym.lab.lab_error import LabError
 from fmugym.lab.presets import Options
 
 __all__ = ["Account", "Accounts", "Bucket", "User"]
@@ -67,20 +66,15 @@ def _checked(name: str, value: Any) -> Any:
         return check_integer(what, value, 0, 10**9)
     if name == "refil_interval":
         return check_number(what, value, 1e-3, 1e9)
-    if name != "name":
-        return check_number(what, value, 0.0, may_be_infinite=True)
-    if not isinstance(value, str):
-        raise ConfigError(f"{what} must be a text, not {shown(value)}")
-    return str.__str__(value)
+    if name == "name":
+        return check_text(what, value)
+    return check_number(what, value, 0.0, may_be_infinite=True)
 
 
 def _known_types(value: Any) -> tuple[str, ...]:
     if not isinstance(value, tuple | list | set | frozenset):
         raise ConfigError(f"experiment_types of a user must be a list, not {shown(value)}")
-    for name in value:
-        if not isinstance(name, str) or str.__str__(name) not in EXPERIMENTS:
-            raise unknown_name("experiment type", name, EXPERIMENTS)
-    return tuple(str.__str__(name) for name in value)
+    return tuple(check_option("experiment type", name, EXPERIMENTS) for name in value)
 
 
 class Bucket:

@@ -10,27 +10,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU, StandsForFMU
 from fmugym.archive.texts import number_of, with_texts
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import Variable, checked_value
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import Pool
+from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.licences import licence_errors
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.spec import PoolSpec
 from fmugym.systems.system_description import SystemDescription
-from fmugym.task.starting import checked_value, start_values
+from fmugym.task.starting import start_values
 
 __all__ = ["LinearModel", "linearize"]
 
 logger = logging.getLogger(__name__)
 
-FloatArray = npt.NDArray[np.float64]
 Variables = tuple[Variable, ...]
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.variable import checked_value
 from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.linearization.sensitivities import float_box, moved_both_ways
@@ -15,7 +16,6 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.spec import START_TIME
 from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
-from fmugym.task.starting import checked_value
 from fmugym.vector.env import FMUVectorEnv
 
 __all__ = ["Matrices", "differentiate_by_starts"]

@@ -31,19 +31,12 @@ class Receiver:
 
     def __call__(self, index: int, status: int, category: str, message: str) -> None:
         """Log a message of an instance, or of a component of one."""
-        level, text = self._record(index, status, category, message)
+        instance, part = divmod(index, len(self._parts))
+        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
+        level, text = as_record(name, status, category, message)
         self._log.log(level, "%s", text)
-
-    def text_of(self, index: int, status: int, category: str, message: str) -> str:
-        """The text that is logged for a message."""
-        return self._record(index, status, category, message)[1]
 
     @property
     def sources(self) -> int:
         """How many sources of messages an instance has: its components, or itself."""
         return len(self._parts)
-
-    def _record(self, index: int, status: int, category: str, message: str) -> tuple[int, str]:
-        instance, part = divmod(index, len(self._parts))
-        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
-        return as_record(name, status, category, message)

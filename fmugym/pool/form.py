@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 import os
 import struct
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -90,7 +90,7 @@ _NO_FMU: Final = 2, 0
 
 
 class Writer:
-    """Writes a form."""
+    """Writes a form; each method returns the writer."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -99,38 +99,46 @@ class Writer:
         """What has been written."""
         return b"".join(self._parts)
 
-    def integers(self, *numbers: int) -> None:
+    def forms(self, *forms: bytes) -> Self:
+        """Write what others have written."""
+        self._parts += forms
+        return self
+
+    def integers(self, *numbers: int) -> Self:
         """Write integers or flags."""
         self._parts += [_INTEGER.pack(number) for number in numbers]
+        return self
 
-    def numbers(self, *numbers: float) -> None:
+    def numbers(self, *numbers: float) -> Self:
         """Write floating-point numbers."""
         self._parts += [_NUMBER.pack(number) for number in numbers]
+        return self
 
-    def optional(self, number: float | None) -> None:
+    def optional(self, number: float | None) -> Self:
         """Write whether there is a number, and the number."""
-        self.integers(number is not None)
-        self.numbers(number or 0.0)
+        return self.integers(number is not None).numbers(number or 0.0)
 
-    def block(self, data: bytes) -> None:
+    def block(self, data: bytes) -> Self:
         """Write bytes with their size."""
         self._parts += [_INTEGER.pack(len(data)), data, bytes(-len(data) % _BLANK)]
+        return self
 
-    def array(self, values: Any, dtype: Any) -> None:
+    def array(self, values: Any, dtype: Any) -> Self:
         """Write a block of values of one type."""
-        self.block(np.ascontiguousarray(values, dtype).tobytes())
+        return self.block(np.ascontiguousarray(values, dtype).tobytes())
 
-    def text(self, text: bytes) -> None:
+    def text(self, text: bytes) -> Self:
         """Write a text."""
-        self.block(text + b"\0")
+        return self.block(text + b"\0")
 
-    def texts(self, texts: Sequence[bytes]) -> None:
+    def texts(self, texts: Sequence[bytes]) -> Self:
         """Write a number of texts."""
         self.integers(len(texts))
         for text in texts:
             self.text(text)
+        return self
 
-    def listing(self, variables: Sequence[Variable], version: int) -> None:
+    def listing(self, variables: Sequence[Variable], version: int) -> Self:
         """Write a list of variables.
 
         Args:
@@ -141,8 +149,7 @@ class Writer:
         both = [*variables, *rest]
         self.block(bytes(type_number(variable, version) for variable in both))
         self.array([(v.value_reference, v.place, v.size) for v in both], np.uint32)
-        self.array([v.start_number for v in rest], np.float64)
-        self.block(_texts(variables))
+        return self.array([v.start_number for v in rest], np.float64).block(_texts(variables))
 
 
 def _texts(variables: Sequence[Variable]) -> bytes:
@@ -164,10 +171,7 @@ def form_of_listing(
         version: See ``table_of``; by default that of pools without an FMU.
         manner: See ``manner_of``.
     """
-    writer = Writer()
-    writer.integers(version, manner)
-    writer.listing(variables, version)
-    return writer.form()
+    return Writer().integers(version, manner).listing(variables, version).form()
 
 
 def type_number(variable: Variable, version: int) -> int:
@@ -526,7 +530,6 @@ def form_of_program(
     code: bytes,
     constants: bytes,
     slots: bytes,
-    rows: Iterable[int],
     tables: Sequence[Any],
     registers: int,
     seen: int,
@@ -538,7 +541,6 @@ def form_of_program(
         code: The instructions.
         constants: Registers that keep a value.
         slots: Elements of observations that are stored.
-        rows: The numbers of the rows that are loaded or stored, among those that come with it.
         tables: Values to look up.
         registers: How many registers there are.
         seen: How many arrays the slots refer to.
@@ -548,7 +550,6 @@ def form_of_program(
     writer.integers(registers, seen)
     for data in (code, constants, slots):
         writer.block(data)
-    writer.array(list(rows), np.int64)
     writer.array(results, np.int64)
     writer.integers(len(tables))
     for table in tables:
@@ -565,7 +566,4 @@ def form_of_draws(table: Any, numbers: Any) -> bytes:
             the number of its numbers; shape (draws, 4).
         numbers: The numbers of all.
     """
-    writer = Writer()
-    writer.array(table, np.int64)
-    writer.array(numbers, np.float64)
-    return writer.form()
+    return Writer().array(table, np.int64).array(numbers, np.float64).form()

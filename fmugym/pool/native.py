@@ -24,6 +24,7 @@ from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
+from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     FloatArray,
     MaskArray,
@@ -31,18 +32,25 @@ from fmugym.pool.base import (
     PoolSpec,
     StatusArray,
     available_processors,
-    naming,
 )
 from fmugym.pool.bundle import IndexArray
 from fmugym.pool.callbacks import Receiver
-from fmugym.pool.derivatives import Question, Variables, differentiated
 from fmugym.pool.extension import require_refusal
-from fmugym.pool.form import Files, form_of_listing, form_of_pool, manner_of, table_of
+from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import no_counts
 from fmugym.pool.leaks import watch_leaks
+from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.private_libraries import copy_libraries
-from fmugym.pool.reports import Failure, describe_failure, loading_failed
-from fmugym.pool.saving_pool import SavingPool, keeps_records
+from fmugym.pool.reports import loading_failed
+from fmugym.pool.requests import (
+    Answer,
+    Answers,
+    Reader,
+    Request,
+    request_restore_states,
+    request_save_states,
+)
+from fmugym.pool.saving_pool import keeps_records
 from fmugym.signals import ordinary
 
 __all__ = ["NativePool", "prepare"]
@@ -57,7 +65,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class NativePool(SavingPool):
+class NativePool(AskingPool):
     """N instances stepped by the C extension; see ``Pool`` for the contract.
 
     Args:
@@ -114,6 +122,7 @@ class NativePool(SavingPool):
             raise
         self._close = weakref.finalize(self, _close, self._pool, fmu)
         self._prepare_saving(fmu.description, spec)
+        self._answers = Answers(fmu.description, spec, slice(0, num_instances))
         self.step_own = self._pool.step_own
         self._watch = watch_leaks(fmu, spec, self._counts, log)
         self._reset = self._watched(self._pool.reset)
@@ -147,9 +156,8 @@ class NativePool(SavingPool):
         if access is None:
             if len(self._accesses) >= _MOST_CACHED:
                 self._accesses.clear()
-            version = table_of(self._fmu.description)
             manner = manner_of(self._fmu.description)
-            access = _native.Access(form_of_listing(variables, version, manner))
+            access = _native.Access(form_of_listing(variables, self._version, manner))
             self._accesses[variables] = access
         return access
 
@@ -203,56 +211,50 @@ class NativePool(SavingPool):
 
     def failure(self, index: int) -> str:
         """See ``Pool.failure``."""
-        failure = self._open_pool().failure(index)
-        if failure is None:
-            return ""
-        name = f"{self._fmu.description.model_identifier}_{index}"
-        return describe_failure(Failure(*failure), self._fmu.description, self._spec, name)
+        if not 0 <= index < self.num_instances:
+            raise IndexError(f"there is no instance {index}")
+        content, tell = Writer().integers(index).form(), self._answers.failure
+        return self._ask_pool(Request.FAILURE, content, lambda reader: tell(reader, index))
 
-    def read(self, variables: tuple[Variable, ...]) -> FloatArray:
-        """See ``Pool.read``."""
-        values = np.empty((len(variables), self.num_instances))
-        failed = self._open_pool().read(self._access(variables), values)
-        if failed >= 0:
-            raise SimulationError(naming(self.failure(failed), variables))
-        return values
+    def _ask(
+        self,
+        doing: str,
+        request: Request,
+        content: Callable[[slice], bytes],
+        read: Callable[[Reader, int], R],
+    ) -> list[R]:
+        """See ``AskingPool._ask``; the instances are one block."""
+        count = self.num_instances
+        return [
+            self._ask_pool(request, content(slice(0, count)), lambda reader: read(reader, count))
+        ]
 
-    def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
-        """See ``Pool.differentiate``."""
-        about = self._fmu.description, self._spec, self.num_instances
-        return differentiated(*about, self._differentiate, unknowns, knowns)
-
-    def _differentiate(self, question: Question) -> FloatArray:
-        adjoint, part, version, *lists = question
-        some, rest = (_native.Access(form_of_listing(v, version)) for v in lists)
-        shape = len(question.seeded), len(question.others), self.num_instances
-        rows = np.zeros((shape[0] * shape[1], shape[2]))
-        failed = self._open_pool().differentiate(adjoint, part, some, rest, rows)
-        if failed >= 0:
-            raise SimulationError(self.failure(failed))
-        return rows.reshape(shape)
-
-    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
-        """See ``Pool.write``."""
-        values = np.ascontiguousarray(values, np.float64)
-        failed = self._open_pool().write(self._access(variables), values)
-        if failed >= 0:
-            raise SimulationError(self.failure(failed))
+    def _ask_pool(
+        self, request: Request, content: bytes, read: Callable[[Reader], R], *states: Any
+    ) -> R:
+        code, answer = self._open_pool().ask(request, content, *states)
+        found: R | SimulationError = self._answers.result(code, Reader(answer), read)
+        if isinstance(found, SimulationError):
+            raise found
+        return found
 
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``."""
-        states = self._open_pool().save_states(np.ascontiguousarray(indices), records)
-        if isinstance(states, int):
-            raise SimulationError(self.failure(states))
-        return states
+        content = request_save_states(indices, records)
+        code, answer = self._open_pool().ask(Request.SAVE_STATES, content)
+        if code == Answer.RESULT:
+            states: list[bytes] = answer
+            return states
+        raise self._answers.result(code, Reader(answer), Reader.end)
 
     def restore_states(self, states: Sequence[bytes], indices: IndexArray) -> None:
-        """See ``SavingPool.restore_states``."""
-        self._open_pool().restore_states(states, np.ascontiguousarray(indices))
+        """See ``SavingPool.restore_states``; the states are not copied."""
+        content = request_restore_states((), indices)
+        self._ask_pool(Request.RESTORE_STATES, content, Reader.end, states)
 
     def _count_steps(self) -> None:
         if self._close.alive:
-            self._pool.count_steps()
+            self._ask_pool(Request.COUNT_STEPS, b"", Reader.end)
 
     def _memory_growth(self) -> int:
         return 0 if self._watch is None else self._watch.growth
@@ -414,28 +416,21 @@ class NativePool(SavingPool):
         return self._pool.step_one
 
 
-def prepare(
-    pool: _native.Pool,
-    start: _native.Access,
-    programs: tuple[tuple[Any, ...], tuple[Any, ...]],
-    actions: Mapping[str, Any],
-    start_values: FloatArray,
-    draws: tuple[_native.Draws, npt.NDArray[np.uint64]],
-    episodes: tuple[npt.NDArray[np.int64], MaskArray, int],
-    surroundings: Mapping[str, Any],
-) -> None:
+def prepare(pool: _native.Pool, start: _native.Access, *parts: Any) -> None:
     """Do ``NativePool.prepare_play``, with the access to its variables."""
-    count, ended, limit = episodes
+    programs, actions, start_values, draws, (counts, ended, limit), surroundings = parts
+    rows = Rows()
     pool.prepare_play(
+        form=form_of_play(rows, programs, actions, limit, surroundings),
+        rows=tuple(rows.arrays),
         start=start,
         start_values=start_values,
-        inputs=programs[0],
-        judgement=programs[1],
-        actions=dict(actions),
         draws=draws[0],
         states=draws[1],
-        episodes={"step_counts": count, "ended": ended, "limit": limit},
-        **surroundings,
+        step_counts=counts,
+        ended=ended,
+        **{name: actions[name] for name in ("shape", "letter", "current", "previous")},
+        **{name: surroundings[name] for name in ("kept", "done", "results")},
     )
 
 

@@ -21,6 +21,7 @@ _Points: TypeAlias = NDArray[np.float64]
 _ARC_STEP: Final = math.radians(2.0)  # keeps chords within 0.1 pixel up to a radius of 600 pixels
 _HEAD_LENGTH: Final = 2.6  # of an arrow, in shaft thicknesses
 _HEAD_HALF_WIDTH: Final = 1.55  # of an arrow, in shaft thicknesses
+_SUPERSAMPLING: Final = 4  # a power of two: for others, pygame's weights do not sum to one
 _MOST_PIXELS: Final = 2**28  # of the supersampled picture, about 1 GB
 
 _CallT = TypeVar("_CallT", bound=Callable[..., Any])
@@ -72,7 +73,7 @@ class World:
 
 
 class Canvas:
-    """Draws filled shapes at a multiple of the picture's size and scales them down smoothly.
+    """Draws filled shapes at four times the picture's size and scales them down smoothly.
 
     The world is centred in the picture, with the same scale for both axes. The canvas omits
     shapes with coordinates that are not finite, and clips shapes outside the picture.
@@ -80,21 +81,17 @@ class Canvas:
     Args:
         size: Width and height of the picture, in pixels.
         world: The part of the world to show.
-        supersampling: Drawn pixels per pixel of the picture, along each axis. A power of two
-            keeps colours exact; for other factors, pygame's weights do not sum to one.
 
     Raises:
         ConfigError: If an argument has a wrong type or is out of its range. The methods raise it
             for arguments that cannot be drawn.
     """
 
-    def __init__(self, size: tuple[int, int], world: World, supersampling: int = 4) -> None:
+    def __init__(self, size: tuple[int, int], world: World) -> None:
         if not isinstance(world, World):
             raise ConfigError(f"expected a World, not {shown(world)}")
-        supersampling = check_integer("supersampling", supersampling, 1, 16)
-        width, height = self.size = size = checked_size(size, supersampling)
-        self._supersampling = supersampling
-        self._drawn = pygame.Surface((width * supersampling, height * supersampling), 0, 32)
+        width, height = self.size = size = checked_size(size)
+        self._drawn = pygame.Surface((width * _SUPERSAMPLING, height * _SUPERSAMPLING), 0, 32)
         self._picture = pygame.Surface(size, 0, 32)
         self._fonts: dict[int, pygame.font.Font] = {}
         self._set_view(world)
@@ -134,14 +131,9 @@ class Canvas:
         """Fill an upright rectangle, with corners rounded by `radius` (world units)."""
         across, up = 0.5 * width - radius, 0.5 * height - radius
         signs = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+        centers = [(center[0] + x * across, center[1] + y * up) for x, y in signs]
         corners = [
-            _arc(
-                (center[0] + x * across, center[1] + y * up),
-                radius,
-                turn * math.pi / 2,
-                math.pi / 2,
-            )
-            for turn, (x, y) in enumerate(signs)
+            _arc(one, radius, turn * math.pi / 2, math.pi / 2) for turn, one in enumerate(centers)
         ]
         self.polygon(np.concatenate(corners), color)
 
@@ -247,12 +239,10 @@ class Canvas:
             self._write((pixels[0][0], pixels[0][1]), text, size, color, anchor)
 
     @_drawing
-    def caption(
-        self, pixel: tuple[int, int], text: str, size: int, color: Color, anchor: str = "topleft"
-    ) -> None:
-        """Write one line of text at a pixel from the upper left corner; see `text`."""
-        x, y = pixel[0] * self._supersampling, pixel[1] * self._supersampling
-        self._write((x, y), text, size, color, anchor)
+    def caption(self, pixel: tuple[int, int], text: str, size: int, color: Color) -> None:
+        """Write one line of text with its upper left corner at a pixel from that of the picture."""
+        x, y = pixel[0] * _SUPERSAMPLING, pixel[1] * _SUPERSAMPLING
+        self._write((x, y), text, size, color, "topleft")
 
     def picture(self) -> pygame.Surface:
         """Return the picture; the next call overwrites the surface."""
@@ -271,7 +261,7 @@ class Canvas:
     def _write(
         self, drawn: tuple[int, int], text: str, size: int, color: Color, anchor: str
     ) -> None:
-        label = self._label(text.replace("\0", ""), size * self._supersampling, color)
+        label = self._label(text.replace("\0", ""), size * _SUPERSAMPLING, color)
         self._drawn.blit(label, label.get_rect(**{anchor: drawn}))
 
     def _label(self, text: str, size: int, color: Color) -> pygame.Surface:
@@ -288,12 +278,8 @@ class Canvas:
         return self._fonts[size]
 
 
-def checked_size(size: Any, supersampling: int = 4) -> tuple[int, int]:
-    """Return the size of a picture.
-
-    Args:
-        size: Width and height, in pixels.
-        supersampling: Drawn pixels per pixel, along each axis.
+def checked_size(size: Any) -> tuple[int, int]:
+    """Return the size of a picture: width and height, in pixels.
 
     Raises:
         ConfigError: If the size is not a pair of positive integers, or is too large.
@@ -301,7 +287,7 @@ def checked_size(size: Any, supersampling: int = 4) -> tuple[int, int]:
     if not isinstance(size, tuple | list) or len(size) != 2:
         raise ConfigError(f"size must be a width and a height, not {shown(size)}")
     width, height = (check_integer("width and height", side, 1, 2**15) for side in size)
-    if width * height * supersampling**2 > _MOST_PIXELS:
+    if width * height * _SUPERSAMPLING**2 > _MOST_PIXELS:
         raise ConfigError(f"a picture of {width} x {height} pixels is too large")
     return width, height
 

@@ -1,11 +1,9 @@
 """The figures of a step, in a row at the top of a picture."""
 
 from dataclasses import dataclass
-from numbers import Real
 from typing import Final
 
-from fmugym.checks import float_or_nan
-from fmugym.errors import ConfigError, shown
+from fmugym.checks import check_text, number_of
 from fmugym.rendering import palette
 from fmugym.rendering.canvas import Canvas
 
@@ -32,12 +30,11 @@ class Overlay:
     episode_return: float | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.action, str):
-            raise ConfigError(f"the action of an overlay must be a text: {shown(self.action)}")
+        check_text("the action of an overlay", self.action)
         for name in ("time", "reward", "episode_return"):
             value = getattr(self, name)
-            if not isinstance(value, Real) and (value is not None or name == "time"):
-                raise ConfigError(f"{name} of an overlay must be a number, not {shown(value)}")
+            if value is not None or name == "time":
+                object.__setattr__(self, name, number_of(f"{name} of an overlay", value))
 
     def draw(self, canvas: Canvas) -> None:
         """Write the figures, in a size that follows the width of the picture."""
@@ -60,5 +57,4 @@ def _number(value: float | None) -> str:
     """Return two decimals, or a power of ten for a number too long for its column."""
     if value is None:
         return _NONE
-    number = float_or_nan(value)
-    return f"{number:.3e}" if abs(number) >= 1e7 else f"{number:.2f}"
+    return f"{value:.3e}" if abs(value) >= 1e7 else f"{value:.2f}"

@@ -5,7 +5,7 @@ from typing import Final, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fmugym.checks import check_number, check_text
+from fmugym.checks import check_number, check_option, check_text, has_method
 from fmugym.errors import ConfigError, shown
 from fmugym.rendering import palette
 from fmugym.rendering._pygame import pygame
@@ -61,10 +61,8 @@ class Renderer(Generic[FrameT]):
         render_mode: str = "rgb_array",
         title: str = "fmugym",
     ) -> None:
-        self.render_mode = check_text("render_mode", render_mode)
-        if self.render_mode not in _RENDER_MODES:
-            raise ConfigError(f"render_mode must be one of {_RENDER_MODES}: {shown(render_mode)}")
-        if not callable(getattr(scene, "draw", None)) or not hasattr(scene, "world"):
+        self.render_mode = check_option("render_mode", render_mode, _RENDER_MODES)
+        if not has_method(scene, "draw") or not hasattr(scene, "world"):
             raise ConfigError(f"a scene needs a method draw and a world: {shown(scene)}")
         self.scene = scene
         self.size = checked_size(size)

@@ -8,11 +8,9 @@ end the process with a message when they are called: nothing is ever computed wr
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Iterable, Mapping
 from importlib import resources
@@ -23,9 +21,10 @@ from fmugym.archive.dependencies import libraries_of
 from fmugym.archive.elf import opened
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError
+from fmugym.extras import c_compiler
 from fmugym.signals import ordinary
 
-__all__ = ["LIBRARIES", "StandIn", "build_stand_in", "find_compiler", "replaceable"]
+__all__ = ["LIBRARIES", "StandIn", "build_stand_in", "replaceable"]
 
 LIBRARIES: Final = {"libgfortran.so.3": "GFORTRAN_1.0", "libgfortran.so.4": "GFORTRAN_7"}
 """The libraries that can be replaced, each with its first symbol version."""
@@ -104,7 +103,7 @@ def _compile(path: Path, symbols: Mapping[str, str]) -> None:
         (folder / "lacking.c").write_text(_lacking(set(symbols) - _served()))
         (folder / "versions").write_text(_versions(symbols, LIBRARIES[path.name]))
         command = [
-            *find_compiler("a stand-in"),
+            *c_compiler("a stand-in"),
             *("-shared", "-fPIC", "-O1", "-w", "stand_in.c", "lacking.c", "-o", "library"),
             *(f"-Wl,-soname,{path.name}", "-Wl,--version-script=versions"),
         ]
@@ -146,26 +145,3 @@ def _versions(symbols: Mapping[str, str], first: str) -> str:
         lines.append(f"{version} {{ {shown}{hidden} }};")
         hidden = ""
     return "\n".join([*lines, ""])
-
-
-_PROGRAMS: Final = ("cc", "gcc", "clang")
-
-
-def find_compiler(what: str) -> list[str]:
-    """The command of a compiler for C.
-
-    Args:
-        what: What is to be built, for the error.
-
-    Raises:
-        ConfigError: If there is none; the text says how to get one.
-    """
-    found = next(filter(None, map(shutil.which, _PROGRAMS)), None)
-    if found is not None:
-        return [found]
-    if importlib.util.find_spec("ziglang") is None:
-        raise ConfigError(
-            f"{what} needs a C compiler: install gcc (Debian: apt install gcc), or ziglang "
-            "(pip install ziglang)"
-        )
-    return [sys.executable, "-m", "ziglang", "cc"]

@@ -14,15 +14,13 @@ from fmugym.baselines import controller_of
 from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.base import FloatArray
 from fmugym.errors import ConfigError, reason, shown
-from fmugym.search.policy import CONSTANT, Form, Policy
+from fmugym.search.policy import Form, Policy
 from fmugym.signals import ordinary
 
 __all__ = ["AGENT", "Agent"]
 
 AGENT: Final = "agent.npz"
 """The file of an agent in its folder."""
-
-_VERSION: Final = 1
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,8 @@ class Agent:
         """The agent that always gives all numbers of the action one value."""
         middles = np.array([(low + high) / 2 for low, high in ranges])
         halves = np.array([(high - low) / 2 for low, high in ranges])
-        return cls(name, None, CONSTANT, (value - middles) / halves)
+        form = Form("constant action", 0, len(ranges), blind=True)
+        return cls(name, None, form, (value - middles) / halves)
 
     def policy(self) -> Policy:
         """The controller, to be bound to an environment.
@@ -69,19 +68,10 @@ class Agent:
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""
-        facts = {
-            "version": _VERSION,
-            "name": self.name,
-            "controller": self.text,
-            "form": None if self.form is None else asdict(self.form),
-            "names": self.names,
-            "actions": self.actions,
-        }
+        facts = json.dumps(asdict(self) | {"weights": None, "scale": None})
         mean, divisor = self.scale
         with (folder / AGENT).open("wb") as file:
-            np.savez(
-                file, facts=json.dumps(facts), weights=self.weights, mean=mean, divisor=divisor
-            )
+            np.savez(file, facts=facts, weights=self.weights, mean=mean, divisor=divisor)
 
     @classmethod
     def load(cls, folder: Path) -> Self:
@@ -95,13 +85,12 @@ class Agent:
                 facts = json.loads(str(found["facts"]))
                 numbers = [np.asarray(found[n], np.float64) for n in ("weights", "mean", "divisor")]
             form = facts["form"]
-            form = None if form is None else Form(**form | {"hidden": tuple(form["hidden"])})
-            if facts["version"] != _VERSION or not all(np.isfinite(one).all() for one in numbers):
-                raise ValueError("of another version, or not finite")
-            told = facts["name"], facts["controller"], form
-            return cls(
-                *told, numbers[0], tuple(numbers[1:]), tuple(facts["names"]), facts["actions"]
-            )
+            form = form and Form(**form | {"hidden": tuple(form["hidden"])})
+            counts = [form.size, form.features, form.features] if form else [0, 0, 0]
+            if [len(one) for one in numbers] != counts or not np.isfinite(np.hstack(numbers)).all():
+                raise ValueError(f"expected {counts} finite numbers")
+            known = facts["name"], facts["text"], form, numbers[0], tuple(numbers[1:])
+            return cls(*known, tuple(facts["names"]), facts["actions"])
         except ordinary(Exception) as error:  # a damaged file may raise anything
             raise ConfigError(
                 f"the agent in {shown(str(folder))} cannot be read: {reason(error)}"

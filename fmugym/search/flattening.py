@@ -11,7 +11,7 @@ from gymnasium import spaces
 from fmugym.baselines.base import FloatArray
 from fmugym.errors import ConfigError
 
-__all__ = ["choices_of", "require_numbers", "rows_of", "width_of"]
+__all__ = ["choices_of", "require_numbers", "rows_of"]
 
 
 def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArray:
@@ -22,27 +22,24 @@ def rows_of(space: spaces.Space[Any], observations: Any, count: int) -> FloatArr
         observations: A batch of N, or one observation if N is 1.
         count: N.
     """
-    first, *rest = _columns(space, observations, count)
-    return np.concatenate([first, *rest], axis=1) if rest else first
+    columns = []
+    for part, values in _parts(space, observations):
+        rows = np.asarray(values, np.float64).reshape(count, -1)
+        if isinstance(part, spaces.Discrete | spaces.MultiDiscrete):
+            pairs = zip(rows.T, choices_of(part), strict=True)
+            columns += [1.0 * (row[:, None] == np.array(choice)) for row, choice in pairs]
+        else:
+            columns.append(rows)
+    return np.concatenate(columns, axis=1) if len(columns) > 1 else columns[0]
 
 
-def _columns(space: Any, values: Any, count: int) -> Iterator[FloatArray]:
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        parts: Any = space.items() if isinstance(space, spaces.Dict) else enumerate(space)
-        for key, part in parts:
-            yield from _columns(part, values[key], count)
+def _parts(space: Any, values: Any = None) -> Iterator[tuple[Any, Any]]:
+    """The spaces within Dicts and Tuples, each with its part of a batch."""
+    if not isinstance(space, spaces.Dict | spaces.Tuple):
+        yield space, values
         return
-    rows = np.asarray(values, np.float64).reshape(count, -1)
-    if not isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        yield rows
-        return
-    for row, choice in zip(rows.T, choices_of(space), strict=True):
-        yield (row[:, np.newaxis] == np.array(choice)).astype(np.float64)
-
-
-def width_of(space: spaces.Space[Any]) -> int:
-    """The number k of ``rows_of``."""
-    return int(spaces.flatdim(space))
+    for key, part in space.items() if isinstance(space, spaces.Dict) else enumerate(space):
+        yield from _parts(part, None if values is None else values[key])
 
 
 def choices_of(space: Any) -> list[range]:
@@ -65,7 +62,7 @@ def require_numbers(observed: spaces.Space[Any], acting: spaces.Space[Any]) -> N
             the cure.
     """
     kinds = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary
-    for part in _parts(observed):
+    for part, _ in _parts(observed):
         if not isinstance(part, kinds) or len(part.shape or ()) > 1:
             raise ConfigError(
                 f"a search needs numbers to observe, and {part} has none: give numbers by a hook, "
@@ -78,11 +75,3 @@ def require_numbers(observed: spaces.Space[Any], acting: spaces.Space[Any]) -> N
             f"a search needs actions with limits, got {acting}: give 'bounds' in the config, or "
             "'min' and 'max' in the task file"
         )
-
-
-def _parts(space: Any) -> Iterator[Any]:
-    if isinstance(space, spaces.Dict | spaces.Tuple):
-        for part in space.values() if isinstance(space, spaces.Dict) else space:
-            yield from _parts(part)
-    else:
-        yield space

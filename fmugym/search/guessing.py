@@ -82,7 +82,7 @@ def _pairs(
             for left, right in _differences(text):
                 for of, setpoint in ((left, right), (right, left)):
                     is_known = isinstance(setpoint, float) or setpoint in observed
-                    if of in observed - points and is_known:
+                    if of in observed - points and setpoint is not None and is_known:
                         yield str(of), setpoint
                         break
 
@@ -95,17 +95,18 @@ def _texts(section: Any) -> Iterator[str]:
             yield text
 
 
-def _differences(text: str) -> Iterator[tuple[str | float, str | float]]:
-    """The names or numbers on both sides of each minus."""
+def _differences(text: str) -> Iterator[tuple[str | float | None, str | float | None]]:
+    """What is on both sides of each minus."""
     for node in ast.walk(ast.parse(text.strip(), mode="eval")):
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-            sides = _side(node.left), _side(node.right)
-            if None not in sides:
-                yield sides  # type: ignore[misc]  # none of them is None
+            yield _side(node.left), _side(node.right)
 
 
 def _side(node: ast.expr) -> str | float | None:
-    if isinstance(node, ast.Name):
-        return node.id
-    is_number = isinstance(node, ast.Constant) and isinstance(node.value, int | float)
-    return float(node.value) if is_number else None  # type: ignore[attr-defined]
+    """A name or a number; None for anything else."""
+    match node:
+        case ast.Name(name):
+            return name
+        case ast.Constant(int() | float() as number):
+            return float(number)
+    return None

@@ -10,12 +10,13 @@ from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
 from fmugym.baselines.base import Controller, FloatArray, attribute_of, limited
 from fmugym.errors import ConfigError
-from fmugym.search.flattening import choices_of, rows_of, width_of
+from fmugym.search.flattening import choices_of, rows_of
 
-__all__ = ["CONSTANT", "LIMIT", "Form", "Policy", "Scale", "names_that_differ"]
+__all__ = ["LIMIT", "Form", "Policy", "Scale", "names_that_differ"]
 
 _NOTHING: Final = np.empty(0)
 
@@ -45,6 +46,8 @@ class Form:
 
     Attributes:
         name: What it is called.
+        observed: The number of observations.
+        acting: The number of outputs.
         hidden: The widths of the hidden layers, which end in a tanh.
         history: Whether the network also sees the last change of each observation, its leaky
             integral, and the last action.
@@ -52,26 +55,31 @@ class Form:
     """
 
     name: str
+    observed: int
+    acting: int
     hidden: tuple[int, ...] = ()
     history: bool = False
     blind: bool = False
 
-    def features(self, observed: int, acting: int) -> int:
+    @property
+    def features(self) -> int:
         """How many numbers the network sees."""
         if self.blind:
             return 0
-        return 3 * observed + acting if self.history else observed
+        return 3 * self.observed + self.acting if self.history else self.observed
 
-    def shapes(self, observed: int, acting: int) -> list[tuple[int, int]]:
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
         """The inputs, the constant one included, and the outputs of each layer."""
-        widths = [self.features(observed, acting), *self.hidden, acting]
+        widths = [self.features, *self.hidden, self.acting]
         return [(before + 1, after) for before, after in itertools.pairwise(widths)]
 
-    def size(self, observed: int, acting: int) -> int:
+    @property
+    def size(self) -> int:
         """The number of weights."""
-        return sum(before * after for before, after in self.shapes(observed, acting))
+        return sum(before * after for before, after in self.shapes)
 
-    def covariance(self, correlations: FloatArray | None, observed: int, acting: int) -> FloatArray:
+    def covariance(self, correlations: FloatArray | None) -> FloatArray:
         """Covariances of weights by which all parts of what is observed change outputs alike.
 
         Observations that go together would otherwise move the outputs more than what differs
@@ -79,48 +87,40 @@ class Form:
 
         Args:
             correlations: Of the k observations, shape (k, k); None if they are not known.
-            observed: The number of observations.
-            acting: The number of outputs.
 
         Returns:
             Shape (n, n), with n from ``size``.
         """
-        found = np.eye(self.size(observed, acting))
+        found = np.eye(self.size)
         if correlations is not None and correlations.any():
-            inverse = np.linalg.inv(correlations + _REGULARIZATION * np.eye(observed))
-            inverse *= observed / np.trace(inverse @ correlations)
-            after = self.shapes(observed, acting)[0][1]
-            place = observed * after
-            found[:place, :place] = np.kron(inverse, np.eye(after))
+            inverse = np.linalg.inv(correlations + _REGULARIZATION * np.eye(self.observed))
+            inverse *= self.observed / np.trace(inverse @ correlations)
+            first = np.kron(inverse, np.eye(self.shapes[0][1]))
+            found[: len(first), : len(first)] = first
         return found
 
-    def extended(self, weights: FloatArray, observed: int, acting: int) -> FloatArray:
+    def extended(self, weights: FloatArray) -> FloatArray:
         """The weights that decide as those of a linear policy without a history, shape (n,).
 
         This form is linear, too.
         """
-        found = np.zeros(self.shapes(observed, acting)[0])
-        given = weights.reshape(observed + 1, acting) * math.sqrt(len(found) / (observed + 1))
-        found[:observed], found[-1] = given[:-1], given[-1]
+        found, count = np.zeros(self.shapes[0]), self.observed + 1
+        given = weights.reshape(count, self.acting) * math.sqrt(len(found) / count)
+        found[: self.observed], found[-1] = given[:-1], given[-1]
         return found.ravel()
 
-    def layers(self, weights: FloatArray, observed: int, acting: int) -> Iterator[FloatArray]:
+    def layers(self, weights: FloatArray) -> Iterator[FloatArray]:
         """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
 
         Args:
             weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
                 step length suits all.
-            observed: The number of observations.
-            acting: The number of outputs.
         """
         place = 0
-        for before, after in self.shapes(observed, acting):
+        for before, after in self.shapes:
             part = weights[:, place : place + before * after]
             yield part.reshape(-1, before, after) / math.sqrt(before)
             place += before * after
-
-
-CONSTANT: Final = Form("constant action", blind=True)
 
 
 class Scale(NamedTuple):
@@ -174,6 +174,8 @@ class Policy(Controller):
             for any.
     """
 
+    masks: Callable[[], Any] | None
+
     def __init__(
         self,
         baseline: Controller | None,
@@ -192,12 +194,14 @@ class Policy(Controller):
         names = tuple(self._names_of(env) if names is None else names)
         if self.baseline is not None:
             self.baseline.bind(env, names)
-        self.masks = _masks_of(env)
+        base, self.masks = env.unwrapped, None
+        if hasattr(attribute_of(env, "unwrapped"), "action_masks"):
+            self.masks = lambda: base.call("action_masks") if is_vector else [base.action_masks()]
         return super().bind(env, names)
 
     def _names_of(self, env: Any) -> tuple[str, ...]:
         names = attribute_of(env, "observation_names")
-        return names or tuple(map(str, range(width_of(self._seen))))
+        return names or tuple(map(str, range(spaces.flatdim(self._seen))))
 
     def _rows(self, observation: Any) -> FloatArray:
         return rows_of(self._seen, observation, self.count)
@@ -211,13 +215,12 @@ class Policy(Controller):
         self.acting = sum(self.parts) or len(self.limits)
         self._require_task()
         if self.form is not None:
-            weights = np.atleast_2d(self.weights)
-            self._require_sizes(self.form, weights)
-            self._layers = list(self.form.layers(weights, len(self.names), self.acting))
+            self._layers = list(self.form.layers(np.atleast_2d(self.weights)))
+        self._memory = tuple(np.repeat(one[None], self.count, axis=0) for one in self.starts)
 
     def _require_task(self) -> None:
         """Refuse another task than that of the agent; the text names what differs."""
-        if self.task is None or self.task == (self.names, str(self.space)):
+        if self.task in (None, (self.names, str(self.space))):
             return
         names, space = self.task
         told = names_that_differ(names, self.names)
@@ -225,23 +228,11 @@ class Policy(Controller):
             told.append(f"its actions are {space}, here they are {self.space}")
         raise ConfigError(f"the agent is for another task: {'; '.join(told)}")
 
-    def _require_sizes(self, form: Form, weights: FloatArray) -> None:
-        sizes = len(self.names), self.acting
-        given = [(weights.shape[1], form.size(*sizes), "weights")]
-        given += [(len(one), form.features(*sizes), "scales") for one in self.scale]
-        for count, needed, what in given:
-            if count != needed:
-                raise ConfigError(f"a {form.name} needs {needed} {what} here, got {count}")
-
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:
             self.baseline.reset(mask)
-        starts = [np.repeat(one[None], self.count, axis=0) for one in self.starts]
-        if mask.all():
-            self._memory = tuple(starts)
-        else:
-            pairs = zip(starts, self._memory, strict=True)
-            self._memory = tuple(np.where(mask[:, None], start, now) for start, now in pairs)
+        pairs = zip(self.starts, self._memory, strict=True)
+        self._memory = tuple(np.where(mask[:, None], start, now) for start, now in pairs)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
         if self.baseline is None:
@@ -336,7 +327,7 @@ class Policy(Controller):
         if not self.parts:
             return outputs
         if self.masks is not None:
-            outputs = np.where(self.masks().T, outputs, -np.inf)
+            outputs = np.where(np.array(self.masks()).T, outputs, -np.inf)
         split = np.split(outputs, np.cumsum(self.parts)[:-1])
         return [
             one[0] + part.argmax(axis=0) for one, part in zip(self._choices, split, strict=True)
@@ -350,18 +341,6 @@ def names_that_differ(own: Sequence[str], here: Sequence[str]) -> list[str]:
     if more:
         told.append(f"this task also gives {', '.join(more)}")
     return told or (["the order of the observations differs"] if list(own) != list(here) else [])
-
-
-def _masks_of(env: Any) -> Callable[[], npt.NDArray[np.bool_]] | None:
-    """A function that tells which choices are allowed now, shape (N, choices); None if all are."""
-    try:
-        attribute_of(env, "action_masks")
-    except AttributeError:
-        return None
-    base = env.unwrapped
-    if hasattr(base, "single_action_space"):
-        return lambda: np.stack(base.call("action_masks"))
-    return lambda: np.array([base.action_masks()])
 
 
 def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:

@@ -16,7 +16,7 @@ from fmugym.baselines.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, m
 from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
-from fmugym.search.policy import CONSTANT, Form, Policy, Scale
+from fmugym.search.policy import Form, Policy, Scale
 
 __all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
 
@@ -61,10 +61,8 @@ _GROWTH: Final = 5.0
 _MANY: Final = 200
 """More weights than this are searched without covariances."""
 
-_LINEAR, _HISTORY = Form("linear"), Form("linear with history", history=True)
-_NETWORK = Form("network", hidden=(16,))
-
-_SIGMAS: Final = {_LINEAR: 1.0, _HISTORY: 1.0, _NETWORK: 4.0, CONSTANT: 1.0}
+_SIGMA: Final = 1.0
+_SIGMA_OF_NETWORKS: Final = 4.0
 _CORRECTION: Final = 0.4
 """The first steps of the weights, and the part of them where they correct a controller."""
 
@@ -142,7 +140,8 @@ class Search:
         self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
         self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
         if not (fixed or tunable or guesses):
-            make = _Policies(Agent("", None), CONSTANT, (np.empty(0), np.empty(0)))
+            form = Form("constant action", *sizes, blind=True)
+            make = _Policies(Agent("", None), form, (np.empty(0), np.empty(0)))
             self._tuned = [replace(self._entrant(make), quota=_TRYING)]
         self._contenders: list[Entrant] = []
         self._gone: list[Entrant] = []
@@ -221,7 +220,7 @@ class Search:
                 one.cma = self._cma(one.make, one.best)
             one.gained = one.rounds
             if one.then is not None:
-                start = one.then.form.extended(one.best, *self._sizes)
+                start = one.then.form.extended(one.best)
                 self._contenders.append(
                     Entrant(self._cma(one.then, start), one.then, self.episodes)
                 )
@@ -252,46 +251,48 @@ class Search:
         return Entrant(cma, _Tuned(name, tunable), self.episodes, quota)
 
     def _entrant(self, make: _Policies) -> Entrant:
-        cma = self._cma(make, np.zeros(make.form.size(*self._sizes)))
+        cma = self._cma(make, np.zeros(make.form.size))
         return Entrant(cma, make, self.episodes)
 
     def _cma(self, make: _Policies, start: FloatArray) -> CMA:
-        sigma = _SIGMAS[make.form] * (1.0 if make.under.text is None else _CORRECTION)
+        sigma = _SIGMA_OF_NETWORKS if make.form.hidden else _SIGMA
+        sigma *= 1.0 if make.under.text is None else _CORRECTION
         alike = np.ones(len(start))
         if len(start) <= _MANY:
-            alike = make.form.covariance(make.correlations, *self._sizes)
+            alike = make.form.covariance(make.correlations)
         limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
         return CMA(start, sigma, self.population, self._rng, alike, **limits)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
+        linear = Form("linear", *self._sizes)
+        history = Form("linear with history", *self._sizes, history=True)
+        network = Form("network", *self._sizes, hidden=(16,))
         middle = Agent("", None)
-        scale = self._scale(arena, baseline, middle)
+        scale = self._scale(arena, history, baseline, middle)
 
         def make(under: Agent, form: Form, correlations: FloatArray | None = None) -> _Policies:
-            count = form.features(*self._sizes)
-            parts = scale.mean[:count], scale.divisor[:count]
+            parts = scale.mean[: form.features], scale.divisor[: form.features]
             return _Policies(under, form, parts, correlations)
 
         if baseline.text is None:
-            alone = [_LINEAR, _HISTORY, _NETWORK]
+            alone = [linear, history, network]
         else:  # only these observations are like those that were seen
-            alone = [_LINEAR, _NETWORK]
-            first = self._entrant(make(baseline, _LINEAR, scale.correlations))
-            first.then = make(baseline, _HISTORY, scale.correlations)
+            alone = [linear, network]
+            first = self._entrant(make(baseline, linear, scale.correlations))
+            first.then = make(baseline, history, scale.correlations)
             self._contenders.append(first)
         self._contenders += [self._entrant(make(middle, form)) for form in alone]
 
-    def _scale(self, arena: Arena, *agents: Agent) -> Scale:
+    def _scale(self, arena: Arena, history: Form, *agents: Agent) -> Scale:
         """What observations are like while each candidate adds another constant."""
-        size, acting = _HISTORY.size(*self._sizes), self._sizes[1]
-        count = _HISTORY.features(*self._sizes)
+        count, acting = history.features, history.acting
         moments: FloatArray = np.zeros(())
         for agent in agents:
-            rows = np.zeros((self.population, size))
+            rows = np.zeros((self.population, history.size))
             rows[:, -acting:] = self._rng.uniform(-1, 1, (self.population, acting))
-            rows *= np.sqrt(_HISTORY.shapes(*self._sizes)[0][0])
-            make = _Policies(agent, _HISTORY, (np.zeros(count), np.ones(count)))
+            rows *= np.sqrt(history.shapes[0][0])
+            make = _Policies(agent, history, (np.zeros(count), np.ones(count)))
             seeds = self._training(self.episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
             moments = moments + outcome.watched.sum(axis=(0, 1))

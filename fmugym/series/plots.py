@@ -124,9 +124,9 @@ def plot(series: TimeSeries, path: str | os.PathLike[str] | None = None, title: 
     return figure
 
 
-def as_svg(series: TimeSeries, title: str = "") -> str:
+def as_svg(series: TimeSeries) -> str:
     """Draw an episode as the text of an SVG element, whose letters are text."""
-    return svg_of(_figure(series, title))
+    return svg_of(_figure(series, ""))
 
 
 def drawing_style() -> AbstractContextManager[None]:

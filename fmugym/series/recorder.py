@@ -52,7 +52,7 @@ class _Recorder:
         self._path = None if path is None else check_path("the path of a recording", path)
         self._most_rows = check_count("most_rows", most_rows)
         self._memory: Memory | None = None
-        self._file: Store | None = None
+        self._stores: list[Store] = []
         self.has_begun = False
         self._steps: Any = None
 
@@ -75,9 +75,10 @@ class _Recorder:
         if self._steps is not None:
             self._rows.go_on(self._steps)
         if self._path is not None:
-            self._file = open_store(self._path, self._rows.columns)
-            weakref.finalize(self, self._file.close)
+            self._stores.append(open_store(self._path, self._rows.columns))
+            weakref.finalize(self, self._stores[0].close)
         self._memory = Memory(self._rows.columns, self._most_rows)
+        self._stores.append(self._memory)
 
     def add(self, outcome: Outcome, idle: MaskArray) -> None:
         """Write down a step."""
@@ -89,12 +90,8 @@ class _Recorder:
         return present(self.episodes, self._choice, self._indices)
 
     def _add(self, block: Block) -> None:
-        if not len(block):
-            return
-        if self._memory is not None:
-            self._memory.add(block)
-        if self._file is not None:
-            self._file.add(block)
+        for store in self._stores if len(block) else ():
+            store.add(block)
 
     @property
     def series(self) -> TimeSeries:
@@ -106,10 +103,10 @@ class _Recorder:
         return TimeSeries(self._rows.columns, block.values, block.faults, limits, block.texts)
 
     def close(self) -> None:
-        """Complete the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        """Complete the file; rows that follow are only in memory."""
+        for store in self._stores:
+            store.close()
+        self._stores = [store for store in self._stores if store is self._memory]
 
 
 def _chosen(environments: Iterable[int] | None, count: int) -> Any:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from html import escape
+from statistics import fmean
 from typing import Final
 
 from fmugym.checks import check_path
@@ -74,6 +76,9 @@ _PAGE: Final = """<!doctype html>
 </html>
 """
 
+_MOST_PICTURES: Final = 6
+"""The episodes of each run that are drawn."""
+
 _CAPTION: Final = "Dashed lines: set points (black) and limits (red)."
 
 _IDS: Final = re.compile(r'(\bid="|url\(#|href="#)')
@@ -88,7 +93,6 @@ def write_report(
     facts: Mapping[str, str] | None = None,
     text: str = "",
     charts: Mapping[str, str] | None = None,
-    most_pictures: int = 6,
 ) -> None:
     """Write a report of episodes.
 
@@ -101,16 +105,13 @@ def write_report(
         text: The task, as its file has it.
         charts: More pictures, by their headings: SVG elements, as ``Figure.savefig`` of Matplotlib
             writes them.
-        most_pictures: The episodes of each run that are drawn.
 
     Raises:
         ConfigError: If Matplotlib is missing, or nothing was recorded.
         FileExistsError: If the file exists.
     """
     file = check_path("the path of a report", path)
-    body = "\n".join(
-        _body(runs, title, description, facts or {}, text, charts or {}, most_pictures)
-    )
+    body = "\n".join(_body(runs, title, description, facts or {}, text, charts or {}))
     page = _PAGE.format(title=escape(title), style=_STYLE, body=body)
     with file.open("x", encoding="utf-8", newline="\n") as stream:
         stream.write(page)
@@ -123,7 +124,6 @@ def _body(
     facts: Mapping[str, str],
     text: str,
     charts: Mapping[str, str],
-    most: int,
 ) -> Iterator[str]:
     found = {name: summaries(series) for name, series in runs.items()}
     yield f"<header><h1>{escape(title)}</h1>"
@@ -139,7 +139,7 @@ def _body(
         yield f"<h2>{escape(heading)}</h2><figure>{svg}</figure>"
     for number, (name, series) in enumerate(runs.items()):
         yield f"<h2>{escape(name)}</h2>"
-        yield from _episodes(series, most, f"r{number}")
+        yield from _episodes(series, f"r{number}")
     if text:
         yield f"<h2>Task</h2><pre>{escape(text)}</pre>"
 
@@ -150,91 +150,84 @@ def _results(
     """The table of means, and that of all episodes if there are several of a run."""
     rows = [(name, one) for name, episodes in found.items() for one in episodes]
     limits = {k: limit for series in runs.values() for k, limit in series.cost_limits.items()}
+    figures = _Figures([one for _, one in rows], limits)
     if any(len(episodes) > 1 for episodes in found.values()):
         yield "<h3>Means over the episodes of each run</h3>"
-        yield _means(found, limits)
+        yield _means(found, figures)
         yield "<h3>Each episode</h3>"
-    yield _table(_header(rows, limits), [_row(name, one, rows, limits) for name, one in rows])
+    several = len({one.environment for _, one in rows}) > 1
+    header = ["", *(["environment"] if several else []), "episode", *figures.header]
+    cells = [
+        [
+            _text(name, "first"),
+            *([_cell(str(one.environment))] if several else []),
+            _cell(str(one.episode)),
+            *figures.cells(one),
+            *(_cell(str(one.steps)), _cell(_duration(one.seconds)), _text(one.end)),
+        ]
+        for name, one in rows
+    ]
+    yield _table([*header, "steps", "simulated", "end"], cells)
     if limits:
         yield '<p class="soft">Costs above their limit are red.</p>'
 
 
-def _names(rows: Iterable[tuple[str, EpisodeSummary]], group: str) -> list[str]:
-    return list(dict.fromkeys(name for _, one in rows for name in getattr(one, group)))
+class _Figures:
+    """The columns that episodes and means over them have: the reward, its terms, costs, KPIs."""
 
-
-def _header(rows: Sequence[tuple[str, EpisodeSummary]], limits: Mapping[str, float]) -> list[str]:
-    several = _has_many(rows)
-    costs = [f"{n} (at most {limits[n]:g})" if n in limits else n for n in _names(rows, "costs")]
-    return [
-        *("", *(["environment"] if several else []), "episode", "reward"),
-        *_names(rows, "terms"),
-        *costs,
-        *_names(rows, "kpis"),
-        *("steps", "simulated", "end"),
-    ]
-
-
-def _has_many(rows: Sequence[tuple[str, EpisodeSummary]]) -> bool:
-    return len({one.environment for _, one in rows}) > 1
-
-
-def _row(
-    name: str,
-    one: EpisodeSummary,
-    rows: Sequence[tuple[str, EpisodeSummary]],
-    limits: Mapping[str, float],
-) -> list[str]:
-    """The cells of an episode."""
-    return [
-        _text(name, "first"),
-        *([_cell(str(one.environment))] if _has_many(rows) else []),
-        _cell(str(one.episode)),
-        _cell(_number(one.reward)),
-        *(_cell(_number(one.terms.get(n))) for n in _names(rows, "terms")),
-        *(_cost(one.costs.get(n), limits.get(n)) for n in _names(rows, "costs")),
-        *(_cell(_number(one.kpis.get(n))) for n in _names(rows, "kpis")),
-        _cell(str(one.steps)),
-        _cell(_duration(one.seconds)),
-        _text(one.end),
-    ]
-
-
-def _means(found: Mapping[str, Sequence[EpisodeSummary]], limits: Mapping[str, float]) -> str:
-    rows = [(name, one) for name, episodes in found.items() for one in episodes]
-    terms, costs, kpis = (_names(rows, group) for group in ("terms", "costs", "kpis"))
-    best = max(_mean([one.reward for one in episodes]) for episodes in found.values())
-    cells = []
-    for name, episodes in found.items():
-        rewards = [one.reward for one in episodes]
-        reward, half = _mean(rewards), confidence(rewards)
-        is_best = len(found) > 1 and reward == best
-        cells.append(
-            [
-                _text(name, "first"),
-                _cell(str(len(episodes))),
-                _cell(_number(reward), "best" if is_best else ""),
-                _cell(_number(half)),
-                *(_cell(_number(_mean_of(episodes, "terms", n))) for n in terms),
-                *(_cost(_mean_of(episodes, "costs", n), limits.get(n)) for n in costs),
-                *(_cell(_number(_mean_of(episodes, "kpis", n))) for n in kpis),
-            ]
+    def __init__(self, episodes: Sequence[EpisodeSummary], limits: Mapping[str, float]) -> None:
+        self._terms, self._costs, self._kpis = (
+            list(dict.fromkeys(name for one in episodes for name in getattr(one, group)))
+            for group in ("terms", "costs", "kpis")
         )
-    return _table(["", "episodes", "reward", "± (95 %)", *terms, *costs, *kpis], cells)
+        self._limits = limits
+        costs = [f"{n} (at most {limits[n]:g})" if n in limits else n for n in self._costs]
+        self.header = ["reward", *self._terms, *costs, *self._kpis]
+
+    def cells(self, one: EpisodeSummary, kind: str = "") -> Iterator[str]:
+        """The cells of one row; the kind is that of its reward."""
+        yield _cell(_number(one.reward), kind)
+        yield from (_cell(_number(one.terms.get(name))) for name in self._terms)
+        for name in self._costs:
+            value = one.costs.get(name, math.nan)
+            yield _cell(_number(value), "bad" if value > self._limits.get(name, math.inf) else "")
+        yield from (_cell(_number(one.kpis.get(name))) for name in self._kpis)
 
 
-def _mean(values: Sequence[float]) -> float:
-    return math.fsum(values) / len(values) if values else math.nan
+def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> str:
+    means = {name: _mean(episodes) for name, episodes in found.items() if episodes}
+    best = max(one.reward for one in means.values()) if len(means) > 1 else None
+    cells = [
+        [
+            _text(name, "first"),
+            _cell(str(len(found[name]))),
+            _cell(_number(confidence([episode.reward for episode in found[name]]))),
+            *figures.cells(one, "best" if one.reward == best else ""),
+        ]
+        for name, one in means.items()
+    ]
+    return _table(["", "episodes", "± (95 %)", *figures.header], cells)
 
 
-def _mean_of(episodes: Sequence[EpisodeSummary], group: str, name: str) -> float:
-    dicts = [getattr(one, group) for one in episodes]
-    return _mean([values[name] for values in dicts if name in values])
+def _mean(episodes: Sequence[EpisodeSummary]) -> EpisodeSummary:
+    """The means of rewards, costs and KPIs, where episodes have them."""
+    return replace(
+        episodes[0],
+        reward=fmean(one.reward for one in episodes),
+        terms=_means_by_name([one.terms for one in episodes]),
+        costs=_means_by_name([one.costs for one in episodes]),
+        kpis=_means_by_name([one.kpis for one in episodes]),
+    )
 
 
-def _episodes(series: TimeSeries, most: int, prefix: str) -> Iterator[str]:
+def _means_by_name(dicts: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    names = {name for one in dicts for name in one}
+    return {name: fmean(one[name] for one in dicts if name in one) for name in names}
+
+
+def _episodes(series: TimeSeries, prefix: str) -> Iterator[str]:
     episodes = series.episodes()
-    for number, (key, one) in enumerate(list(episodes.items())[:most]):
+    for number, (key, one) in enumerate(list(episodes.items())[:_MOST_PICTURES]):
         where = f"Environment {key[0]}, episode {key[1]}" if key[0] else f"Episode {key[1]}"
         yield f"<h3>{where}</h3>" if len(episodes) > 1 else ""
         picture = _inline(as_svg(one), f"{prefix}-{number}")
@@ -247,8 +240,8 @@ def _episodes(series: TimeSeries, most: int, prefix: str) -> Iterator[str]:
         if texts := list(text_courses(one)):
             table = _table(["String", "text", "first at", "share"], list(map(_texts, texts)))
             yield f"<details{opened}><summary>Strings</summary>{table}</details>"
-    if len(episodes) > most:
-        yield f'<p class="soft">{len(episodes) - most} more episodes are not drawn.</p>'
+    if len(episodes) > _MOST_PICTURES:
+        yield f'<p class="soft">{len(episodes) - _MOST_PICTURES} more episodes are not drawn.</p>'
 
 
 def _inline(svg: str, prefix: str) -> str:
@@ -283,11 +276,6 @@ def _text(text: str, kind: str = "") -> str:
 
 def _cell(text: str, kind: str = "") -> str:
     return f'<td class="{kind}">{text}</td>' if kind else f"<td>{text}</td>"
-
-
-def _cost(value: float | None, limit: float | None) -> str:
-    is_bad = value is not None and limit is not None and value > limit
-    return _cell(_number(value), "bad" if is_bad else "")
 
 
 def _number(value: float | None) -> str:

@@ -113,7 +113,6 @@ class Memory:
         self._blocks: deque[Block] = deque()
         self._small: list[Block] = []
         self._rows = 0
-        self.dropped = 0
 
     def add(self, block: Block) -> None:
         """Add rows. Small blocks are put together, since each takes memory of its own."""
@@ -122,8 +121,7 @@ class Memory:
         if len(self._small) >= 1000:
             self._join()
         while self._blocks and self._rows - len(self._blocks[0]) >= self._most:
-            old = len(self._blocks.popleft())
-            self._rows, self.dropped = self._rows - old, self.dropped + old
+            self._rows -= len(self._blocks.popleft())
 
     def _join(self) -> None:
         self._blocks.append(Block.joined(self._small, self._width))

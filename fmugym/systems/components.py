@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from fmugym.archive.description import INTERFACES
 from fmugym.archive.fmu import FMU
 from fmugym.archive.structure import Feedthrough
-from fmugym.archive.variable import Variable, unknown_rest
-from fmugym.checks import (
-    KnownArguments,
-    check_flag,
-    check_number,
-    check_path,
-    parts_of_array,
-)
+from fmugym.archive.variable import Variable, checked_value, unknown_rest
+from fmugym.checks import KnownArguments, check_flag, check_path, parts_of_array
 from fmugym.errors import ConfigError, FMULoadError, shown, unknown_name
 from fmugym.keys import COUNT, FLAG, Entries, Kind, check_fields, key, option
 from fmugym.systems import system_plan
 
-__all__ = ["Component", "OpenComponent", "start_number"]
+__all__ = ["Component", "OpenComponent"]
 
 _NO_NAME = set('/\\:*?"<>|')
 
@@ -84,11 +78,6 @@ class Component(KnownArguments):
     def __post_init__(self) -> None:
         check_fields(self)
 
-    @classmethod
-    def of(cls, value: Any) -> Component:
-        """Return a component as it is, or make one of an FMU."""
-        return value if isinstance(value, Component) else cls(value)
-
 
 class OpenComponent:
     """A component whose FMU has been read.
@@ -133,11 +122,11 @@ class OpenComponent:
                 f"{variable.causality} with initial={variable.initial!r}"
             )
         if not variable.shape:
-            yield name, start_number(f"{self.name}.{name}", variable, value)
+            yield name, _start(f"{self.name}.{name}", variable, value)
             return
         parts = parts_of_array(f"{self.name}.{name}", variable.shape, value)
         for element, part in zip(variable.elements, parts, strict=True):
-            yield element.name, start_number(f"{self.name}.{element.name}", element, part)
+            yield element.name, _start(f"{self.name}.{element.name}", element, part)
 
     def _require_rest(self) -> None:
         """FMI sets whole arrays, and the FMU does not tell the start values of a new size."""
@@ -188,31 +177,13 @@ class OpenComponent:
         )
 
 
-def start_number(name: str, variable: Variable, value: Any) -> float | str:
-    """Convert a start value for a variable, without loss.
-
-    Args:
-        name: The name of the variable, for errors.
-        variable: The variable.
-        value: A number, a Boolean, a text, or the name of an item of an enumeration.
-
-    Raises:
-        ConfigError: If the value is not of the variable's kind.
-    """
+def _start(name: str, variable: Variable, value: Any) -> float | str:
+    """Convert a start value for a variable, which is called by another name in errors."""
     if variable.kind == "string" and isinstance(value, str):
         return str.__str__(value)
     if not variable.numeric:
         raise ConfigError(f"{name} is of type {variable.type} and cannot be {shown(value)}")
-    items = dict(variable.items)
-    if isinstance(value, str) and value in items:
-        return float(items[value])
-    if isinstance(value, str) and items:
-        raise unknown_name(f"item of {name}", value, items)
-    number = check_number(name, value, may_be_boolean=variable.kind == "boolean")
-    whole = variable.kind in {"integer", "enumeration"}
-    if (whole and not number.is_integer()) or (variable.kind == "boolean" and number not in {0, 1}):
-        raise ConfigError(f"{name} is of type {variable.type}, got {shown(value)}")
-    return number
+    return checked_value(replace(variable, name=name), value)
 
 
 def _opened(given: Component) -> FMU:

@@ -9,7 +9,7 @@ from fmugym.checks import check_path
 from fmugym.errors import ConfigError, printable, reason
 from fmugym.extras import imported
 from fmugym.signals import ordinary
-from fmugym.systems.placing import Box, Layout, Wire, layout_of
+from fmugym.systems.placing import Box, Picture, Wire, picture_of
 from fmugym.systems.wired import WiredSystem
 
 __all__ = ["draw"]
@@ -42,7 +42,7 @@ def draw(system: WiredSystem, path: str | os.PathLike[str] | None = None) -> Any
     """
     matplotlib: Any = imported("matplotlib", "plot")
     with matplotlib.rc_context(_STYLE):
-        figure = _figure(system, layout_of(system))
+        figure = _figure(system, picture_of(system))
         if path is not None:
             file = check_path("the path of a picture", path)
             try:
@@ -57,22 +57,22 @@ def _metadata(suffix: str) -> dict[str, None] | None:
     return {"Date": None} if suffix.lower() == ".svg" else None
 
 
-def _figure(system: WiredSystem, layout: Layout) -> Any:
+def _figure(system: WiredSystem, picture: Picture) -> Any:
     figures: Any = imported("fmugym.figures", "plot")
-    width, height = layout.size
+    width, height = picture.size
     size = max(width + 2 * _MARGIN, 5.0), height + 2 * _MARGIN + 2 * _TITLE
     figure = figures.Figure(figsize=size)
     axes = figure.add_axes((0, 0, 1, 1))
-    top = max(box.y for box in layout.boxes.values())
+    top = max(box.y for box in picture.boxes.values())
     axes.set_xlim(-_MARGIN, size[0] - _MARGIN)
     axes.set_ylim(top + _MARGIN + _TITLE - size[1], top + _MARGIN + _TITLE)
     axes.axis("off")
-    for wire in layout.wires:
-        _draw_wire(axes, wire, layout.boxes[wire.target[0]])
-    for key, name in layout.open_ports:
-        x, y = layout.boxes[key].port(name, left=True)
+    for wire in picture.wires:
+        _draw_wire(axes, wire, picture.boxes[wire.target[0]])
+    for key, name in picture.open_ports:
+        x, y = picture.boxes[key].port(name, left=True)
         axes.plot([x - 0.22, x], [y, y], color=_GREY, lw=0.9, ls=":")
-    for box in layout.boxes.values():
+    for box in picture.boxes.values():
         _draw_box(axes, box)
     _write_captions(axes, system, top, top + _MARGIN + _TITLE - size[1])
     return figure

@@ -15,7 +15,7 @@ from typing import Final
 from fmugym.systems.system_plan import Connector, Link
 from fmugym.systems.wired import WiredSystem
 
-__all__ = ["Box", "Layout", "Wire", "layout_of"]
+__all__ = ["Box", "Picture", "Wire", "picture_of"]
 
 ROW: Final = 0.24
 _HEAD: Final = 0.52
@@ -103,7 +103,7 @@ class Wire:
 
 
 @dataclass(frozen=True)
-class Layout:
+class Picture:
     """A picture of a system.
 
     Attributes:
@@ -119,7 +119,7 @@ class Layout:
     size: Point
 
 
-def layout_of(system: WiredSystem) -> Layout:
+def picture_of(system: WiredSystem) -> Picture:
     """Place the components, names and wires of a system."""
     boxes = {name: Box(name, one.fmu.path.name) for name, one in system.components.items()}
     wires = [_wire(link, system) for link in system.links]
@@ -131,7 +131,7 @@ def layout_of(system: WiredSystem) -> Layout:
     _set_columns(boxes, wires, [n for group in system.order.groups for n in group.components])
     columns = _Columns(boxes, wires)
     size = columns.place()
-    return Layout(boxes, wires, ports, size)
+    return Picture(boxes, wires, ports, size)
 
 
 def _wire(link: Link, system: WiredSystem) -> Wire:

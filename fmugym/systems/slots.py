@@ -12,7 +12,6 @@ from typing import TypeAlias
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.variable import Variable
-from fmugym.errors import ConfigError
 from fmugym.systems.system_description import PartVariable, SystemDescription
 from fmugym.systems.system_plan import Component, Evaluation, Group, Link
 
@@ -51,26 +50,13 @@ class PartLayout:
     @cached_property
     def starts(self) -> tuple[tuple[Variable, float | str], ...]:
         """What the plan sets before the initialization."""
-        return tuple((self._settable(name), value) for name, value in self.component.starts)
+        starts = self.component.starts
+        return tuple((self.description.variable(name), value) for name, value in starts)
 
     def starts_of(self, variables: Iterable[Variable]) -> list[float]:
         """What numeric scalars and elements of this component start with."""
         known = dict(self.component.starts)
         return [float(known.get(one.name, one.start_number)) for one in variables]
-
-    @cached_property
-    def clocks(self) -> tuple[int, ...]:
-        """The places of the clocks among the inputs: each tick is for one step only."""
-        return tuple(place for place, variable in enumerate(self.inputs) if variable.ticking)
-
-    def _settable(self, name: str) -> Variable:
-        variable = self.description.variable(name)
-        if not variable.settable_at_start:
-            raise ConfigError(
-                f"{self.component.name}.{name} cannot be set: it is a {variable.variability} "
-                f"{variable.causality} with initial={variable.initial!r}"
-            )
-        return variable
 
 
 @dataclass(frozen=True)
@@ -93,16 +79,6 @@ class Route:
     offset: float
     link: int
 
-    @property
-    def sources(self) -> range:
-        """The slots of outputs."""
-        return range(self.source, self.source + self.count)
-
-    @property
-    def targets(self) -> range:
-        """The slots of inputs."""
-        return range(self.target, self.target + self.count)
-
 
 class Layout:
     """The slots and routes of a system.
@@ -116,7 +92,6 @@ class Layout:
         description, plan: Of the system.
         parts: One for each component.
         routes: In the order of their targets.
-        number_of_inputs, number_of_outputs: Slots in all.
 
     Raises:
         ConfigError: If a name of the plan is unknown, or a variable cannot be used in its role.
@@ -146,15 +121,12 @@ class Layout:
         for index, part in enumerate(self.parts):
             part.inputs = list(_different(_wholes(own_inputs.get(index, []))))
             part.outputs = list(_different(_wholes(own_outputs.get(index, []))))
-        self.number_of_inputs = self.number_of_outputs = 0
         for index, part in enumerate(self.parts):
-            part.first_input, part.first_output = self.number_of_inputs, self.number_of_outputs
+            part.first_input, part.first_output = len(self._input_slots), len(self._output_slots)
             for place, variable in enumerate(part.inputs, part.first_input):
                 self._input_slots[index, *_key(variable)] = place
             for place, variable in enumerate(part.outputs, part.first_output):
                 self._output_slots[index, *_key(variable)] = place
-            self.number_of_inputs += len(part.inputs)
-            self.number_of_outputs += len(part.outputs)
 
     def _source(self, link: Link) -> tuple[int, Variable]:
         part = self._numbers[link.source]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from pathlib import Path
+from functools import partial
 from typing import Any, Self
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT
@@ -118,11 +118,11 @@ class FMUSystem(WiredSystem):
         """
         return draw(self, path)
 
-    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[Any, tuple[()]]:
         """A system pickles as the file that it came from, or as its arguments."""
         if self.file is not None:
-            return _read_again, (type(self), self.file, self.master)
-        return _again, (type(self), self.arguments())
+            return partial(type(self).read, self.file, master=self.master), ()
+        return partial(type(self), **self.arguments()), ()
 
     def arguments(self) -> dict[str, Any]:
         """The arguments that make this system once more, FMUs as their paths."""
@@ -131,24 +131,8 @@ class FMUSystem(WiredSystem):
             for name, one in self.components.items()
         }
         return {
+            **self._given,
             "components": components,
-            "connections": self.connections,
-            "name": self.name,
-            "units": self.units,
-            "master": self.master,
-            "loops": self.loops,
-            "loop_tolerance": self.loop.tolerance,
-            "loop_iterations": self.loop.max_iterations,
-            **self.times,
-            "description": self.description,
             "own_names": self.own_names,
             "unit_definitions": self.unit_definitions,
         }
-
-
-def _read_again(cls: type[FMUSystem], file: Path, master: str) -> FMUSystem:
-    return cls.read(file, master=master)
-
-
-def _again(cls: type[FMUSystem], arguments: dict[str, Any]) -> FMUSystem:
-    return cls(**arguments)

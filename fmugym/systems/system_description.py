@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Final
 
-import numpy as np
-
 from fmugym.archive.description import Capabilities, ModelDescription, Unit
+from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.archive.variable import MOST_ELEMENTS, Variable
-from fmugym.errors import ConfigError, unknown_name
+from fmugym.errors import ConfigError
 from fmugym.systems.system_plan import Connector, End, SystemPlan
 
 __all__ = ["PartVariable", "SystemDescription", "describe_system"]
@@ -138,7 +137,7 @@ def describe_system(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Syst
         start_time=plan.start_time,
         stop_time=plan.stop_time,
         tolerance=plan.tolerance,
-        step_size=_step_size(plan, parts),
+        step_size=plan.step_size,
         fixed_internal_step_size=None,
         capabilities=_capabilities(plan, parts),
         variables=variables,
@@ -158,15 +157,6 @@ def _derivatives(plan: SystemPlan, parts: Sequence[ModelDescription]) -> dict[st
         for component, part in zip(plan.components, parts, strict=True)
         for state, derivative in part.derivatives.items()
     }
-
-
-def _step_size(plan: SystemPlan, parts: Sequence[ModelDescription]) -> float | None:
-    """The plan's; or else the smallest that fits the default of a component."""
-    if plan.step_size is not None:
-        return plan.step_size
-    pairs = zip(plan.components, parts, strict=True)
-    steps = [part.step_size * one.steps for one, part in pairs if part.step_size is not None]
-    return min(steps, default=None)
 
 
 def _capabilities(plan: SystemPlan, parts: Sequence[ModelDescription]) -> Capabilities:
@@ -196,7 +186,7 @@ def _units(plan: SystemPlan, parts: Iterable[ModelDescription]) -> dict[str, Uni
 def _variables(
     plan: SystemPlan, parts: Sequence[ModelDescription]
 ) -> tuple[dict[str, Variable], tuple[tuple[PartVariable, ...], ...]]:
-    numbers = _Numbers(plan)
+    numbers = {one.name: number for number, one in enumerate(plan.components)}
     driven = _driven(plan, parts, numbers)
     variables: dict[str, Variable] = {}
     ends: list[tuple[PartVariable, ...]] = []
@@ -220,19 +210,8 @@ def _variables(
     return variables, tuple(ends)
 
 
-class _Numbers(dict[str, int]):
-    """The numbers of components by name."""
-
-    def __init__(self, plan: SystemPlan) -> None:
-        super().__init__((one.name, number) for number, one in enumerate(plan.components))
-        self._plan = plan
-
-    def __missing__(self, name: str) -> int:
-        raise unknown_name(f"component of {self._plan.name}", name, self)
-
-
 def _driven(
-    plan: SystemPlan, parts: Sequence[ModelDescription], numbers: _Numbers
+    plan: SystemPlan, parts: Sequence[ModelDescription], numbers: Mapping[str, int]
 ) -> dict[str, set[str]]:
     """What links and connectors of the system set: it cannot be set by another name.
 
@@ -257,8 +236,7 @@ def _usable(
     values = dict(starts)
     for variable in part.variables.values():
         is_number = variable.is_number and not (variable.ticking and variable.shape)
-        is_text = variable.kind == "string" and variable.is_scalar
-        if (is_number and _is_good_array(variable)) or is_text:
+        if (is_number and _is_good_array(variable)) or variable.is_text:
             yield _started(variable, values)
 
 
@@ -324,11 +302,9 @@ def _elements_behind(end: PartVariable) -> list[PartVariable]:
 
 def _connector_variable(connector: Connector, first: PartVariable, reference: int) -> Variable:
     """Describe a connector as the variable behind its first end, in its own unit."""
-    own = first.variable
-    if connector.causality == "output":
-        limits = [first.gain * x + first.offset for x in (own.minimum, own.maximum)]
-    else:
-        limits = [(x - first.offset) / first.gain for x in (own.minimum, own.maximum)]
+    own, change = first.variable, Conversion(first.gain, first.offset)
+    convert = change if connector.causality == "output" else change.inverse
+    limits = [convert(x) for x in (own.minimum, own.maximum)]
     return replace(
         own,
         name=connector.name,
@@ -340,27 +316,13 @@ def _connector_variable(connector: Connector, first: PartVariable, reference: in
         unit=own.unit if connector.unit is None else connector.unit,
         minimum=min(limits),
         maximum=max(limits),
-        start=_start(connector, first),
-        nominal=_nominal(connector, first),
+        start=own.start if change == IDENTITY else _converted_start(own, convert),
+        nominal=None if own.nominal is None else own.nominal * abs(first.reading[0]),
         description=connector.description or own.description,
     )
 
 
-def _start(connector: Connector, first: PartVariable) -> str | None:
-    own = first.variable
-    if own.start is None or not own.is_number or (first.gain, first.offset) == (1.0, 0.0):
+def _converted_start(own: Variable, convert: Callable[[float], float]) -> str | None:
+    if own.start is None or not own.is_number:
         return own.start
-    numbers = np.array([element.start_number for element in own.elements])
-    if connector.causality == "output":
-        numbers = first.gain * numbers + first.offset
-    else:
-        numbers = (numbers - first.offset) / first.gain
-    return " ".join(map(repr, numbers.tolist()))
-
-
-def _nominal(connector: Connector, first: PartVariable) -> float | None:
-    nominal = first.variable.nominal
-    if nominal is None:
-        return None
-    factor = abs(first.gain)
-    return nominal * factor if connector.causality == "output" else nominal / factor
+    return " ".join(repr(convert(element.start_number)) for element in own.elements)

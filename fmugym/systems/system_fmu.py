@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
-from fmugym.archive.bundled import is_bundled
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU, file_digest
-from fmugym.archive.loadable import ExtractedFMU, LoadableFMU
+from fmugym.archive.loadable import LoadableFMU
 from fmugym.archive.safe_zip import ArchiveLimits
-from fmugym.archive.temporary import folder_name, make_folder, remove_folder
-from fmugym.errors import ConfigError, FMULoadError
-from fmugym.systems.slots import Layout
-from fmugym.systems.system_description import SystemDescription, describe_system
+from fmugym.errors import FMULoadError
+from fmugym.systems.system_description import describe_system
 from fmugym.systems.system_plan import Component, SystemPlan
 
 __all__ = ["SystemFMU"]
@@ -45,11 +40,8 @@ class SystemFMU(FMU):
         self, plan: SystemPlan, *, probe_timeout: float | None = DEFAULT_PROBE_TIMEOUT
     ) -> None:
         self.plan = plan
-        if not plan.components:
-            raise ConfigError(f"the system {plan.name!r} has no components")
         self._opened = tuple(_opened(plan.components))
         description = describe_system(plan, [fmu.description for fmu in self._opened])
-        Layout(description)  # which refuses names and roles that are wrong
         path = Path(plan.name) if plan.file is None else plan.file
         LoadableFMU.__init__(self, path, description, ())
         self.limits, self.interface = ArchiveLimits(), None
@@ -72,18 +64,13 @@ class SystemFMU(FMU):
     @property
     def bundled(self) -> bool:
         """Whether all FMUs come with the package."""
-        return all(is_bundled(component.path) for component in self.plan.components)
+        return all(fmu.bundled for fmu in self._opened)
 
     @property
     def parts(self) -> tuple[LoadableFMU, ...]:
         """The FMUs of the components, extracted."""
-        description, folder, in_wine = self.description, self.extract(), self.in_wine
-        assert isinstance(description, SystemDescription)
-        pairs = zip(self.plan.components, description.parts, strict=True)
-        return tuple(
-            ExtractedFMU(one.path, part, one.preload, folder / str(number), in_wine=in_wine)
-            for number, (one, part) in enumerate(pairs)
-        )
+        folder = self.extract()
+        return tuple(fmu.again(folder / str(n)) for n, fmu in enumerate(self._opened))
 
     @cached_property
     def platforms(self) -> tuple[str, ...]:
@@ -131,33 +118,20 @@ class SystemFMU(FMU):
     def _pairs(self) -> Iterator[tuple[Component, FMU]]:
         return zip(self.plan.components, self._opened, strict=True)
 
-    def extract(self) -> Path:
-        """Extract each FMU into a folder of its own; see ``FMU.extract``.
-
-        Raises:
-            FMULoadError: If one of them cannot run here, or its archive is damaged.
-        """
-        if self._folder is not None:
-            return self._folder
+    def _check_library(self) -> None:
         if self._mixed:
             raise FMULoadError(self._mixed)
         for component, fmu in self._pairs():
             with _naming(component):
                 fmu._check_library()
-        folder = folder_name()
-        self._remove_folder = weakref.finalize(self, remove_folder, folder, os.getpid())
-        try:
-            make_folder(folder)
-            for number, (component, fmu) in enumerate(self._pairs()):
-                with _naming(component):
-                    own = folder / str(number)
-                    own.mkdir()
-                    fmu._extract_to(own)
-        except BaseException:
-            self.close()
-            raise
-        self._folder = folder
-        return folder
+
+    def _extract_to(self, folder: Path, only: str = "") -> None:
+        """Extract each FMU into a folder of its own."""
+        for number, (component, fmu) in enumerate(self._pairs()):
+            with _naming(component):
+                own = folder / str(number)
+                own.mkdir()
+                fmu._extract_to(own, only)
 
 
 def _opened(components: Iterable[Component]) -> Iterator[FMU]:

@@ -132,7 +132,7 @@ class WiredSystem:
             "stop_time": stop_time,
             "tolerance": tolerance,
         }
-        given = checked(SYSTEM, told)
+        self._given = given = checked(SYSTEM, told)
         if not given["components"]:
             raise ConfigError("a system needs at least one component")
         self.name, self.description = given["name"], given["description"]

@@ -45,8 +45,7 @@ class Port:
     @property
     def is_text(self) -> bool:
         """Whether it is a String that a component can be started with."""
-        variable = self.variable
-        return variable.kind == "string" and variable.is_scalar and variable.settable_at_start
+        return self.variable.is_text and self.variable.settable_at_start
 
 
 @dataclass
@@ -255,9 +254,8 @@ def _require_source(source: Port, connection: Connection) -> None:
 
 
 def _end(connection: Connection, port: Port, conversion: Conversion) -> End:
-    gain = connection.gain * conversion.factor
-    offset = connection.gain * conversion.offset + connection.offset
-    return End(port.component.name, port.variable.name, gain, offset)
+    change = Conversion(connection.gain, connection.offset).after(conversion)
+    return End(port.component.name, port.variable.name, change.factor, change.offset)
 
 
 def _conversion(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property, partial
 from itertools import islice
 from types import MappingProxyType
@@ -11,15 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fmugym.archive.texts import number_of, text_of, texts_of
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
 from fmugym.distributions import Recipe, Uniform, draw, is_distribution, recipe_of
 from fmugym.pool.base import FloatArray
-from fmugym.task.starting import checked_value
 from fmugym.task.values import ParameterValues
 from fmugym.trial.trial_episodes import Starts
 
-__all__ = ["Draw", "Episode", "EpisodePlan", "Sampler"]
+__all__ = ["Draw", "Episode", "EpisodePlan"]
 
 
 class Draw(NamedTuple):
@@ -104,7 +103,8 @@ class EpisodePlan:
         for name, array in self._random_variables:
             own = [episode_variables[name]] if array is None else array.distributions
             self._distributions.extend(own)
-        self._sampler = Sampler(self._distributions)
+        uniform = [d for d in self._distributions if type(d) is Uniform]
+        self._limits = [(d.low, d.high - d.low) for d in uniform]
         self._start_values = self.constants.reshape(-1, 1).copy()
         self._starts: Any = self._start_values.reshape(-1).data  # faster to write to
 
@@ -228,15 +228,23 @@ class EpisodePlan:
     def draw_values(self, rng: np.random.Generator) -> list[float]:
         """Draw one episode.
 
+        A single call makes all draws if they are uniform. The results equal those of single draws,
+        because ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
+
         Returns:
             The drawn values in the order of ``draws``.
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        values = self._sampler.draw(rng)
-        if self._sampler.all_uniform and self._all_fit:
-            return values
+        if len(self._limits) < len(self._distributions):
+            values = [draw(distribution, rng) for distribution in self._distributions]
+        else:
+            fractions = rng.random(len(self._limits)).tolist()
+            pairs = zip(self._limits, fractions, strict=True)
+            values = [low + width * fraction for (low, width), fraction in pairs]
+            if self._all_fit:
+                return values
         for place, (index, _, may_not_fit) in enumerate(self._random_parameters):
             if may_not_fit:
                 values[place] = checked_value(self.model_variables[index], values[place])
@@ -317,30 +325,3 @@ def _recipe_of(distribution: Any, variable: Variable) -> Recipe | None:
     recipe = recipe_of(distribution, partial(checked_value, variable))
     discrete = recipe is not None and recipe.kind in {"choice", "weighted"}
     return recipe if discrete or variable.kind == "real" else None
-
-
-class Sampler:
-    """Draws from a fixed list of distributions, in order.
-
-    A single call makes successive uniform draws. The results equal those of single draws, because
-    ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
-
-    Attributes:
-        limits: Lower end and width of each uniform distribution; a subclass may differ.
-        all_uniform: Whether all distributions are uniform.
-    """
-
-    def __init__(self, distributions: Sequence[Any]) -> None:
-        self._distributions = list(distributions)
-        self.limits = [(d.low, d.high - d.low) for d in distributions if type(d) is Uniform]
-        self.all_uniform = len(self.limits) == len(distributions)
-
-    def draw(self, rng: np.random.Generator) -> list[float]:
-        """Draw one value from each distribution."""
-        if not self.all_uniform:
-            return [draw(distribution, rng) for distribution in self._distributions]
-        fractions = rng.random(len(self.limits)).tolist()
-        return [
-            low + width * fraction
-            for (low, width), fraction in zip(self.limits, fractions, strict=True)
-        ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final, NamedTuple
 
@@ -12,47 +12,33 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.signals import ordinary
 
-__all__ = ["Future", "Lookup", "Table", "assumed"]
+__all__ = ["Future", "Lookup", "assumed"]
 
 _YEAR: Final = 365 * 86400.0
 
 
-class Table(NamedTuple):
-    """Values between which lines are drawn.
+class Lookup(NamedTuple):
+    """A periodic series, and where hooks look its values up.
 
     Attributes:
-        times: Seconds since the first row of a series, rising.
-        values: The values at these times.
-    """
-
-    times: FloatArray
-    values: FloatArray
-
-
-class Lookup:
-    """Looks the values of a periodic series up, or those that candidates assume in its place.
-
-    Args:
-        number: The number of the series, which tells equal ones apart.
+        tables: Those that hooks look values up in.
+        key: That of the series: the times of a period from 0 on, the values there, and those before
+            the first time and after the last one.
         start: The time in seconds of its first row.
         period: Seconds after which it repeats.
         is_stepped: Whether a value holds until the next one.
-        table: Its values in one period.
-
-    Attributes:
-        own: The table of the series.
-        present: The table that is looked up: the same, or an assumed one.
     """
 
-    def __init__(
-        self, number: int, start: float, period: float, is_stepped: bool, table: Table
-    ) -> None:
-        self._number, self.start, self.period, self.is_stepped = number, start, period, is_stepped
-        self.own = self.present = table
+    tables: dict[Hashable, FloatArray]
+    key: str
+    start: float
+    period: float
+    is_stepped: bool
 
-    def __call__(self, place: Any) -> Any:
-        """The values at places from 0 to the period; to the left of them, nobody looks."""
-        return np.interp(place, *self.present, left=self._number)
+    @property
+    def table(self) -> FloatArray:
+        """What hooks look values up in now."""
+        return self.tables[self.key]
 
     def mean(self, held_out: Sequence[tuple[float, float]] = ()) -> float:
         """The mean over a period.
@@ -61,7 +47,7 @@ class Lookup:
             held_out: Beginnings and lengths in seconds of parts of each year that are left out. If
                 nothing else is there, such as in the data of a day, nothing is left out.
         """
-        times, values = self.own
+        times, values = np.split(self.table[:-2], 2)
         widths = np.diff(times)
         is_seen = np.ones(len(widths), np.bool_)
         for begin, length in held_out:
@@ -71,15 +57,7 @@ class Lookup:
         middles = (values[1:] + values[:-1]) / 2
         return float(np.average(middles, weights=widths * is_seen if is_seen.any() else widths))
 
-    def table_of_program(self, table: Table) -> FloatArray:
-        """A table as programs have it: times, values, and the values beyond both ends."""
-        return np.concatenate([*table, [self._number, table.values[-1]]])
-
-    def tobytes(self) -> bytes:
-        """The bytes of its own table, as those of an array."""
-        return self.table_of_program(self.own).tobytes()
-
-    def table_of(self, what: str, rows: Any) -> Table:
+    def table_of(self, what: str, rows: Any) -> FloatArray:
         """The table of other rows, which repeat after the same period.
 
         Args:
@@ -106,15 +84,16 @@ class Lookup:
             )
         return self._in_period(np.remainder(times - self.start, self.period), values)
 
-    def _in_period(self, places: FloatArray, values: FloatArray) -> Table:
+    def _in_period(self, places: FloatArray, values: FloatArray) -> FloatArray:
         order = np.argsort(places, kind="stable")
         places, values = places[order], values[order]
-        around = np.concatenate([places[-1:] - self.period, places, places[:1] + self.period])
+        places = np.concatenate([places[-1:] - self.period, places, places[:1] + self.period])
         values = np.concatenate([values[-1:], values, values[:1]])
-        if not self.is_stepped:
-            return Table(around, values)
-        ends = np.maximum(around[:-1], np.nextafter(around[1:], -np.inf))
-        return Table(np.stack([around[:-1], ends], axis=1).ravel(), np.repeat(values[:-1], 2))
+        if self.is_stepped:
+            ends = np.maximum(places[:-1], np.nextafter(places[1:], -np.inf))
+            places = np.stack([places[:-1], ends], axis=1).ravel()
+            values = np.repeat(values[:-1], 2)
+        return np.concatenate([places, values, self.table[-2:-1], values[-1:]])
 
 
 class Future(NamedTuple):
@@ -132,27 +111,27 @@ class Future(NamedTuple):
     clock: Callable[[Any], Any]
     held_out: tuple[tuple[float, float], ...] = ()
 
-    def tables_of_programs(
-        self, tables: Mapping[str, Table]
-    ) -> list[tuple[FloatArray, FloatArray]]:
-        """The tables of programs: those of series, and those in their place."""
-        pairs = [(self.lookups[name], table) for name, table in tables.items()]
-        return [(one.table_of_program(one.own), one.table_of_program(t)) for one, t in pairs]
-
 
 @contextmanager
-def assumed(futures: Iterable[Future | None], tables: Mapping[str, Table]) -> Iterator[None]:
-    """Let hooks read other tables inside of a ``with`` block."""
-    pairs = [
-        (future.lookups[name], table)
-        for future in futures
-        if future is not None
-        for name, table in tables.items()
-    ]
-    for lookup, table in pairs:
-        lookup.present = table
+def assumed(
+    futures: Iterable[Future | None], tables: Mapping[str, FloatArray]
+) -> Iterator[dict[bytes, FloatArray]]:
+    """Let hooks look other tables up inside of a ``with`` block.
+
+    Args:
+        futures: Those of the environments.
+        tables: See ``Lookup.table_of``; by the names of series.
+
+    Yields:
+        The tables by the bytes of those whose place they take.
+    """
+    found = [one.lookups[name] for one in futures if one is not None for name in tables]
+    own = [one.table for one in found]
+    others = [*tables.values()] * (len(found) // max(1, len(tables)))
+    for lookup, table in zip(found, others, strict=True):
+        lookup.tables[lookup.key] = table
     try:
-        yield
+        yield {mine.tobytes(): other for mine, other in zip(own, others, strict=True)}
     finally:
-        for lookup, _ in pairs:
-            lookup.present = lookup.own
+        for lookup, table in zip(found, own, strict=True):
+            lookup.tables[lookup.key] = table

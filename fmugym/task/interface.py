@@ -32,7 +32,6 @@ from fmugym.task.starting import (
 
 __all__ = [
     "Interface",
-    "outputs_named",
     "readable_named",
     "resolve",
 ]
@@ -230,7 +229,7 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     given = start_values(description, starts)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
     inputs = _resolved(description, config.model_input_names, check_input)
-    outputs = outputs_named(description, config.model_output_names)
+    outputs = _resolved(description, config.model_output_names, check_output)
     read = readable_named(description, config.model_output_names + config.monitor_names)
     monitors = read[len(outputs) :]
     limits = _limits(config, description, inputs + outputs)
@@ -257,18 +256,13 @@ def _limits(
     return _by_scalar(description, config.bounds, allowed, kind)
 
 
-def outputs_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
-    """Find the variables that can be read after every step: scalars, and all elements of arrays.
+def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
+    """Find what can be read after every step: scalars, all elements of arrays, and Strings.
 
     Raises:
-        ConfigError: If there is no variable of a name, one is named twice, or a float cannot hold
-            its value.
+        ConfigError: If there is no variable of a name, one is named twice, or its value is neither
+            a number nor a text.
     """
-    return _resolved(description, names, check_output)
-
-
-def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
-    """Do what ``outputs_named`` does, but find Strings, too, which cannot be observed."""
     return _resolved(description, names, check_readable)
 
 

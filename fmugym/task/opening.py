@@ -79,7 +79,8 @@ def open_fmu(
     file = _find_file(cls, check_path("fmu_path", path))
     if file.suffix.lower() == ".ssp":
         key = file, repr(config.foreign.archive_limits), config.foreign.probe_timeout
-        return _shared(key, lambda: _open_system(_read_system(file, config), config))
+        limits = config.foreign.archive_limits
+        return _shared(key, lambda: _open_system(FMUSystem.read(file, limits), config))
     preload = [
         _find_file(cls, Path(p)) if os.path.dirname(p) else p for p in config.foreign.preload
     ]
@@ -105,10 +106,6 @@ def _shared(key: Any, open_it: Callable[[], FMU]) -> FMU:
     if key not in known:
         known[key] = open_it()
     return known[key]
-
-
-def _read_system(file: Path, config: EnvConfig) -> FMUSystem:
-    return FMUSystem.read(file, config.foreign.archive_limits)
 
 
 def _open_system(system: FMUSystem, config: EnvConfig) -> FMU:
@@ -171,32 +168,24 @@ class PoolOpening:
             ConfigError: If an argument is invalid.
             FMULoadError: If the FMU cannot be used on this machine.
         """
-        self._check_max_instances(num_instances)
+        most = self.config.foreign.max_instances
+        if most is not None and num_instances > most:
+            self.fmu.close()
+            raise ConfigError(
+                f"{self.fmu.path.name}: {num_instances} environments need {num_instances} "
+                f"instances, but 'max_instances' of 'foreign' allows {most}"
+            )
         own: dict[str, Any] = {
             "isolation": self.isolation or self.config.isolation,
             "call_timeout": self.config.foreign.call_timeout,
             "reset_method": self.config.foreign.reset_method,
             "starts": self.plan.starts(),
-            "spare": self._has_spare(num_instances),
+            "spare": most is None or num_instances < most,
         }
         options = own | options
         if self.backend is not None:
             options["backend"] = self.backend
         return make_pool(self.fmu, self.spec, num_instances, self.log, **options)
-
-    def _has_spare(self, num_instances: int) -> bool:
-        """Whether there may be one more instance."""
-        most = self.config.foreign.max_instances
-        return most is None or num_instances < most
-
-    def _check_max_instances(self, wanted: int) -> None:
-        most = self.config.foreign.max_instances
-        if most is not None and wanted > most:
-            self.fmu.close()
-            raise ConfigError(
-                f"{self.fmu.path.name}: {wanted} environments need {wanted} instances, but "
-                f"'max_instances' of 'foreign' allows {most}"
-            )
 
     def apart(self) -> PoolOpening:
         """Return the same with an FMU that is not shared."""

@@ -100,7 +100,7 @@ def check_readable(description: ModelDescription, variable: Variable) -> None:
     Raises:
         ConfigError: If it can be neither observed nor read.
     """
-    if variable.kind != "string" or variable.shape or variable.array is not None:
+    if not variable.is_text:
         check_output(description, variable)
 
 

@@ -12,12 +12,21 @@ import numpy as np
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.pool import Pool
 from fmugym.task.construction import Constructed
-from fmugym.task.generators import row_of, state_of
 from fmugym.task.plain import changed, plain_attributes
 from fmugym.task.snapshot import Column, Columns
 
-__all__ = ["READ", "columns_of", "place_columns", "read_columns", "require_saving"]
+__all__ = [
+    "READ",
+    "columns_of",
+    "generator_of",
+    "place_columns",
+    "read_columns",
+    "require_saving",
+    "row_of",
+    "state_of",
+]
 
+_WORD: Final = 2**64
 _NUMBERS: Final = ("values", "previous_state", "inputs")
 
 READ: Final = (*_NUMBERS, "action", "previous_action", "step_count", "done", "after_end")
@@ -120,10 +129,37 @@ def _place_stream(env: Constructed, columns: Columns, place: int) -> None:
         env._np_random, env._np_random_seed = None, None
         return
     state = stream if isinstance(stream, dict) else state_of([int(word) for word in stream])
+    seed = columns["seeds"][place]
+    env._np_random, env._np_random_seed = generator_of(state), -1 if seed is None else seed
+
+
+def generator_of(state: Any) -> np.random.Generator:
+    """A generator in a state, as its bit generator has told it.
+
+    Raises:
+        ConfigError: If numpy has no such bit generator.
+    """
     bits = getattr(np.random, state["bit_generator"], None)
     if bits is None:
-        raise ConfigError(f"the snapshot has a generator {state['bit_generator']!r}")
+        raise ConfigError(f"there is no random generator {state['bit_generator']!r}")
     generator = np.random.Generator(bits())
     generator.bit_generator.state = state
-    seed = columns["seeds"][place]
-    env._np_random, env._np_random_seed = generator, -1 if seed is None else seed
+    return generator
+
+
+def row_of(state: Any) -> list[int]:
+    """The state of a ``numpy.random.PCG64`` as six integers of 64 bits.
+
+    They are state and increment (the higher half first), whether a half of a number is left over,
+    and that half.
+    """
+    inner = state["state"]
+    numbers = [*divmod(inner["state"], _WORD), *divmod(inner["inc"], _WORD)]
+    return [*numbers, state["has_uint32"], state["uinteger"]]
+
+
+def state_of(row: list[int]) -> dict[str, Any]:
+    """The state of a ``numpy.random.PCG64`` from such a row."""
+    high, low, increment_high, increment_low, has_half, half = row
+    numbers = {"state": high * _WORD + low, "inc": increment_high * _WORD + increment_low}
+    return {"bit_generator": "PCG64", "state": numbers, "has_uint32": has_half, "uinteger": half}

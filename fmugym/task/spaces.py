@@ -20,10 +20,9 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import LARGEST_EXACT_INTEGER, Variable, checked_value
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task.interface import Interface
-from fmugym.task.starting import checked_value
 
 __all__ = [
     "action_space",
@@ -33,8 +32,6 @@ __all__ = [
     "outputs_observation",
     "to_input_types",
 ]
-
-_LARGEST_EXACT_INTEGER = 2.0**53
 
 
 def action_space(interface: Interface) -> spaces.Space[Any]:
@@ -115,7 +112,7 @@ def _bounded(interface: Interface, variable: Variable) -> bool:
 
 def _countable(interface: Interface, variable: Variable) -> bool:
     """Whether a ``Discrete`` can have an element for each integer within the limits."""
-    return all(abs(limit) <= _LARGEST_EXACT_INTEGER for limit in interface.bounds(variable))
+    return all(abs(limit) <= LARGEST_EXACT_INTEGER for limit in interface.bounds(variable))
 
 
 def to_input_types(

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.description import ModelDescription
-from fmugym.archive.variable import Variable, unknown_rest
-from fmugym.checks import check_number, integer_of, parts_of_array
+from fmugym.archive.variable import Variable, checked_value, unknown_rest
+from fmugym.checks import parts_of_array
 from fmugym.distributions import Choice, as_distribution, is_distribution
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, shown
 from fmugym.task.roles import require_not_driven, require_numeric
 
 __all__ = [
     "check_rest_is_known",
     "checked",
     "checked_column",
-    "checked_value",
     "spread",
     "start_time_of",
     "start_values",
@@ -27,9 +26,6 @@ __all__ = [
     "structural_values",
     "texts_in",
 ]
-
-_LARGEST_FLOAT32: Final = float(np.finfo(np.float32).max)
-_LARGEST_EXACT_INTEGER: Final = 2.0**53
 
 
 def start_values(
@@ -137,7 +133,7 @@ def _check_start(description: ModelDescription, variable: Variable, value: Any) 
             f"{name!r} cannot be set: it is a {variable.variability} {variable.causality} "
             f"with initial={variable.initial!r}"
         )
-    if variable.kind == "string" and not variable.shape and variable.array is None:
+    if variable.is_text:
         for text in texts_in(variable, value):
             _require_text(name, text)
     else:
@@ -182,30 +178,6 @@ def checked(variable: Variable, value: Any) -> Any:
     return str.__str__(value) if variable.kind == "string" else checked_value(variable, value)
 
 
-def checked_value(variable: Variable, value: Any) -> float:
-    """Convert a value for a variable to a number, without loss.
-
-    Of a String, this is the number of one of the texts that the variable knows.
-
-    Raises:
-        ConfigError: If the value is not finite, not of the variable's kind, or outside its type's
-            range.
-    """
-    if isinstance(value, str) and variable.items:
-        return _item_value(variable, str.__str__(value))
-    number = check_number(repr(variable.name), value, may_be_boolean=variable.kind == "boolean")
-    if variable.kind == "string" and number not in dict(variable.items).values():
-        raise ConfigError(f"{variable.name!r} is a String, got {shown(value)}")
-    if variable.type == "Float32" and abs(number) > _LARGEST_FLOAT32:
-        raise ConfigError(f"{variable.name!r} is a Float32, too narrow for {number}")
-    if variable.kind == "boolean" and number not in {0.0, 1.0}:
-        raise ConfigError(f"{variable.name!r} is a Boolean, got {number}")
-    if variable.kind in {"integer", "enumeration"}:
-        whole = integer_of(value)  # which no float has rounded
-        _check_integer(variable, number if whole is None else whole)
-    return number
-
-
 def checked_column(variable: Variable, values: Sequence[Any]) -> npt.NDArray[Any]:
     """Check the values of a parameter in N environments.
 
@@ -220,28 +192,6 @@ def checked_column(variable: Variable, values: Sequence[Any]) -> npt.NDArray[Any
     for value in values:
         _require_text(variable.name, value)
     return np.array([str.__str__(value) for value in values], object)
-
-
-def _item_value(variable: Variable, name: str) -> float:
-    items = dict(variable.items)
-    if name not in items:
-        raise unknown_name(f"item of {variable.name!r}", name, items)
-    return float(items[name])
-
-
-def _check_integer(variable: Variable, number: float) -> None:
-    low, high = variable.integer_limits
-    if not float(number).is_integer() or not low <= number <= high:
-        raise ConfigError(
-            f"{variable.name!r} is of type {variable.type}: expected an integer from {low} to "
-            f"{high}, got {number}"
-        )
-    if abs(number) > _LARGEST_EXACT_INTEGER:
-        raise ConfigError(f"{variable.name!r}: integers beyond 2**53 are not exact, got {number}")
-    values = [value for _, value in variable.items]
-    if values and number not in values:
-        listing = ", ".join(f"{value} ({name})" for name, value in variable.items)
-        raise ConfigError(f"{variable.name!r}: expected one of {listing}, got {number:g}")
 
 
 def start_time_of(env: Any) -> Any:

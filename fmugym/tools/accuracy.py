@@ -17,14 +17,13 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.archive.fmu import FMU
-from fmugym.archive.variable import Variable
+from fmugym.archive.variable import Variable, checked_value
 from fmugym.env import FMUEnv
 from fmugym.errors import FMUGymError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
 from fmugym.task.opening import PoolOpening
-from fmugym.task.starting import checked_value
 
 __all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
@@ -51,25 +51,29 @@ class Verdict:
         """
         pairs = zip(self.outcomes[name], self.outcomes[other], strict=True)
         each = [(one.returns - two.returns).ravel() for one, two in pairs]
+        gain = sum(float(values.mean()) for values in each)
         freedom = sum(len(values) - 1 for values in each)
         if not freedom:
-            return sum(float(values.mean()) for values in each), math.nan
+            return gain, math.nan
         variance = sum(float(values.var(ddof=1)) / len(values) for values in each)
-        half = student(freedom) * math.sqrt(variance)
-        return sum(float(values.mean()) for values in each), half
+        return gain, student(freedom) * math.sqrt(variance)
 
     def text(self) -> str:
-        """The verdict in a line."""
-        first, *others = self.outcomes
-        totals = ", ".join(f"{name} {self.total(name):.6g}" for name in self.outcomes)
-        told = [f"{totals}: {self._beside(first, other)}" for other in others[:1]] or [totals]
-        return "; ".join([*told, *self._costs()])
+        """The verdict in a line: who has won, and the costs of the first two beside limits."""
+        told = self.as_dict()
+        first, *others = told
+        text = ", ".join(f"{name} {one['total_reward']:.6g}" for name, one in told.items())
+        text += f": {self._beside(first, others[0])}" if others else ""
+        for cost, limit in self.limits.items():
+            both = [f"{name} {told[name]['mean_costs'][cost]:.4g}" for name in [*told][:2]]
+            text += f"; {cost} {', '.join(both)} of at most {limit:g}"
+        return text
 
     def _beside(self, name: str, other: str) -> str:
-        """One agent beside another one; per cent only if both totals have one sign."""
+        """One agent beside another one; per cent only of totals of one sign and one magnitude."""
         gain, half = self.gain(name, other)
         base, unit = self.total(other), ""
-        if base * self.total(name) > 0:
+        if base * self.total(name) > 0 and abs(gain) < 10 * abs(base):
             gain, half, unit = 100 * gain / abs(base), 100 * half / abs(base), " %"
         word = "better" if gain >= 0 else "worse"
         interval = ""
@@ -77,15 +81,6 @@ class Verdict:
             interval = f" ({abs(gain) - half:.3g} to {abs(gain) + half:.3g})"
         doubt = ", which may be chance," if half >= abs(gain) else ""
         return f"{abs(gain):.3g}{unit} {word} than {other}{interval}{doubt} in unseen episodes"
-
-    def _costs(self) -> Iterator[str]:
-        """The costs of the first two, beside their limits."""
-        for index, (cost, limit) in enumerate(self.limits.items()):
-            each = [
-                f"{name} {np.mean([one.costs[..., index].mean() for one in outcomes]):.4g}"
-                for name, outcomes in list(self.outcomes.items())[:2]
-            ]
-            yield f"{cost} {', '.join(each)} of at most {limit:g}"
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers in types that JSON has."""

@@ -13,6 +13,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
+from fmugym.export.names import new_file
 from fmugym.search.agent import Agent as FoundAgent
 from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
 from fmugym.tools.targets import maker_of
@@ -69,8 +70,7 @@ def _export(arguments: argparse.Namespace) -> None:
         raise ConfigError(
             f"expected a file that ends in {', '.join(_WRITERS)}, got {shown(str(output))}"
         )
-    if not output.parent.is_dir():
-        raise ConfigError(f"{shown(str(output.parent))} is no folder")
+    new_file(output)
     model, normalization = read_agent(arguments.agent, arguments.algorithm)
     is_physical = isinstance(model, FoundAgent)
     with closing(maker_of(arguments.task)(physical=is_physical)) as env:

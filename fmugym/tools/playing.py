@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fmugym.env import FMUEnv
-from fmugym.episodes.evaluation import Score, each_score, plot_scores, table
+from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
@@ -153,7 +153,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
             make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario
             with progress(None, label) as advance:
-                played = each_score(make_env, players, seeds, arguments.steps, scenario, advance)
+                played = evaluate(make_env, players, seeds, arguments.steps, scenario, advance)
                 scores.extend(played)  # one by one, so that an interruption keeps them
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from fmugym.archive.fmu import FMU
 from fmugym.declared import Task
-from fmugym.declared.systems import fmu_of
+from fmugym.declared.task_fmu import fmu_of
 from fmugym.errors import ConfigError, plain
 from fmugym.systems import FMUSystem
 from fmugym.tools.overview import overview, tables

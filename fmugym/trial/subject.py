@@ -6,22 +6,17 @@ import logging
 import math
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, ParamSpec, TypeVar
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, Final, TypeVar
 
 from fmugym.archive.fmu import DEFAULT_PROBE_TIMEOUT, FMU
-from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.base import FloatArray, MaskArray, StatusArray
-from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.licences import licence_errors, speaks_of_licence
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.pool.process.supervisor import Loss, WorkerError
+from fmugym.pool.process.supervisor import A_STEP, RESET, Loss, Supervisor, WorkerError
+from fmugym.pool.process.worker_group import WorkerGroup
 from fmugym.pool.progress import progress
 from fmugym.pool.spec import INITIALIZATION_FACTOR, PoolSpec
 
@@ -29,7 +24,6 @@ __all__ = ["CLOSING", "STEP", "DeathError", "Subject", "TriedPool"]
 
 logger = logging.getLogger(__name__)
 
-P = ParamSpec("P")
 R = TypeVar("R")
 
 OPENING: Final = "loading and instantiation"
@@ -132,7 +126,7 @@ class Subject:
                 pool.close()
                 self.note_call(CLOSING, begin)
                 self.initializations += pool.initializations
-            pool.require_alive(CLOSING)
+            pool.require_survival()
 
     def _open(self, stage: str, *arguments: Any, **options: Any) -> TriedPool:
         begin = time.perf_counter()
@@ -217,6 +211,44 @@ class Subject:
         self.is_harmful |= alone
 
 
+class _TriedGroup(WorkerGroup):
+    """A worker on trial: the time of its calls is limited, and its death is an error.
+
+    Args:
+        subject: The FMU.
+        stage: The part of the trial.
+        arguments: See ``WorkerGroup``.
+    """
+
+    def __init__(self, subject: Subject, stage: str, *arguments: Any) -> None:
+        self._subject, self._stage = subject, stage
+        self._calls = {RESET: INITIALIZATION, A_STEP: FIRST_STEP}
+        super().__init__(*arguments)
+
+    def run(
+        self, doing: str, supervisors: Sequence[Supervisor], tell: Callable[[Supervisor], None]
+    ) -> dict[Supervisor, Any]:
+        """See ``WorkerGroup.run``.
+
+        Raises:
+            DeathError: If the process has not survived.
+        """
+        call = self._calls.get(doing, STEP)
+        self._calls[A_STEP] = STEP if doing == A_STEP else self._calls[A_STEP]
+        self.call_timeout = self._subject.call_timeout(call)
+        begin = time.perf_counter()
+        try:
+            return super().run(doing, supervisors, tell)
+        finally:
+            self.require_alive(call)
+            self._subject.note_call(call, begin)
+
+    def require_alive(self, call: str) -> None:
+        """Raise a ``DeathError`` if the process has not survived a call."""
+        if self.losses:
+            raise self._subject.death(call, self._stage, self.losses[0])
+
+
 class TriedPool(ProcessPool):
     """Instances on trial in one process.
 
@@ -232,6 +264,8 @@ class TriedPool(ProcessPool):
         fmu: As given.
     """
 
+    _group: _TriedGroup
+
     def __init__(
         self,
         subject: Subject,
@@ -241,50 +275,15 @@ class TriedPool(ProcessPool):
         num_instances: int,
         **options: Any,
     ) -> None:
-        self.fmu, self._subject, self._stage = fmu, subject, stage
-        self._next_step = FIRST_STEP
+        self.fmu, self._about = fmu, (subject, stage)
         options = {"workers": 1, "threads": 1, "on_trial": True} | options
         options["call_timeout"] = subject.call_timeout(OPENING)
         options["closing_time"], _ = subject.limit(CLOSING)
         super().__init__(fmu, spec, num_instances, _SILENT, **options)
 
-    def require_alive(self, call: str) -> None:
-        """Raise a ``DeathError`` if the process has not survived a call."""
-        if self.losses:
-            raise self._subject.death(call, self._stage, self.losses[0])
+    def _grouped(self, *arguments: Any) -> _TriedGroup:
+        return _TriedGroup(*self._about, *arguments)
 
-    def _ask(self, call: str, function: Callable[P, R], *args: P.args, **named: P.kwargs) -> R:
-        """Limit the time of a call, and see whether the process survives it."""
-        self.limit_calls(self._subject.call_timeout(call))
-        begin = time.perf_counter()
-        try:
-            return function(*args, **named)
-        finally:
-            self.require_alive(call)
-            self._subject.note_call(call, begin)
-
-    def reset(
-        self, variables: tuple[Variable, ...], values: FloatArray, mask: MaskArray | None = None
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.reset``."""
-        return self._ask(INITIALIZATION, super().reset, variables, values, mask)
-
-    def step(
-        self,
-        inputs: FloatArray | None = None,
-        skip: MaskArray | None = None,
-        observations: npt.NDArray[np.float32] | None = None,
-    ) -> tuple[FloatArray, StatusArray]:
-        """See ``Pool.step``."""
-        call, self._next_step = self._next_step, STEP
-        return self._ask(call, super().step, inputs, skip, observations)
-
-    def save_instances(self, indices: IndexArray) -> Bundle:
-        """See ``Pool.save_instances``."""
-        return self._ask(STEP, super().save_instances, indices)
-
-    def restore_instances(
-        self, bundle: Bundle, sources: IndexArray, indices: IndexArray
-    ) -> StatusArray:
-        """See ``Pool.restore_instances``."""
-        return self._ask(STEP, super().restore_instances, bundle, sources, indices)
+    def require_survival(self) -> None:
+        """Raise a ``DeathError`` if the process has not survived until its end."""
+        self._group.require_alive(CLOSING)

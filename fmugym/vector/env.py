@@ -237,6 +237,30 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         return self.inside.guard.run("step", FMUVectorEnv._step, self, actions)
 
     @alone
+    def step_around(self, actions: Any, resting: MaskArray) -> StepResult:
+        """Step some environments, while the others stay as they are.
+
+        Args:
+            actions: As for ``step``, of all environments.
+            resting: Which ones stay as they are, shape (N,). Their rewards are 0, neither
+                terminated nor truncated is true for them, and their episodes count as ended.
+
+        Returns:
+            As ``step``.
+
+        Raises:
+            ConfigError: As ``step``.
+            SimulationError: As ``step``, but for ended episodes, which may rest.
+            PendingStepError: As ``step``.
+        """
+        self._require_ready("step_around", ended=True)
+        try:
+            return self.inside.engine.step(actions, None, resting)
+        except BaseException:  # as in a single environment
+            self._interrupt()
+            raise
+
+    @alone
     def step_async(self, actions: Any) -> None:
         """Begin a step of all environments, which goes on while the caller computes.
 

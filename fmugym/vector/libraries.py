@@ -8,13 +8,15 @@ from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.vector import AutoresetMode
 
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 from fmugym.vector.entry_points import vectorized
+from fmugym.vector.env import FMUVectorEnv
 
-__all__ = ["make_vector_env"]
+__all__ = ["make_vector_env", "require_vector_env"]
 
 
 def make_vector_env(
@@ -36,6 +38,22 @@ def make_vector_env(
     if callable(env):
         return vectorized(env)(num_envs, **kwargs)
     raise ConfigError(f"env must be a registered id or a class, got {shown(env)}")
+
+
+def require_vector_env(env: Any, mode: AutoresetMode) -> FMUVectorEnv:
+    """Return a vector environment with the autoreset mode that a library expects.
+
+    Raises:
+        ConfigError: If it is something else, or has another mode.
+    """
+    if not isinstance(env, FMUVectorEnv):
+        raise ConfigError(f"expected a FMUVectorEnv, got {type(env).__name__}")
+    if env.autoreset_mode is not mode:
+        raise ConfigError(
+            f"the autoreset mode is {env.autoreset_mode.name}, expected {mode.name}: make the "
+            f"FMUVectorEnv with autoreset_mode={mode.name.lower()!r}"
+        )
+    return env
 
 
 def _registered(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:

@@ -9,15 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.variable import Variable, unlisted
+from fmugym.archive.variable import Variable, checked_value, unlisted
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
-from fmugym.task.future import Table
 from fmugym.task.snapshot import Columns
-from fmugym.task.starting import checked_value
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.infos import copy_rows
@@ -153,7 +151,7 @@ class Candidates:
     variables: Mapping[str, FloatArray] = MappingProxyType({})
     """What episode variables of each candidate are at the beginning, arrays of shape (n,)."""
 
-    tables: Mapping[str, Table] = MappingProxyType({})
+    tables: Mapping[str, FloatArray] = MappingProxyType({})
     """What candidates look up in the place of data, by name."""
 
     offsets: FloatArray | None = None
@@ -238,7 +236,7 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
     return {variable.name: values for variable, values in found.items()}
 
 
-def tables_of(env: FMUEnv, data: Any) -> dict[str, Table]:
+def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
     """Check what candidates assume in the place of data.
 
     Args:

@@ -20,7 +20,7 @@ from fmugym.pool.base import FloatArray
 from fmugym.pool.form import form_of_draws
 from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.generators import row_of, state_of
+from fmugym.task.saving import row_of, state_of
 
 if TYPE_CHECKING:
     from fmugym._native import Draws

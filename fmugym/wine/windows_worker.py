@@ -19,7 +19,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
-from fmugym.caching import cache_folder
+from fmugym.caching import cache_folder, own_prefix, sweep
 from fmugym.errors import FMULoadError, printable
 from fmugym.signals import ordinary
 
@@ -125,7 +125,8 @@ def _build() -> Path:
         raise FMULoadError(f"{what} the worker program for Windows libraries, is not installed")
     target = wine_folder() / f"worker-{_digest()}-{_compiler_version()}.exe"
     logger.warning("building the worker program for Windows libraries, once; it takes some minutes")
-    with tempfile.TemporaryDirectory(dir=target.parent) as folder:
+    sweep(target.parent)
+    with tempfile.TemporaryDirectory(prefix=own_prefix(), dir=target.parent) as folder:
         built = Path(folder) / "worker.exe"
         _compile(built)
         os.replace(built, target)

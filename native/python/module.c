@@ -7,22 +7,6 @@
 #include "texts.h"
 #include "threads.h"
 
-/* The memory of the echo. It belongs to the whole process. */
-static Py_buffer echo;
-
-static PyObject *echo_to(PyObject *module, PyObject *memory) {
-    Py_buffer view;
-
-    (void)module;
-    if (PyObject_GetBuffer(memory, &view, PyBUF_SIMPLE | PyBUF_WRITABLE) < 0) {
-        return NULL;
-    }
-    log_echo_to(view.buf, (size_t)view.len);
-    release_buffer(&echo);
-    echo = view;
-    Py_RETURN_NONE;
-}
-
 static PyObject *tuple_of(const char *const *texts, Py_ssize_t count) {
     PyObject *names = PyTuple_New(count);
 
@@ -85,7 +69,6 @@ static PyMethodDef functions[] = {
     {"seed", py_seed, METH_VARARGS, NULL},
     {"statistics", statistics, METH_NOARGS, NULL},
     {"initializations", initializations, METH_NOARGS, NULL},
-    {"echo_to", echo_to, METH_O, NULL},
     {"text_with", py_text_with, METH_O, NULL},
     {"serve", py_serve, METH_VARARGS, NULL},
     {"end_with", py_end_with, METH_O, NULL},

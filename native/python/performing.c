@@ -85,7 +85,7 @@ bool report_messages(PyPool *self) {
 /* Getting the GIL back may take milliseconds if other Python threads are busy. So very short
  * work keeps the GIL. */
 static bool is_short(const PyPool *self, int length) {
-    return length == ALWAYS_SHORT || (length >= 0 && pool_is_quick(&self->pool, length));
+    return length != NEVER_SHORT && pool_is_quick(&self->pool, length);
 }
 
 bool explain_entry(Entry entry) {

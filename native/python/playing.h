@@ -3,6 +3,7 @@
 #ifndef FMUGYM_PLAYING_H
 #define FMUGYM_PLAYING_H
 
+#include "play_form.h"
 #include "programs.h"
 #include "results.h"
 
@@ -13,7 +14,6 @@ enum {
     ENDED,
     CURRENT,
     PREVIOUS,
-    NO_ACTION,
     KEPT,
     DONE,
     PLAY_BUFFERS
@@ -21,15 +21,9 @@ enum {
 
 /* The result of prepare_play. It never changes; the next call replaces it as a whole. */
 typedef struct {
-    Play play;
-    PyProgram inputs, judgement;
+    PlayForm form;
+    PyRows rows;
     Py_buffer buffers[PLAY_BUFFERS];
-    Py_buffer *row_buffers; /* two for each copy, one for each variable and variable's start */
-    size_t number_of_row_buffers;
-    RowCopy *copies;
-    VariableStart *variable_starts;
-    DrawnVariable *drawn_variables;
-    InputStart *input_starts;
     int action_letter, action_dimensions;
     Py_ssize_t action_shape[MOST_DIMENSIONS + 1]; /* with the environments on the first axis */
     PyObject *start; /* the Access of the variables set before initialization */

@@ -1,10 +1,9 @@
-/* The methods of the type Pool that step, reset and read instances. */
+/* The methods of the type Pool that step and reset instances, and ask for the rest. */
 
 #include <stdlib.h>
-#include <string.h>
 
-#include "derivatives.h"
 #include "python.h"
+#include "requests.h"
 
 /* A call and its result. */
 typedef struct {
@@ -145,178 +144,108 @@ PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     return give_up(&c);
 }
 
-typedef struct {
-    const Access *access;
-    double *values;
-    ptrdiff_t failed;
-} Reading;
-
-static void do_read(PyPool *self, bool alone, void *context) {
-    Reading *r = context;
-    (void)alone;
-    r->failed = pool_read(&self->pool, r->access, r->values);
-}
-
-PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-    Py_buffer values;
-
-    if (!has_arguments(nargs, 2) || !is_access(self, args[0])) {
-        return NULL;
-    }
-    const Access *access = &((PyAccess *)args[0])->access;
-    if (!take_matrix(args[1], &values, WRITTEN, "values", ITEM_FLOAT64, (Py_ssize_t)access->count,
-                     (Py_ssize_t)self->pool.settings.count)) {
-        return NULL;
-    }
-    Reading reading = {access, values.buf, -1};
-    const bool done = perform(self, NEVER_SHORT, do_read, &reading);
-    PyBuffer_Release(&values);
-    return done && report_messages(self) ? PyLong_FromSsize_t(reading.failed) : NULL;
-}
+/* What is asked for besides steps and resets: see ../requests.h. */
 
 typedef struct {
-    const Access *access;
-    const double *values;
-    ptrdiff_t failed;
-} Writing;
-
-static void do_write(PyPool *self, bool alone, void *context) {
-    Writing *w = context;
-    (void)alone;
-    w->failed = pool_write(&self->pool, w->access, w->values);
-}
-
-PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-    Py_buffer values;
-
-    if (!has_arguments(nargs, 2) || !is_access(self, args[0])) {
-        return NULL;
-    }
-    const Access *access = &((PyAccess *)args[0])->access;
-    if (!take_matrix(args[1], &values, IN_PLACE, "values", ITEM_FLOAT64,
-                     (Py_ssize_t)access->count, (Py_ssize_t)self->pool.settings.count)) {
-        return NULL;
-    }
-    Writing writing = {access, values.buf, -1};
-    const bool done = perform(self, NEVER_SHORT, do_write, &writing);
-    PyBuffer_Release(&values);
-    return done && report_messages(self) ? PyLong_FromSsize_t(writing.failed) : NULL;
-}
-
-typedef struct {
-    Question question;
-    Matrix inputs;
-    double *derivatives;
-    ptrdiff_t failed;
-} Asked;
-
-static void do_differentiate(PyPool *self, bool alone, void *context) {
-    Asked *a = context;
-    (void)alone;
-    a->failed = pool_differentiate(&self->pool, a->inputs, &a->question, a->derivatives);
-}
-
-/* The variables of a part have the functions of its FMU, so that is_access does not fit. */
-static bool take_question(PyPool *self, PyObject *const *args, Question *question) {
-    const System *system = self->pool.settings.system;
-    const Py_ssize_t part = PyLong_AsSsize_t(args[1]);
-
-    if (PyErr_Occurred()) {
-        return false;
-    }
-    if (part < 0 || (size_t)part >= (system == NULL ? 1 : system->count)) {
-        PyErr_Format(PyExc_ValueError, "there is no part %zd", part);
-        return false;
-    }
-    if (!PyObject_TypeCheck(args[2], access_type) || !PyObject_TypeCheck(args[3], access_type)) {
-        PyErr_SetString(PyExc_TypeError, "expected an Access");
-        return false;
-    }
-    *question = (Question){.adjoint = args[0] == Py_True,
-                           .part = (size_t)part,
-                           .seeded = &((PyAccess *)args[2])->access,
-                           .others = &((PyAccess *)args[3])->access};
-    return true;
-}
-
-PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
-    PyPool *self = (PyPool *)object;
-    Py_buffer derivatives;
-    Asked asked = {.inputs = matrix_of(&self->buffers[INPUTS]), .failed = -1};
-
-    if (!has_arguments(nargs, 5) || !take_question(self, args, &asked.question) ||
-        !take_matrix(args[4], &derivatives, WRITTEN, "derivatives", ITEM_FLOAT64,
-                     (Py_ssize_t)(asked.question.seeded->count * asked.question.others->count),
-                     (Py_ssize_t)self->pool.settings.count)) {
-        return NULL;
-    }
-    asked.derivatives = derivatives.buf;
-    const bool done = perform(self, NEVER_SHORT, do_differentiate, &asked);
-    PyBuffer_Release(&derivatives);
-    return done && report_messages(self) ? PyLong_FromSsize_t(asked.failed) : NULL;
-}
-
-/* Queries */
-
-typedef struct {
-    size_t index;
-    bool found;
-    Failure failure;
+    Request request;
+    Reader reader;
+    Writer writer;
+    PyObject *held; /* a tuple of the states to restore, or NULL */
+    State *states;
+    size_t number_of_states;
+    Answer answer;
 } Asking;
 
 static void do_ask(PyPool *self, bool alone, void *context) {
     Asking *a = context;
+
     (void)alone;
-    a->found = pool_failure(&self->pool, a->index, &a->failure);
+    a->answer = a->held == NULL
+                    ? pool_answer(&self->pool, matrix_of(&self->buffers[INPUTS]), a->request,
+                                  &a->reader, &a->writer)
+                    : pool_answer_restore(&self->pool, &a->reader, &a->writer, a->states,
+                                          a->number_of_states);
 }
 
-static PyObject *values_of(const Failure *f) {
-    if (f->values == NULL) {
-        Py_RETURN_NONE;
+/* Takes a sequence of bytes, which is neither copied nor changed. */
+static bool take_states(PyObject *sequence, Asking *a) {
+    a->held = PySequence_Tuple(sequence);
+    if (a->held == NULL) {
+        return false;
     }
-    return PyBytes_FromStringAndSize((const char *)f->values,
-                                     (Py_ssize_t)(f->number_of_values * sizeof *f->values));
+    a->number_of_states = (size_t)PyTuple_Size(a->held);
+    a->states = calloc(a->number_of_states + 1, sizeof *a->states);
+    if (a->states == NULL) {
+        PyErr_NoMemory();
+        return false;
+    }
+    for (size_t i = 0; i < a->number_of_states; i++) {
+        char *bytes;
+        Py_ssize_t size;
+        if (PyBytes_AsStringAndSize(PyTuple_GetItem(a->held, (Py_ssize_t)i), &bytes, &size) < 0) {
+            return false;
+        }
+        a->states[i] = (State){bytes, (size_t)size};
+    }
+    return true;
 }
 
-PyObject *py_failure(PyObject *object, PyObject *argument) {
-    PyPool *self = (PyPool *)object;
-    const Py_ssize_t index = PyNumber_AsSsize_t(argument, PyExc_IndexError);
+/* A list of the blocks that are all that was written. */
+static PyObject *list_of(const Writer *writer) {
+    Reader reader = {writer->bytes, writer->bytes + writer->size, NULL};
+    PyObject *list = PyList_New(0);
 
-    if (PyErr_Occurred()) {
+    while (list != NULL && reader.at != reader.end) {
+        const Block block = read_block(&reader);
+        PyObject *bytes = PyBytes_FromStringAndSize(block.bytes, (Py_ssize_t)block.size);
+        if (bytes == NULL || PyList_Append(list, bytes) < 0) {
+            Py_CLEAR(list);
+        }
+        Py_XDECREF(bytes);
+    }
+    return list;
+}
+
+static PyObject *answer_of(const Asking *a) {
+    const Writer *writer = &a->writer;
+    const char *bytes = writer->bytes == NULL ? "" : writer->bytes;
+
+    if (writer->failed) {
+        return PyErr_NoMemory();
+    }
+    return a->request == REQUEST_SAVE_STATES && a->answer == ANSWER_RESULT
+               ? Py_BuildValue("iN", (int)a->answer, list_of(writer))
+               : Py_BuildValue("iy#", (int)a->answer, bytes, (Py_ssize_t)writer->size);
+}
+
+static PyObject *ask(PyPool *self, Asking *a, PyObject *states) {
+    if ((states != NULL && !take_states(states, a)) ||
+        !perform(self, NEVER_SHORT, do_ask, a) || !report_messages(self)) {
         return NULL;
     }
-    if (index < 0 || (size_t)index >= self->pool.settings.count) {
-        PyErr_Format(PyExc_IndexError, "there is no instance %zd", index);
+    return answer_of(a);
+}
+
+/* Takes a request, its form, and maybe the states to restore. The memory of bytes is aligned. */
+PyObject *py_ask(PyObject *object, PyObject *args) {
+    Asking a = {.held = NULL};
+    int request;
+    const char *form;
+    Py_ssize_t size;
+    PyObject *states = NULL;
+
+    if (!PyArg_ParseTuple(args, "iy#|O:ask", &request, &form, &size, &states)) {
         return NULL;
     }
-    Asking asking = {.index = (size_t)index};
-    if (!perform(self, ALWAYS_SHORT, do_ask, &asking)) {
+    if (request < 0 || request >= REQUESTS) {
+        PyErr_Format(PyExc_ValueError, "there is no request %d", request);
         return NULL;
     }
-    if (!asking.found) {
-        Py_RETURN_NONE;
-    }
-    const Failure *f = &asking.failure;
-    PyObject *result =
-        Py_BuildValue("sOidINNz", f->doing, f->in_warm_up ? Py_True : Py_False, f->status, f->time,
-                      (unsigned)f->reference, decode(f->said), values_of(f), f->part);
-    free(f->said);
-    free(f->values);
+    a.request = (Request)request;
+    a.reader = (Reader){form, form + size, NULL};
+    PyObject *result = ask((PyPool *)object, &a, states);
+    free(a.writer.bytes);
+    free(a.states);
+    Py_XDECREF(a.held);
     return result;
-}
-
-static void do_count_steps(PyPool *self, bool alone, void *context) {
-    (void)alone;
-    (void)context;
-    pool_count_steps(&self->pool);
-}
-
-PyObject *py_count_steps(PyObject *object, PyObject *unused) {
-    (void)unused;
-    if (!perform((PyPool *)object, NEVER_SHORT, do_count_steps, NULL)) {
-        return NULL;
-    }
-    Py_RETURN_NONE;
 }

@@ -151,7 +151,7 @@ static bool take_number(PyObject *action, Step *s) {
 
 /* Takes an action of exactly the type and shape that the action space has. */
 static bool take_action(const Playing *playing, PyObject *action, Step *s) {
-    if (playing->play.actions.check == ACTIONS_IN_RANGE) {
+    if (playing->form.play.actions.check == ACTIONS_IN_RANGE) {
         return take_number(action, s);
     }
     if (!take_array_of_actions(playing, action, 1, &s->buffer)) {
@@ -167,7 +167,7 @@ static void do_one(PyPool *self, bool alone, void *context) {
 
     t->turn.actions = s->actions;
     t->call.alone = alone;
-    s->is_refused = play_has_bad_action(&t->turn) || !play_makes_inputs(&t->turn, s->one->inputs);
+    s->is_refused = play_has_bad_action(&t->turn, 1) || !play_makes_inputs(&t->turn, s->one->inputs);
     if (!s->is_refused) {
         s->is_troubled = pool_play(&self->pool, &t->call, &t->ends) > 0 || t->ends.outside;
     }
@@ -230,7 +230,7 @@ static PyObject *step_with(PyPool *self, One *one, PyObject *action) {
 
 /* After an exception, the episode does not go on. */
 static PyObject *step_or_end(PyPool *self, One *one, PyObject *action, PyObject *attributes) {
-    uint8_t *ended = playing_of(one->playing)->play.ended;
+    uint8_t *ended = playing_of(one->playing)->form.play.ended;
 
     if (*ended || !is_as_before(one, attributes)) {
         Py_RETURN_NONE;

@@ -20,8 +20,8 @@ bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
 bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
     const Settings *s = &self->pool.settings;
 
-    if (playing->judgement.form.program.number_of_seen > 0 || PyTuple_Check(seen)) {
-        return take_seen(&playing->judgement, seen, t->seen_buffers, t->seen);
+    if (playing->form.judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
+        return take_seen(&playing->form.judgement, s->count, seen, t->seen_buffers, t->seen);
     }
     return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
                       s->count * s->num_observed * sizeof(float));
@@ -44,7 +44,7 @@ bool take_array_of_actions(const Playing *playing, PyObject *actions, int first,
     }
     bool fits = b->ndim == playing->action_dimensions - first &&
                 has_letter(b, playing->action_letter) &&
-                b->itemsize == (Py_ssize_t)playing->play.actions.size;
+                b->itemsize == (Py_ssize_t)playing->form.play.actions.size;
     for (int i = 0; fits && i < b->ndim; i++) {
         fits = b->shape[i] == playing->action_shape[first + i];
     }
@@ -60,7 +60,7 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
     const Py_buffer *inputs = &self->buffers[INPUTS], *starts = &playing->buffers[STARTS];
 
     t->turn = (Turn){
-        .play = &playing->play,
+        .play = &playing->form.play,
         .actions = b[ACTIONS].buf,
         .rewards = b[REWARDS].buf,
         .terminated = b[TERMINATED].buf,
@@ -72,7 +72,7 @@ void settle_turn(PyPool *self, const Playing *playing, PyTurn *t) {
         .inputs = {inputs->buf, inputs->strides[0], inputs->strides[1]},
         .start = &((PyAccess *)playing->start)->access,
         .start_values = {starts->buf, starts->strides[0], starts->strides[1]},
-        .mask = {(const char *)playing->play.ended, 1},
+        .mask = {(const char *)playing->form.play.ended, 1},
         .observations = b[SEEN].buf,
         .turn = &t->turn,
     };
@@ -82,7 +82,7 @@ static void do_play(PyPool *self, bool alone, void *context) {
     PyTurn *t = context;
 
     t->call.alone = alone;
-    t->bad_action = play_has_bad_action(&t->turn);
+    t->bad_action = play_has_bad_action(&t->turn, 1);
     if (!t->bad_action) {
         t->troubled = pool_play(&self->pool, &t->call, &t->ends);
     }
@@ -93,7 +93,7 @@ static void do_before(PyPool *self, bool alone, void *context) {
 
     t->call.alone = alone;
     t->ends.outside = false;
-    t->bad_action = play_has_bad_action(&t->turn);
+    t->bad_action = play_has_bad_action(&t->turn, 1);
     if (!t->bad_action) {
         t->troubled = pool_play_before(&self->pool, &t->call);
     }
@@ -127,20 +127,18 @@ static void settle_results(const Playing *playing, const ResultArrays *arrays, P
 /* Lets episodes start where others have ended before this step. */
 static void settle_starts(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
     t->turn.drawn = (double *)(void *)arrays->memory[DRAWN_ARRAY];
-    memcpy(arrays->memory[MASK_ARRAY], playing->play.ended, playing->play.count);
+    memcpy(arrays->memory[MASK_ARRAY], playing->form.play.ended, playing->form.play.count);
 }
 
 /* Lets them also start where others end in this step. */
 static void settle_starts_at_ends(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
-    const size_t count = playing->play.count;
-
     t->turn.last_seen = arrays->last_memory;
     if (pool_observes(playing)) {
         t->turn.last_observations = (float *)(void *)arrays->last_memory[0];
     }
     t->turn.started = (uint8_t *)arrays->memory[MASK_ARRAY];
-    for (size_t i = 0; i < playing->judgement.form.program.number_of_seen; i++) {
-        t->seen_sizes[i] = (size_t)playing->judgement.seen_bytes[i] / count;
+    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
+        t->seen_sizes[i] = playing->form.judgement.seen_sizes[i];
     }
 }
 
@@ -178,7 +176,7 @@ static bool play_turn(PyPool *self, int operation, PyTurn *t) {
 }
 
 void clear_turn(const Playing *playing, PyTurn *t) {
-    const size_t size = playing->judgement.form.program.number_of_seen * sizeof(Py_buffer);
+    const size_t size = playing->form.judgement.program.number_of_seen * sizeof(Py_buffer);
 
     t->bad_action = false;
     memset(t->buffers, 0, sizeof t->buffers);
@@ -189,7 +187,7 @@ void release_turn(const Playing *playing, PyTurn *t) {
     for (int i = 0; i < TURN_BUFFERS; i++) {
         release_buffer(&t->buffers[i]);
     }
-    for (size_t i = 0; i < playing->judgement.form.program.number_of_seen; i++) {
+    for (size_t i = 0; i < playing->form.judgement.program.number_of_seen; i++) {
         release_buffer(&t->seen_buffers[i]);
     }
 }
@@ -230,7 +228,7 @@ static void settle_step(PyPool *self, const Playing *playing, bool starts, bool 
 static PyObject *play_with(PyPool *self, int operation, PyObject *capsule, PyObject *actions,
                            bool at_ends) {
     const Playing *playing = playing_of(capsule);
-    const Play *play = &playing->play;
+    const Play *play = &playing->form.play;
     const bool starts =
         operation == PLAY && (at_ends || memchr(play->ended, 1, play->count) != NULL);
     ResultArrays arrays;

@@ -11,25 +11,13 @@ typedef struct {
     Py_buffer offsets;
 } PyRollout;
 
-static bool has_bad_action(const PyRollout *r) {
-    const Play *play = r->turn.turn.play;
-    const size_t size = play->count * play->actions.elements * play->actions.size;
-    Turn turn = r->turn.turn;
-    bool bad = false;
-
-    for (size_t step = 0; step < r->horizon && !bad; step++, turn.actions += size) {
-        bad = play_has_bad_action(&turn);
-    }
-    return bad;
-}
-
 static void do_rollout(PyPool *self, bool alone, void *context) {
     PyRollout *r = context;
     PyTurn *t = &r->turn;
 
     t->call.alone = alone;
     t->ends.outside = false;
-    t->bad_action = has_bad_action(r);
+    t->bad_action = play_has_bad_action(&t->turn, r->horizon);
     if (!t->bad_action) {
         t->troubled = pool_rollout(&self->pool, &t->call, r->horizon, &t->ends.outside);
     }
@@ -38,7 +26,7 @@ static void do_rollout(PyPool *self, bool alone, void *context) {
 static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObject *seen,
                                      PyRollout *r) {
     const Settings *s = &self->pool.settings;
-    const size_t count = playing->judgement.form.program.number_of_seen;
+    const size_t count = playing->form.judgement.program.number_of_seen;
     PyTurn *t = &r->turn;
 
     if (count == 0 && !PyTuple_Check(seen)) {
@@ -46,14 +34,15 @@ static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObj
                           r->horizon * s->count * s->num_observed * sizeof(float));
     }
     for (size_t i = 0; i < count; i++) {
-        const size_t size = (size_t)playing->judgement.seen_bytes[i];
+        const size_t size = playing->form.judgement.seen_sizes[i];
         PyObject *array = PyTuple_Check(seen) ? PyTuple_GetItem(seen, (Py_ssize_t)i) : seen;
         if (array == NULL ||
-            !take_bytes(array, &t->seen_buffers[i], PyBUF_WRITABLE, r->horizon * size)) {
+            !take_bytes(array, &t->seen_buffers[i], PyBUF_WRITABLE,
+                        r->horizon * s->count * size)) {
             return false;
         }
         t->seen[i] = t->seen_buffers[i].buf;
-        t->seen_sizes[i] = size / s->count;
+        t->seen_sizes[i] = size;
     }
     return true;
 }
@@ -68,7 +57,7 @@ static bool take_offsets(PyPool *self, PyObject *array, PyRollout *r) {
 static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *args,
                          PyRollout *r) {
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
-    const Actions *a = &playing->play.actions;
+    const Actions *a = &playing->form.play.actions;
     Py_buffer *b = r->turn.buffers;
 
     if (!take_matrix(args[REWARDS], &b[REWARDS], WRITTEN, "rewards", ITEM_FLOAT64, ANY_LENGTH, n)) {

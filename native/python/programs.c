@@ -17,10 +17,8 @@ bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char 
     return false;
 }
 
-static bool take_row(PyProgram *p, PyObject *object, Py_ssize_t count, Row *row) {
-    Py_buffer *buffer = &p->buffers[p->number_of_buffers++];
-
-    if (!take_numbers(object, buffer, true, "a row of a program", count)) {
+static bool take_row(PyObject *object, Py_ssize_t length, Py_buffer *buffer, Row *row) {
+    if (!take_numbers(object, buffer, true, "a row of a program", length)) {
         return false;
     }
     if ((uintptr_t)buffer->buf % (uintptr_t)buffer->itemsize != 0) {
@@ -31,62 +29,41 @@ static bool take_row(PyProgram *p, PyObject *object, Py_ssize_t count, Row *row)
     return true;
 }
 
-static bool accept(const char *fault) {
-    if (fault != NULL) {
-        PyErr_Format(PyExc_ValueError, "a program is not sound: %s", fault);
-    }
-    return fault == NULL;
-}
+bool take_rows(PyObject *tuple, Py_ssize_t length, PyRows *r) {
+    const size_t number = (size_t)PyTuple_Size(tuple);
+    bool good = true;
 
-static bool take_rows(PyProgram *p, PyObject *rows, Py_ssize_t count, size_t action_elements) {
-    const size_t number = (size_t)PyTuple_Size(rows);
-    Row *taken = calloc(number + 1, sizeof *taken);
-
-    p->buffers = calloc(number + 1, sizeof *p->buffers);
-    bool good = taken != NULL && p->buffers != NULL;
-    if (!good) {
+    r->buffers = calloc(number + 1, sizeof *r->buffers);
+    r->rows = calloc(number + 1, sizeof *r->rows);
+    if (r->buffers == NULL || r->rows == NULL) {
         PyErr_NoMemory();
+        return false;
     }
-    for (size_t i = 0; i < number && good; i++) {
-        good = take_row(p, PyTuple_GetItem(rows, (Py_ssize_t)i), count, &taken[i]);
+    for (; good && r->count < number; r->count++) {
+        good = take_row(PyTuple_GetItem(tuple, (Py_ssize_t)r->count), length,
+                        &r->buffers[r->count], &r->rows[r->count]);
     }
-    good = good && accept(program_settle(&p->form, taken, action_elements));
-    free(taken);
     return good;
 }
 
-bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *p) {
-    const char *form;
-    Py_ssize_t size;
-    PyObject *rows;
-
-    if (!PyArg_ParseTuple(parts, "y#O!;a program", &form, &size, &PyTuple_Type, &rows) ||
-        !accept(program_take(&p->form, form, (size_t)size, (size_t)PyTuple_Size(rows))) ||
-        !take_rows(p, rows, count, action_elements)) {
-        return false;
+void release_rows(PyRows *r) {
+    for (size_t i = 0; i < r->count; i++) {
+        release_buffer(&r->buffers[i]);
     }
-    for (size_t i = 0; i < MOST_SEEN; i++) {
-        p->seen_bytes[i] = count * (Py_ssize_t)p->form.seen_sizes[i];
-    }
-    return true;
+    free(r->buffers);
+    free(r->rows);
 }
 
-void release_program(PyProgram *p) {
-    for (size_t i = 0; i < p->number_of_buffers; i++) {
-        release_buffer(&p->buffers[i]);
-    }
-    free(p->buffers);
-    program_drop(&p->form);
-}
+static bool take_one_seen(const ProgramForm *program, size_t count, size_t i, PyObject *array,
+                          Py_buffer *buffers, char **seen) {
+    const Py_ssize_t size = (Py_ssize_t)(count * program->seen_sizes[i]);
 
-static bool take_one_seen(const PyProgram *program, size_t i, PyObject *array, Py_buffer *buffers,
-                          char **seen) {
     if (PyObject_GetBuffer(array, &buffers[i], PyBUF_C_CONTIGUOUS | PyBUF_WRITABLE) < 0) {
         return false;
     }
-    if (buffers[i].len != program->seen_bytes[i]) {
+    if (buffers[i].len != size) {
         PyErr_Format(PyExc_ValueError, "an array of observations has %zd bytes, expected %zd",
-                     buffers[i].len, program->seen_bytes[i]);
+                     buffers[i].len, size);
         return false;
     }
     seen[i] = buffers[i].buf;
@@ -94,36 +71,38 @@ static bool take_one_seen(const PyProgram *program, size_t i, PyObject *array, P
 }
 
 /* Takes the arrays in a tuple or a dict. Its values come in the order in which they were set. */
-static bool take_each_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers,
-                           char **seen) {
+static bool take_each_seen(const ProgramForm *program, size_t count, PyObject *arrays,
+                           Py_buffer *buffers, char **seen) {
     const bool is_dict = PyDict_Check(arrays);
     PyObject *array = NULL;
     Py_ssize_t place = 0;
     bool good = true;
 
-    for (size_t i = 0; good && i < program->form.program.number_of_seen; i++) {
+    for (size_t i = 0; good && i < program->program.number_of_seen; i++) {
         if (!is_dict) {
             array = PyTuple_GetItem(arrays, (Py_ssize_t)i);
         } else if (!PyDict_Next(arrays, &place, NULL, &array)) {
             return false; /* its size has been checked */
         }
-        good = take_one_seen(program, i, array, buffers, seen);
+        good = take_one_seen(program, count, i, array, buffers, seen);
     }
     return good;
 }
 
-bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen) {
-    const size_t count = program->form.program.number_of_seen;
+bool take_seen(const ProgramForm *program, size_t count, PyObject *arrays, Py_buffer *buffers,
+               char **seen) {
+    const size_t number = program->program.number_of_seen;
     const bool is_dict = PyDict_Check(arrays), is_tuple = PyTuple_Check(arrays);
 
-    if (count == 1 && !is_tuple && !is_dict) {
-        return take_one_seen(program, 0, arrays, buffers, seen);
+    if (number == 1 && !is_tuple && !is_dict) {
+        return take_one_seen(program, count, 0, arrays, buffers, seen);
     }
-    if ((!is_dict && !is_tuple) || (size_t)PyObject_Size(arrays) != count) {
-        PyErr_Format(PyExc_TypeError, "there must be a tuple of %zu arrays of observations", count);
+    if ((!is_dict && !is_tuple) || (size_t)PyObject_Size(arrays) != number) {
+        PyErr_Format(PyExc_TypeError, "there must be a tuple of %zu arrays of observations",
+                     number);
         return false;
     }
-    return take_each_seen(program, arrays, buffers, seen);
+    return take_each_seen(program, count, arrays, buffers, seen);
 }
 
 /* Evaluating a program alone */
@@ -131,12 +110,32 @@ bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, c
 enum { ACTIONS_GIVEN, PREVIOUS_GIVEN, FIRST_RESULT, FIRST_SEEN = FIRST_RESULT + PROGRAM_RESULTS };
 
 typedef struct {
-    PyProgram program;
+    ProgramForm program;
+    PyRows rows;
     Py_buffer buffers[FIRST_SEEN + MOST_SEEN];
     Source source;
     char *seen[MOST_SEEN];
     size_t count;
 } Evaluation;
+
+static bool take_program(Evaluation *e, PyObject *parts) {
+    const char *form;
+    Py_ssize_t size;
+    PyObject *rows;
+
+    if (!PyArg_ParseTuple(parts, "y#O!;a program", &form, &size, &PyTuple_Type, &rows) ||
+        !take_rows(rows, (Py_ssize_t)e->count, &e->rows)) {
+        return false;
+    }
+    const char *fault = program_take(&e->program, form, (size_t)size, e->rows.count);
+    if (fault == NULL) {
+        fault = program_settle(&e->program, e->rows.rows, e->source.action_elements);
+    }
+    if (fault != NULL) {
+        PyErr_Format(PyExc_ValueError, "a program is not sound: %s", fault);
+    }
+    return fault == NULL;
+}
 
 static bool take_given(Evaluation *e, PyObject *actions, PyObject *previous) {
     Py_buffer *b = e->buffers;
@@ -157,7 +156,7 @@ static bool take_given(Evaluation *e, PyObject *actions, PyObject *previous) {
 }
 
 static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
-    const size_t wanted = e->program.form.program.number_of_results;
+    const size_t wanted = e->program.program.number_of_results;
 
     if ((size_t)PyTuple_Size(results) != wanted) {
         PyErr_SetString(PyExc_ValueError, "there must be an array for each result");
@@ -170,11 +169,11 @@ static bool take_outputs(Evaluation *e, PyObject *results, PyObject *seen) {
         }
     }
     e->source.seen = e->seen;
-    return take_seen(&e->program, seen, &e->buffers[FIRST_SEEN], e->seen);
+    return take_seen(&e->program, e->count, seen, &e->buffers[FIRST_SEEN], e->seen);
 }
 
 static bool evaluate(Evaluation *e) {
-    const Program *program = &e->program.form.program;
+    const Program *program = &e->program.program;
     Register memory[PROGRAM_REGISTERS];
     Registers registers;
     Notes notes = {.outside = false};
@@ -207,7 +206,7 @@ PyObject *py_evaluate(PyObject *module, PyObject *args) {
                          &previous, &PyTuple_Type, &results, &PyTuple_Type, &seen)) {
         e->count = (size_t)count;
         e->source.action_elements = (size_t)elements;
-        if (take_program(parts, count, (size_t)elements, &e->program) &&
+        if (take_program(e, parts) &&
             take_given(e, actions, previous) && take_outputs(e, results, seen)) {
             result = PyBool_FromLong(evaluate(e));
         }
@@ -215,7 +214,8 @@ PyObject *py_evaluate(PyObject *module, PyObject *args) {
     for (int i = 0; i < FIRST_SEEN + MOST_SEEN; i++) {
         release_buffer(&e->buffers[i]);
     }
-    release_program(&e->program);
+    release_rows(&e->rows);
+    program_drop(&e->program);
     free(e);
     return result;
 }

@@ -7,22 +7,22 @@
 
 enum { MOST_DIMENSIONS = 8 }; /* of an action */
 
-/* A program, and its rows, which stay in use. */
+/* Rows of programs, which stay in use. */
 typedef struct {
-    ProgramForm form;
     Py_buffer *buffers;
-    size_t number_of_buffers;
-    Py_ssize_t seen_bytes[MOST_SEEN]; /* the size of each array of observations */
-} PyProgram;
+    Row *rows;
+    size_t count;
+} PyRows;
 
-/* Takes a program for count instances: a tuple of its form and its rows, also a tuple. Returns false
- * with an exception if it is not sound; it must be released in any case. */
-bool take_program(PyObject *parts, Py_ssize_t count, size_t action_elements, PyProgram *program);
-void release_program(PyProgram *program);
+/* Takes a tuple of vectors of this length. Returns false with an exception if they are none; the rows
+ * must be released in any case. */
+bool take_rows(PyObject *tuple, Py_ssize_t length, PyRows *rows);
+void release_rows(PyRows *rows);
 
-/* Takes the arrays that a program stores observations in: a tuple, the values of a dict, or the only
- * one. There is room for MOST_SEEN. */
-bool take_seen(const PyProgram *program, PyObject *arrays, Py_buffer *buffers, char **seen);
+/* Takes the arrays that a program stores observations of count environments in: a tuple, the values of a
+ * dict, or the only one. There is room for MOST_SEEN. */
+bool take_seen(const ProgramForm *program, size_t count, PyObject *arrays, Py_buffer *buffers,
+               char **seen);
 
 /* Takes a vector with any type of numbers. */
 bool take_numbers(PyObject *object, Py_buffer *buffer, bool written, const char *name,

@@ -69,10 +69,10 @@ bool has_arguments(Py_ssize_t given, Py_ssize_t expected);
 
 typedef void Work(PyPool *self, bool alone, void *context);
 
-enum { ALWAYS_SHORT = -1, NEVER_SHORT = -2 };
+enum { NEVER_SHORT = -1 };
 
 /* Does some work. length is one of the operations of pool.h, whose duration the pool knows, or
- * one of the constants above. Returns false with an exception if the pool cannot be entered. */
+ * NEVER_SHORT. Returns false with an exception if the pool cannot be entered. */
 bool perform(PyPool *self, int length, Work *work, void *context);
 /* Sets the exception of an entry that was refused. Returns whether it was not. */
 bool explain_entry(Entry entry);
@@ -86,14 +86,7 @@ bool report_messages(PyPool *self);
 PyObject *py_step_own(PyObject *object, PyObject *unused);
 PyObject *py_step(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_reset(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_read(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_write(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_differentiate(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_failure(PyObject *object, PyObject *argument);
-PyObject *py_count_steps(PyObject *object, PyObject *unused);
-PyObject *py_save_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-PyObject *py_restore_states(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
-
+PyObject *py_ask(PyObject *object, PyObject *args);
 PyObject *py_save(PyObject *object, PyObject *unused);
 PyObject *py_restore(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 

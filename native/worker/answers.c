@@ -23,9 +23,12 @@ static void end_twin(const Worker *w) {
     }
 }
 
-void send_answer(Worker *w, uint64_t code, Writer *writer) {
+void send_answer(Worker *w, Answer answer, Writer *writer) {
     end_twin(w);
-    send_message(&w->channel, code, writer->bytes, writer->size);
+    if (writer->failed) {
+        end_without_memory();
+    }
+    send_message(&w->channel, answer, writer->bytes, writer->size);
     free(writer->bytes);
 }
 
@@ -54,57 +57,15 @@ void worker_report(Worker *w) {
     }
 }
 
-void send_result(Worker *w, Writer *writer) {
-    send_answer(w, ANSWER_RESULT, writer);
-}
-
 void send_done(Worker *w) {
     Writer nothing = {.bytes = NULL};
-    send_result(w, &nothing);
+    send_answer(w, ANSWER_RESULT, &nothing);
 }
 
 void send_error(Worker *w, const char *text) {
     Writer writer = {.bytes = NULL};
-
-    write_text(&writer, text);
-    send_answer(w, ANSWER_ERROR, &writer);
-}
-
-void write_failure(Worker *w, Writer *writer, size_t index) {
-    Failure failure = {.doing = NULL};
-    const bool found = pool_failure(&w->pool, index, &failure);
-
-    write_integer(writer, found);
-    if (found) {
-        write_text(writer, failure.doing);
-        write_integer(writer, failure.in_warm_up);
-        write_integer(writer, failure.status);
-        write_number(writer, failure.time);
-        write_integer(writer, failure.reference);
-        write_text(writer, failure.said);
-        write_integer(writer, failure.values != NULL);
-        write_block(writer, failure.values, failure.number_of_values * sizeof(double));
-        write_text(writer, failure.part);
-        free(failure.said);
-        free(failure.values);
-    }
-}
-
-void send_failure(Worker *w, size_t index) {
-    Writer writer = {.bytes = NULL};
-
-    write_integer(&writer, (int64_t)index);
-    write_failure(w, &writer, index);
-    send_answer(w, ANSWER_FAILURE, &writer);
-}
-
-void send_result_unless(Worker *w, ptrdiff_t failed, Writer *writer) {
-    if (failed < 0) {
-        send_result(w, writer);
-    } else {
-        free(writer->bytes);
-        send_failure(w, (size_t)failed);
-    }
+    const Answer answer = answer_refusal(&writer, text);
+    send_answer(w, answer, &writer);
 }
 
 /* Outputs of a step whose answer cannot be sent are not published. */

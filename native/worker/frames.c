@@ -159,52 +159,17 @@ bool send_message(Channel *channel, uint64_t code, const void *content, size_t s
     return sent;
 }
 
-/* Writing */
+void end_without_memory(void) {
+    fprintf(stderr, "the worker has no memory left\n");
+    fflush(stderr);
+    _Exit(1);
+}
 
 void *memory_for(void *old, size_t size) {
     void *memory = realloc(old, size + 1);
 
     if (memory == NULL) {
-        fprintf(stderr, "the worker has no memory left\n");
-        fflush(stderr);
-        _Exit(1);
+        end_without_memory();
     }
     return memory;
-}
-
-static char *grow(Writer *writer, size_t size) {
-    const size_t begin = writer->size, whole = size + (8 - size % 8) % 8;
-
-    if (begin + whole > writer->room) {
-        writer->room = 2 * (begin + whole);
-        writer->bytes = memory_for(writer->bytes, writer->room);
-    }
-    writer->size += whole;
-    memset(writer->bytes + begin + size, 0, whole - size);
-    return writer->bytes + begin;
-}
-
-void write_integer(Writer *writer, int64_t number) {
-    memcpy(grow(writer, sizeof number), &number, sizeof number);
-}
-
-void write_number(Writer *writer, double number) {
-    memcpy(grow(writer, sizeof number), &number, sizeof number);
-}
-
-char *write_room(Writer *writer, size_t size) {
-    write_integer(writer, (int64_t)size);
-    return grow(writer, size);
-}
-
-void write_block(Writer *writer, const void *bytes, size_t size) {
-    char *room = write_room(writer, size);
-
-    if (size > 0) {
-        memcpy(room, bytes, size);
-    }
-}
-
-void write_text(Writer *writer, const char *text) {
-    write_block(writer, text == NULL ? "" : text, text == NULL ? 1 : strlen(text) + 1);
 }

@@ -7,19 +7,16 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "../rollouts.h"
+#include "../play_form.h"
 #include "worker.h"
 
 struct Rolling {
-    Play play;
-    ProgramForm inputs, judgement;
-    char *form; /* a copy of the request, which the play points to */
-    double *input_rows, *kept;
+    PlayForm form;
+    double *inputs, *kept;
     char **others; /* the other rows */
     size_t number_of_others;
     Row *rows; /* all */
     size_t number_of_rows;
-    RowCopy *copies;
     uint8_t *ended;
 };
 
@@ -30,16 +27,13 @@ static void rolling_drop(Rolling *r) {
     for (size_t i = 0; i < r->number_of_others; i++) {
         free(r->others[i]);
     }
-    program_drop(&r->inputs);
-    program_drop(&r->judgement);
-    free(r->play.actions.current);
-    free(r->play.actions.previous);
-    free(r->form);
-    free(r->input_rows);
+    free(r->form.play.actions.current);
+    free(r->form.play.actions.previous);
+    play_drop(&r->form);
+    free(r->inputs);
     free(r->kept);
     free(r->others);
     free(r->rows);
-    free(r->copies);
     free(r->ended);
     free(r);
 }
@@ -50,13 +44,14 @@ static void *zeros(size_t size) {
 
 /* Preparing */
 
-static char *row_of(const Settings *s, double *rows, size_t index) {
-    return (char *)(rows + index * s->count);
+static void add_row(Rolling *r, void *data, size_t size) {
+    r->rows[r->number_of_rows++] = (Row){.data = data, .size = size};
 }
 
-/* A program may take a row for one of wider values. */
-static char *other_row(const Settings *s, size_t size) {
-    return zeros(s->count * size + PROGRAM_WIDTH * sizeof(double));
+static void add_rows(Rolling *r, double *values, size_t number, size_t count) {
+    for (size_t i = 0; i < number; i++) {
+        add_row(r, values + i * count, sizeof(double));
+    }
 }
 
 static void read_rows(Worker *w, Reader *reader, Rolling *r) {
@@ -65,136 +60,47 @@ static void read_rows(Worker *w, Reader *reader, Rolling *r) {
     size_t others;
     const int64_t *sizes = read_array(reader, sizeof *sizes, &others);
 
-    r->input_rows = zeros(in * s->count * sizeof(double));
+    r->inputs = zeros(in * s->count * sizeof(double));
     r->kept = zeros(out * s->count * sizeof(double));
+    r->ended = zeros(s->count);
     r->rows = zeros((in + 2 * out + 1 + others) * sizeof *r->rows);
     r->others = zeros(others * sizeof *r->others);
-    Row *row = r->rows;
-    for (size_t i = 0; i < in; i++) {
-        *row++ = (Row){.data = row_of(s, r->input_rows, i), .size = sizeof(double)};
-    }
-    for (size_t i = 0; i < out; i++) {
-        *row++ = (Row){.data = row_of(s, w->output_values, i), .size = sizeof(double)};
-    }
-    for (size_t i = 0; i < out; i++) {
-        *row++ = (Row){.data = row_of(s, r->kept, i), .size = sizeof(double)};
-    }
-    *row++ = (Row){.data = (char *)w->shared.progress, .size = sizeof(int64_t)};
+    add_rows(r, r->inputs, in, s->count);
+    add_rows(r, w->output_values, out, s->count);
+    add_rows(r, r->kept, out, s->count);
+    add_row(r, w->shared.progress, sizeof(int64_t));
     for (size_t i = 0; i < others && reader->fault == NULL; i++) {
         if (sizes[i] != 1 && sizes[i] != 4 && sizes[i] != 8) {
             reader_refuse(reader, "there are no values of this size");
             break;
         }
-        r->others[r->number_of_others++] = other_row(s, (size_t)sizes[i]);
-        *row++ = (Row){.data = r->others[i], .size = (size_t)sizes[i]};
-    }
-    r->number_of_rows = (size_t)(row - r->rows);
-}
-
-static void read_copies(Reader *reader, Rolling *r) {
-    size_t count;
-    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
-
-    r->copies = zeros(count * sizeof *r->copies);
-    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
-        const uint64_t from = (uint64_t)pairs[2 * i], to = (uint64_t)pairs[2 * i + 1];
-        if (from >= r->number_of_rows || to >= r->number_of_rows ||
-            r->rows[from].size != r->rows[to].size) {
-            reader_refuse(reader, "rows to copy differ in type, or do not exist");
-            break;
-        }
-        r->copies[i] = (RowCopy){r->rows[from], r->rows[to]};
-    }
-    r->play.copies = r->copies;
-    r->play.number_of_copies = count;
-}
-
-static void read_actions(Worker *w, Reader *reader, Actions *a) {
-    a->elements = (size_t)read_integer_in(reader, 0, UINT16_MAX);
-    a->size = (size_t)read_integer_in(reader, 1, 8);
-    a->check = (ActionCheck)read_integer_in(reader, ACTIONS_ANY, ACTIONS_FLOAT32);
-    a->lowest = read_integer(reader);
-    a->highest = read_integer(reader);
-    const bool keeps = read_flag(reader);
-    const Block none = read_block(reader);
-    const size_t checked = a->check == ACTIONS_ANY ? a->size : a->check == ACTIONS_FLOAT32 ? 4 : 8;
-    if (none.size != a->elements * a->size || a->size != checked) {
-        reader_refuse(reader, "actions differ in type");
-    }
-    a->none = none.bytes;
-    if (keeps && reader->fault == NULL) {
-        const size_t size = w->opening.settings.count * a->elements * a->size;
-        a->current = zeros(size);
-        a->previous = zeros(size);
+        /* a program may take a row for one of wider values */
+        char *row = zeros(s->count * (size_t)sizes[i] + PROGRAM_WIDTH * sizeof(double));
+        r->others[r->number_of_others++] = row;
+        add_row(r, row, (size_t)sizes[i]);
     }
 }
 
-/* Its rows come as numbers among all. */
-static void read_program(Worker *w, Reader *reader, Rolling *r, ProgramForm *program) {
+static void prepare(Worker *w, Reader *reader) {
     const Settings *s = &w->opening.settings;
-    const Block form = read_block(reader);
-    size_t count;
-    const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
-    Row *rows = zeros(count * sizeof *rows);
-
-    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
-        if (numbers[i] < 0 || (uint64_t)numbers[i] >= r->number_of_rows) {
-            reader_refuse(reader, "there is no such row");
-            break;
-        }
-        rows[i] = r->rows[numbers[i]];
-    }
-    const char *fault = reader->fault;
-    fault = fault == NULL ? program_take(program, form.bytes, form.size, count) : fault;
-    fault = fault == NULL ? program_settle(program, rows, r->play.actions.elements) : fault;
-    if (fault != NULL) {
-        reader_refuse(reader, fault);
-    } else {
-        program_note_outputs(program, w->output_values, s->outputs->count, s->count);
-    }
-    free(rows);
-}
-
-static void settle(Worker *w, Rolling *r) {
-    const Settings *s = &w->opening.settings;
-    Play *play = &r->play;
-
-    play->count = s->count;
-    play->inputs = r->inputs.program;
-    play->judgement = r->judgement.program;
-    play->source.statuses = w->statuses;
-    play->input_rows = r->input_rows;
-    play->number_of_inputs = s->inputs->count;
-    play->output_rows = w->output_values;
-    play->kept_rows = r->kept;
-    play->number_of_outputs = s->outputs->count;
-    play->step_counts = w->shared.progress;
-    play->ended = r->ended = zeros(s->count);
-}
-
-static void prepare(Worker *w, Block form) {
     Rolling *r = zeros(sizeof *r);
 
     rolling_drop(w->rolling);
     w->rolling = r;
-    r->form = memory_for(NULL, form.size);
-    memcpy(r->form, form.bytes, form.size);
-    Reader reader = {r->form, r->form + form.size, NULL};
-    r->play.reads_kept = read_flag(&reader);
-    r->play.limit = read_integer(&reader);
-    read_actions(w, &reader, &r->play.actions);
-    read_rows(w, &reader, r);
-    read_copies(&reader, r);
-    read_program(w, &reader, r, &r->inputs);
-    read_program(w, &reader, r, &r->judgement);
-    if (r->inputs.program.number_of_seen > 0 ||
-        r->judgement.program.number_of_results != PROGRAM_RESULTS ||
-        reader.at != reader.end || reader.fault != NULL) {
+    read_rows(w, reader, r);
+    const Block form = read_block(reader);
+    if (reader->fault != NULL ||
+        play_take(&r->form, s, form.bytes, form.size, r->rows, r->number_of_rows) != NULL) {
         rolling_drop(r);
         w->rolling = NULL;
-    } else {
-        settle(w, r);
+        return;
     }
+    Actions *actions = &r->form.play.actions;
+    if (r->form.keeps_actions) {
+        actions->current = zeros(s->count * actions->elements * actions->size);
+        actions->previous = zeros(s->count * actions->elements * actions->size);
+    }
+    play_settle(&r->form, s, r->inputs, r->kept, w->shared.progress, r->ended);
 }
 
 /* Rolling out */
@@ -213,10 +119,10 @@ static void fill(Reader *reader, void *to, size_t size) {
 static void read_values(Worker *w, Reader *reader, Rolling *r) {
     const Settings *s = &w->opening.settings;
     const size_t first = s->inputs->count + s->outputs->count;
-    const Actions *a = &r->play.actions;
+    const Actions *a = &r->form.play.actions;
 
     for (size_t i = 0; i < s->inputs->count; i++) {
-        memcpy(r->input_rows + i * s->count, w->shared.inputs + i * w->shared.stride,
+        memcpy(r->inputs + i * s->count, w->shared.inputs + i * w->shared.stride,
                s->count * sizeof(double));
     }
     for (size_t i = first; i < r->number_of_rows; i++) {
@@ -240,14 +146,14 @@ typedef struct {
 } Rollout;
 
 static bool makes_observations(const Rolling *r) {
-    return r->judgement.program.number_of_seen > 0;
+    return r->form.judgement.program.number_of_seen > 0;
 }
 
 static void measure(Worker *w, Rolling *r, Rollout *o) {
-    o->arrays = makes_observations(r) ? r->judgement.program.number_of_seen : 1;
+    o->arrays = makes_observations(r) ? r->form.judgement.program.number_of_seen : 1;
     for (size_t i = 0; i < o->arrays; i++) {
         o->seen_sizes[i] = makes_observations(r)
-                               ? r->judgement.seen_sizes[i]
+                               ? r->form.judgement.seen_sizes[i]
                                : w->opening.settings.num_observed * sizeof(float);
     }
 }
@@ -275,13 +181,13 @@ static void settle_rollout(Worker *w, Rolling *r, Rollout *o, Writer *writer, si
     for (size_t i = 0; i < o->arrays; i++) {
         o->seen[i] = next_array(&reader);
     }
-    o->turn.play = &r->play;
+    o->turn.play = &r->form.play;
     o->turn.rewards = (double *)(void *)next_array(&reader);
     o->turn.terminated = (uint8_t *)next_array(&reader);
     o->turn.truncated = (uint8_t *)next_array(&reader);
     o->turn.seen = o->seen;
     o->turn.seen_sizes = o->seen_sizes;
-    o->call = (Call){.inputs = {(const char *)r->input_rows,
+    o->call = (Call){.inputs = {(const char *)r->inputs,
                                 (ptrdiff_t)(s->count * sizeof(double)), sizeof(double)},
                      .mask = {(const char *)r->ended, 1},
                      .turn = &o->turn};
@@ -290,42 +196,26 @@ static void settle_rollout(Worker *w, Rolling *r, Rollout *o, Writer *writer, si
     }
 }
 
-static bool has_bad_action(const Rollout *o) {
-    const Play *play = o->turn.play;
-    Turn turn = o->turn;
-
-    for (size_t step = 0; step < o->horizon; step++) {
-        if (play_has_bad_action(&turn)) {
-            return true;
-        }
-        turn.actions += play->count * play->actions.elements * play->actions.size;
-    }
-    return false;
-}
-
 /* An index outside of a table is told in the place of the troubled instances. */
 enum { OUTSIDE = -1 };
 
-static void roll_out(Worker *w, Rolling *r, Rollout *o) {
-    Writer writer = {.bytes = NULL};
+static Answer roll_out(Worker *w, Rolling *r, Rollout *o, Writer *writer) {
     bool outside = false;
 
-    write_integer(&writer, 0);
+    write_integer(writer, 0);
     measure(w, r, o);
-    make_room(w, o, &writer);
-    settle_rollout(w, r, o, &writer, sizeof(int64_t));
-    if (has_bad_action(o)) {
-        free(writer.bytes);
-        send_error(w, "an action is out of range");
-        return;
+    make_room(w, o, writer);
+    if (writer->failed) {
+        return answer_refusal(writer, "out of memory");
     }
-    pool_enter(&w->pool);
+    settle_rollout(w, r, o, writer, sizeof(int64_t));
+    if (play_has_bad_action(&o->turn, o->horizon)) {
+        return answer_refusal(writer, "an action is out of range");
+    }
     const size_t troubled = pool_rollout(&w->pool, &o->call, o->horizon, &outside);
-    pool_leave(&w->pool);
-    worker_report(w);
     const int64_t result = outside ? OUTSIDE : (int64_t)troubled;
-    memcpy(writer.bytes, &result, sizeof result);
-    send_result(w, &writer);
+    memcpy(writer->bytes, &result, sizeof result);
+    return ANSWER_RESULT;
 }
 
 /* Also adds them to the outputs where the rollout begins. Returns NULL if there are none. */
@@ -347,17 +237,16 @@ static const double *read_offsets(Worker *w, Reader *reader) {
     return offsets;
 }
 
-void answer_roll_out(Worker *w, Reader *reader) {
+Answer answer_roll_out(Worker *w, Reader *reader, Writer *writer) {
     if (read_flag(reader)) {
-        prepare(w, read_block(reader));
+        prepare(w, reader);
     }
     Rolling *r = w->rolling;
     Rollout o = {.horizon = (size_t)read_integer_in(reader, 1, INT32_MAX)};
     if (r == NULL) {
-        send_error(w, "what surrounds the steps of a rollout is damaged");
-        return;
+        return answer_refusal(writer, "what surrounds the steps of a rollout is damaged");
     }
-    const Actions *a = &r->play.actions;
+    const Actions *a = &r->form.play.actions;
     const Block actions = read_block(reader);
     if (actions.size != o.horizon * w->opening.settings.count * a->elements * a->size) {
         reader_refuse(reader, "the actions of a rollout differ in number");
@@ -365,9 +254,8 @@ void answer_roll_out(Worker *w, Reader *reader) {
     o.turn.offsets = read_offsets(w, reader);
     read_values(w, reader, r);
     if (reader->fault != NULL) {
-        send_error(w, reader->fault);
-        return;
+        return answer_refusal(writer, reader->fault);
     }
     o.turn.actions = actions.bytes;
-    roll_out(w, r, &o);
+    return roll_out(w, r, &o, writer);
 }

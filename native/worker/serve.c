@@ -2,7 +2,6 @@
 
 #include <stdlib.h>
 
-#include "../texts.h"
 #include "worker.h"
 
 static const size_t LARGEST_REQUEST = (size_t)1 << 40; /* bytes; no memory is as large */
@@ -25,65 +24,44 @@ static void answer_step(Worker *w, bool some) {
     send_answer(w, troubled ? ANSWER_TROUBLE : ANSWER_FINE, &nothing);
 }
 
-static void answer_count_steps(Worker *w, Reader *reader) {
-    (void)reader;
-    pool_enter(&w->pool);
-    pool_count_steps(&w->pool);
-    pool_leave(&w->pool);
-    send_done(w);
-}
-
-static void answer_failure(Worker *w, Reader *reader) {
-    const int64_t last = (int64_t)w->opening.settings.count - 1;
-    const size_t index = (size_t)read_integer_in(reader, 0, last);
-    Writer writer = {.bytes = NULL};
-
-    if (reader->fault != NULL) {
-        send_error(w, "there is no such instance");
-        return;
-    }
-    write_failure(w, &writer, index);
-    send_result(w, &writer);
-}
-
-static void answer_text_of(Worker *w, Reader *reader) {
-    Writer writer = {.bytes = NULL};
-
-    write_text(&writer, text_with(read_number(reader)));
-    send_result(w, &writer);
-}
-
-static void answer_close(Worker *w, Reader *reader) {
-    (void)reader;
-    pool_enter(&w->pool);
+static Answer answer_close(Worker *w) {
     pool_close(&w->pool);
+    return ANSWER_RESULT;
+}
+
+static Answer answer_in_pool(Worker *w, Request request, Reader *reader, Writer *writer) {
+    return request == REQUEST_RESET      ? answer_reset(w, reader, writer)
+           : request == REQUEST_SAVE     ? answer_save(w, reader, writer)
+           : request == REQUEST_RESTORE  ? answer_restore(w, reader, writer)
+           : request == REQUEST_RELEASE  ? answer_release(w, reader)
+           : request == REQUEST_ROLL_OUT ? answer_roll_out(w, reader, writer)
+           : request == REQUEST_CLOSE
+               ? answer_close(w)
+               : pool_answer(&w->pool, shared_inputs(w), request, reader, writer);
+}
+
+static void answer_other(Worker *w, Request request, Reader *reader) {
+    const bool changes = request == REQUEST_RESET || request == REQUEST_RESTORE ||
+                         request == REQUEST_RESTORE_STATES;
+    Writer writer = {.bytes = NULL};
+
+    pool_enter(&w->pool);
+    const Answer answer = answer_in_pool(w, request, reader, &writer);
     pool_leave(&w->pool);
     worker_report(w);
-    send_done(w);
+    if (changes) {
+        worker_publish(w);
+    }
+    if (request != REQUEST_RELEASE) {
+        send_answer(w, answer, &writer);
+    }
 }
 
-static void answer(Worker *w, uint64_t request, Reader *reader) {
-    static void (*const answers[REQUESTS])(Worker *, Reader *) = {
-        [REQUEST_RESET] = answer_reset,
-        [REQUEST_SAVE] = answer_save,
-        [REQUEST_RESTORE] = answer_restore,
-        [REQUEST_RELEASE] = answer_release,
-        [REQUEST_WRITE] = answer_write,
-        [REQUEST_READ] = answer_read,
-        [REQUEST_SAVE_STATES] = answer_save_states,
-        [REQUEST_RESTORE_STATES] = answer_restore_states,
-        [REQUEST_COUNT_STEPS] = answer_count_steps,
-        [REQUEST_FAILURE] = answer_failure,
-        [REQUEST_DIFFERENTIATE] = answer_differentiate,
-        [REQUEST_ROLL_OUT] = answer_roll_out,
-        [REQUEST_TEXT_OF] = answer_text_of,
-        [REQUEST_CLOSE] = answer_close,
-    };
-
+static void answer(Worker *w, Request request, Reader *reader) {
     if (request == REQUEST_STEP || request == REQUEST_STEP_SOME) {
         answer_step(w, request == REQUEST_STEP_SOME);
     } else {
-        answers[request](w, reader);
+        answer_other(w, request, reader);
     }
 }
 
@@ -112,7 +90,7 @@ static bool serve_one(Worker *w, Head head, bool is_first) {
     if (is_first) {
         goes_on = answer_open(w, &reader);
     } else {
-        answer(w, head.code, &reader);
+        answer(w, (Request)head.code, &reader);
     }
     free(content);
     return goes_on;

@@ -4,6 +4,7 @@
 #ifndef FMUGYM_WORKER_H
 #define FMUGYM_WORKER_H
 
+#include "../requests.h"
 #include "frames.h"
 
 /* The block's part of the arrays that the processes share; see
@@ -19,9 +20,10 @@ typedef struct {
     int64_t *health, *progress;
 } Shared;
 
-/* A list of variables that the other process refers to by a number. */
+/* A list of variables that are set before initialization, and its form. */
 typedef struct {
-    int64_t number;
+    char *form;
+    size_t size;
     Access access;
 } List;
 
@@ -55,17 +57,12 @@ void worker_serve(Worker *worker);
  * told why. */
 bool answer_open(Worker *worker, Reader *reader);
 
-/* The answers to other requests. */
-void answer_reset(Worker *worker, Reader *reader);
-void answer_write(Worker *worker, Reader *reader);
-void answer_read(Worker *worker, Reader *reader);
-void answer_differentiate(Worker *worker, Reader *reader);
-void answer_save(Worker *worker, Reader *reader);
-void answer_restore(Worker *worker, Reader *reader);
-void answer_release(Worker *worker, Reader *reader);
-void answer_save_states(Worker *worker, Reader *reader);
-void answer_restore_states(Worker *worker, Reader *reader);
-void answer_roll_out(Worker *worker, Reader *reader);
+/* The answers to requests that are not those of the pool itself, inside of it. */
+Answer answer_reset(Worker *worker, Reader *reader, Writer *writer);
+Answer answer_save(Worker *worker, Reader *reader, Writer *writer);
+Answer answer_restore(Worker *worker, Reader *reader, Writer *writer);
+Answer answer_release(Worker *worker, Reader *reader);
+Answer answer_roll_out(Worker *worker, Reader *reader, Writer *writer);
 
 /* Passes on the messages of the FMUs. */
 void worker_report(Worker *worker);
@@ -74,16 +71,9 @@ void worker_publish(Worker *worker);
 /* The inputs of a step in the shared memory. */
 Matrix shared_inputs(const Worker *worker);
 
-void send_done(Worker *worker);
 /* Frees what the writer has. */
-void send_answer(Worker *worker, uint64_t code, Writer *writer);
-void send_result(Worker *worker, Writer *writer);
+void send_answer(Worker *worker, Answer answer, Writer *writer);
+void send_done(Worker *worker);
 void send_error(Worker *worker, const char *text);
-/* Sends why the last status of an instance was bad, as an error. */
-void send_failure(Worker *worker, size_t index);
-/* Sends it if an instance has failed, otherwise the result. Frees what the writer has. */
-void send_result_unless(Worker *worker, ptrdiff_t failed, Writer *writer);
-/* Whether there is a failure is the first number. */
-void write_failure(Worker *worker, Writer *writer, size_t index);
 
 #endif

@@ -10,10 +10,10 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import RLock
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +24,7 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_count, check_number
 from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
+from fmugym.pool.asking import AskingPool
 from fmugym.pool.base import (
     DEFAULT_CALL_TIMEOUT,
     FloatArray,
@@ -32,42 +33,30 @@ from fmugym.pool.base import (
     PoolSpec,
     StatusArray,
     available_processors,
-    naming,
 )
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.derivatives import Question, Variables, differentiated
-from fmugym.pool.form import table_of
+from fmugym.pool.form import Writer
 from fmugym.pool.health import HealthArray
-from fmugym.pool.process.requests import (
-    Answer,
-    Reader,
-    Request,
-    read_values,
-    request_differentiate,
-    request_index,
-    request_listing,
-    request_reset,
-    request_text_of,
-    request_write,
-)
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.process.states import SnapshotOfWorkers, StatesOfWorkers
-from fmugym.pool.process.supervisor import ROLLOUT, Loss, Supervisor
+from fmugym.pool.process.supervisor import A_STEP, RESET, ROLLOUT, Supervisor
 from fmugym.pool.process.worker_group import WorkerGroup
-from fmugym.pool.saving_pool import SavingPool
+from fmugym.pool.requests import Answer, Reader, Request, request_listing
 from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
-    from fmugym.pool.process.rollouts import PlayOfWorkers, Rolled
+    from fmugym.pool.process.rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
+
+R = TypeVar("R")
 
 _CLOSING_TIME: Final = 5.0
 
 
-class ProcessPool(SavingPool):
+class ProcessPool(AskingPool):
     """N instances in blocks of supervised processes; see ``Pool`` for the contract.
 
     Args:
@@ -119,17 +108,25 @@ class ProcessPool(SavingPool):
         self.num_instances = num_instances
         self._spec = spec
         self._lock = RLock()
-        self._numbers: dict[tuple[Variable, ...], int] = {}
         self._play: PlayOfWorkers | None
         try:
             _check_options(workers, threads, call_timeout)
             self.workers = min(num_instances, workers or available_processors())
-            setup = Setup.of(fmu, spec, num_instances, log, private_libraries)
+            setup = Setup.of(
+                fmu,
+                spec,
+                num_instances,
+                log,
+                threads=threads or max(1, available_processors() // self.workers),
+                own_files=own_files,
+                private_libraries=private_libraries,
+                checks_heap=checks_heap,
+                on_trial=on_trial,
+            )
             memory = _make_memory(spec, num_instances, self.workers)
         except BaseException:
             fmu.close()
             raise
-        self._version = table_of(fmu.description)
         self._prepare_saving(fmu.description, spec)
         self._gives_texts = any(variable.kind == "string" for variable in spec.outputs)
         ask_for_texts(self._find_text, self)
@@ -137,21 +134,15 @@ class ProcessPool(SavingPool):
         self.inputs, self.outputs = arrays.inputs, arrays.outputs
         self.observations, self.statuses = arrays.observations, arrays.statuses
         self._mask, self._counts = arrays.mask, arrays.counts
-        threads = threads or max(1, available_processors() // self.workers)
-        setup = replace(
-            setup,
-            threads=threads,
-            own_files=own_files,
-            checks_heap=checks_heap,
-            on_trial=on_trial,
-        )
-        self._setup, self._arrays = setup, arrays
-        self._plays, self._play = 0, None
+        self._arrays, self._plays, self._play = arrays, 0, None
         setups = _share_out(setup, self.workers)
         timeout = math.inf if call_timeout is None else float(call_timeout)
         closing_time = closing_time or min(_CLOSING_TIME, timeout)
-        self._group = WorkerGroup(fmu, setups, memory, log, timeout, closing_time)
+        self._group = self._grouped(fmu, setups, memory, log, timeout, closing_time)
         self._states = StatesOfWorkers(self._group)
+
+    def _grouped(self, *arguments: Any) -> WorkerGroup:
+        return WorkerGroup(*arguments)
 
     # The contract of Pool.
 
@@ -183,19 +174,17 @@ class ProcessPool(SavingPool):
         mask: MaskArray,
     ) -> list[Supervisor]:
         """Reset blocks; returns those that lost a used worker, since a new one may succeed."""
-        number = self._numbers.setdefault(variables, len(self._numbers))
+        listing = request_listing(variables, self._version)
         used = [s for s in supervisors if not s.is_new]
         alive = self._group.revive(supervisors)
 
         def tell(supervisor: Supervisor) -> None:
-            block = supervisor.block
-            told = None if number in supervisor.known else variables
-            supervisor.known.add(number)
+            block, writer = supervisor.block, Writer().block(listing)
+            writer.array(values[:, block], np.float64).array(mask[block], np.bool_)
             supervisor.forget_output()
-            content = request_reset(number, told, self._version, values[:, block], mask[block])
-            supervisor.tell(Request.RESET, content, supervisor.read_growth)
+            supervisor.tell(Request.RESET, writer.form(), supervisor.read_growth)
 
-        for supervisor in self._group.run("a reset", alive, tell):
+        for supervisor in self._group.run(RESET, alive, tell):
             supervisor.note_success()
             block = supervisor.block
             self._group.lost[block] &= ~mask[block]
@@ -260,7 +249,7 @@ class ProcessPool(SavingPool):
             request = Request.STEP_SOME
             np.logical_or(self._group.lost, False if skip is None else skip, out=self._mask)
         replies = self._group.run(
-            "a step", self._group.able, lambda supervisor: supervisor.step(request)
+            A_STEP, self._group.able, lambda supervisor: supervisor.step(request)
         )
         if not self._group.any_lost and Answer.TROUBLE not in replies.values():
             return 0
@@ -284,7 +273,7 @@ class ProcessPool(SavingPool):
 
     def roll_out(self, *arrays: Any) -> int:
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
-        from fmugym.pool.process.rollouts import read_rolled
+        from fmugym.pool.process.rollouts import OUTSIDE, read_rolled
 
         actions, seen, *judged, offsets = arrays
         play = self._play = self._play or self._describe_play()
@@ -293,17 +282,18 @@ class ProcessPool(SavingPool):
         def tell(supervisor: Supervisor) -> None:
             block, is_known = supervisor.block, supervisor.knows_play(self._plays)
             supervisor.begin_progress(play.counts[block])
-            count = block.stop - block.start
             supervisor.tell(
                 Request.ROLL_OUT,
                 play.request(block, actions, offsets, is_known=is_known),
-                lambda reader: read_rolled(reader, count, own),
+                lambda reader: read_rolled(reader, block, own),
             )
 
         with self._lock:
-            replies = self._group.run(ROLLOUT, self._group.able, tell)
+            troubled = self._group.run(ROLLOUT, self._group.able, tell).values()
             self._group.note_lost()
-        return int(np.count_nonzero(self._group.lost)) + _take_rolled(replies, own)
+        if OUTSIDE in troubled:
+            raise IndexError("a hook looks up an index outside of its table")
+        return int(np.count_nonzero(self._group.lost) + sum(troubled))
 
     def _describe_play(self) -> PlayOfWorkers:
         from fmugym.pool.process.rollouts import PlayOfWorkers
@@ -329,18 +319,6 @@ class ProcessPool(SavingPool):
             self._states.restore(snapshot, mask)
         return self.outputs, self.statuses
 
-    def write(self, variables: tuple[Variable, ...], values: FloatArray) -> None:
-        """See ``Pool.write``."""
-        with self._lock:
-            self._require_present()
-            self._group.run(
-                "setting parameters",
-                self._group.supervisors,
-                lambda s: s.tell(
-                    Request.WRITE, request_write(variables, self._version, values[:, s.block])
-                ),
-            )
-
     def save_states(self, indices: IndexArray, records: bool) -> list[bytes]:
         """See ``SavingPool.save_states``; the episodes of lost instances have ended."""
         with self._lock:
@@ -358,13 +336,14 @@ class ProcessPool(SavingPool):
             supervisor = self._group.of(index)
             if not self._group.lost[index]:
                 within = index - supervisor.block.start
+                content = Writer().integers(within).form()
                 texts = self._group.run(
                     "a question",
                     [supervisor],
                     lambda s: s.tell(
                         Request.FAILURE,
-                        request_index(within),
-                        lambda reader: s.failure_in(reader, within),
+                        content,
+                        lambda reader: s.answers.failure(reader, within),
                     ),
                 )
                 for text in texts.values():
@@ -391,7 +370,7 @@ class ProcessPool(SavingPool):
             if self._group.refusal or not self._gives_texts:
                 return None
             group = self._group
-            content = request_text_of(number)
+            content = Writer().numbers(number).form()
             answers = group.run(
                 "a question",
                 group.able,
@@ -402,35 +381,24 @@ class ProcessPool(SavingPool):
     def read(self, variables: tuple[Variable, ...]) -> FloatArray:
         """See ``Pool.read``."""
         self._gives_texts |= any(variable.kind == "string" for variable in variables)
-        content = request_listing(variables, self._version)
-        try:
-            found = self._asked("reading variables", Request.READ, content, (len(variables),))
-        except SimulationError as error:
-            raise SimulationError(naming(str(error), variables)) from None
-        return np.concatenate(found, axis=1)
+        return super().read(variables)
 
-    def differentiate(self, unknowns: Variables, knowns: Variables) -> FloatArray:
-        """See ``Pool.differentiate``."""
-        about = self._setup.description, self._spec, self.num_instances
-        return differentiated(*about, self._differentiate, unknowns, knowns)
-
-    def _differentiate(self, question: Question) -> FloatArray:
-        content = request_differentiate(*question)
-        doing, shape = "a directional derivative", (len(question.seeded), len(question.others))
-        return np.concatenate(self._asked(doing, Request.DIFFERENTIATE, content, shape), axis=2)
-
-    def _asked(
-        self, doing: str, request: Request, content: bytes, shape: tuple[int, ...]
-    ) -> list[FloatArray]:
-        """Ask all workers for arrays of this shape and their instances, in the order of blocks."""
+    def _ask(
+        self,
+        doing: str,
+        request: Request,
+        content: Callable[[slice], bytes],
+        read: Callable[[Reader, int], R],
+    ) -> list[R]:
+        """See ``AskingPool._ask``; each worker has a block."""
         with self._lock:
             self._require_present()
             group = self._group
 
             def tell(supervisor: Supervisor) -> None:
-                count = supervisor.block.stop - supervisor.block.start
+                count = supervisor.answers.count
                 supervisor.tell(
-                    request, content, lambda reader: read_values(reader, (*shape, count))
+                    request, content(supervisor.block), lambda reader: read(reader, count)
                 )
 
             parts = group.run(doing, group.supervisors, tell)
@@ -450,15 +418,6 @@ class ProcessPool(SavingPool):
         """How many initializations the workers have begun."""
         return sum(supervisor.initializations for supervisor in self._group.supervisors)
 
-    @property
-    def losses(self) -> list[Loss]:
-        """How worker processes died or hung, in the order of the workers."""
-        return self._group.losses
-
-    def limit_calls(self, call_timeout: float) -> None:
-        """Let the next calls take so long; see ``call_timeout``."""
-        self._group.call_timeout = call_timeout
-
     def processes(self) -> list[int]:
         """Return the process numbers of the workers; 0 for a worker that was given up."""
         return [supervisor.pid for supervisor in self._group.supervisors]
@@ -468,16 +427,6 @@ class ProcessPool(SavingPool):
         missing = np.flatnonzero(lost if mask is None else lost & mask)
         if missing.size:
             raise SimulationError(self.failure(int(missing[0])))
-
-
-def _take_rolled(replies: Mapping[Supervisor, Rolled], arrays: Sequence[npt.NDArray[Any]]) -> int:
-    """Put the results of rollouts together; returns how many instances had trouble."""
-    if any(reply.is_outside for reply in replies.values()):
-        raise IndexError("a hook looks up an index outside of its table")
-    for supervisor, reply in replies.items():
-        for array, part in zip(arrays, reply.arrays, strict=True):
-            array[:, supervisor.block] = part
-    return sum(reply.troubled for reply in replies.values())
 
 
 def _check_options(workers: Any, threads: Any, call_timeout: Any) -> None:

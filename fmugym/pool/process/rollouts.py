@@ -7,38 +7,22 @@ reads what is written here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.pool.base import FloatArray
 from fmugym.pool.form import Writer
-from fmugym.pool.process.requests import DamagedError, Reader
+from fmugym.pool.play_form import Rows, form_of_play
 from fmugym.pool.process.shared_memory import Arrays
+from fmugym.pool.requests import DamagedError, Reader
 
-__all__ = ["PlayOfWorkers", "Rolled", "read_rolled"]
+__all__ = ["OUTSIDE", "PlayOfWorkers", "read_rolled"]
 
-Rows = Sequence[npt.NDArray[Any]]
-
-_OUTSIDE: Final = -1
+OUTSIDE: Final = -1
 """In the place of a number of instances: a hook has looked up an index outside of its table."""
-
-
-class Rolled(NamedTuple):
-    """What a rollout of a block has led to.
-
-    Attributes:
-        troubled: How many instances or numbers were in trouble.
-        is_outside: Whether a hook has looked up an index outside of its table.
-        arrays: The observations, rewards, terminated and truncated, with the steps on the first
-            axis.
-    """
-
-    troubled: int
-    is_outside: bool
-    arrays: tuple[npt.NDArray[Any], ...]
 
 
 class PlayOfWorkers:
@@ -56,30 +40,15 @@ class PlayOfWorkers:
     """
 
     def __init__(self, arrays: Arrays, parts: Sequence[Any]) -> None:
-        programs, actions, _, _, (self.counts, _, limit), surroundings = parts
+        programs, self._actions, _, _, (self.counts, _, limit), surroundings = parts
         self._kept: FloatArray = surroundings["kept"]
-        self._actions = actions
-        self._others: list[npt.NDArray[Any]] = []
-        rows = *arrays.inputs, *arrays.outputs, *self._kept, self.counts
-        self._numbers = {_address(row): number for number, row in enumerate(rows)}
-        copies = [list(map(self._number, pair)) for pair in surroundings["copies"]]
-        numbers = [list(map(self._number, rows)) for _, rows in programs]
-        writer = Writer()
-        writer.integers(surroundings["reads_kept"], limit)
-        _write_actions(writer, actions)
-        writer.array([row.itemsize for row in self._others], np.int64)
-        writer.array(copies, np.int64)
-        for (form, _), own in zip(programs, numbers, strict=True):
-            writer.block(form)
-            writer.array(own, np.int64)
-        self._play = writer.form()
-
-    def _number(self, row: npt.NDArray[Any]) -> int:
-        key = _address(row)
-        if key not in self._numbers:
-            self._numbers[key] = len(self._numbers)
-            self._others.append(row)
-        return self._numbers[key]
+        rows = Rows([*arrays.inputs, *arrays.outputs, *self._kept, self.counts])
+        known = len(rows.arrays)
+        starts: dict[str, tuple[()]] = {"variable_starts": (), "drawn_variables": ()}
+        form = form_of_play(rows, programs, self._actions, limit, surroundings | starts)
+        self._others = rows.arrays[known:]
+        sizes = [row.itemsize for row in self._others]
+        self._play = Writer().array(sizes, np.int64).block(form).form()
 
     def request(
         self, block: slice, actions: npt.NDArray[Any], offsets: FloatArray, *, is_known: bool
@@ -92,11 +61,8 @@ class PlayOfWorkers:
             offsets: What is added to the outputs; empty for nothing.
             is_known: Whether the worker knows what was prepared.
         """
-        writer = Writer()
-        writer.integers(not is_known)
-        if not is_known:
-            writer.block(self._play)
-        writer.integers(len(actions))
+        writer = Writer().integers(not is_known)
+        writer.forms(b"" if is_known else self._play).integers(len(actions))
         writer.block(np.ascontiguousarray(actions[:, block]).tobytes())
         writer.array(offsets, np.float64)
         for row in (*self._kept, *self._others):
@@ -107,37 +73,25 @@ class PlayOfWorkers:
         return writer.form()
 
 
-def _write_actions(writer: Writer, actions: Mapping[str, Any]) -> None:
-    none = actions["none"]
-    writer.integers(none.size, none.itemsize)
-    writer.integers(*(int(actions[name]) for name in ("check", "lowest", "highest")))
-    writer.integers(actions["current"] is not None)
-    writer.block(none.tobytes())
-
-
-def _address(row: npt.NDArray[Any]) -> int:
-    return int(row.__array_interface__["data"][0])
-
-
-def read_rolled(reader: Reader, count: int, arrays: Sequence[npt.NDArray[Any]]) -> Rolled:
+def read_rolled(reader: Reader, block: slice, arrays: Sequence[npt.NDArray[Any]]) -> int:
     """Read the answer to a rollout.
 
     Args:
         reader: Reads it.
-        count: The number of the worker's instances.
-        arrays: Those of all instances, which are of the same types.
+        block: The indices of the worker's instances.
+        arrays: The observations, rewards, terminated and truncated of all instances, with the steps
+            on the first axis. Those of the worker's are filled.
+
+    Returns:
+        How many instances or numbers were in trouble, or ``OUTSIDE``.
     """
     troubled = reader.integer()
-    if troubled < _OUTSIDE:
+    if troubled < OUTSIDE:
         raise DamagedError(f"{troubled} instances in trouble")
-    found = tuple(_read_like(reader, count, array) for array in arrays)
+    for array in arrays:
+        part = array[:, block]
+        is_flag = array.dtype == np.bool_
+        found = reader.array(part.shape, np.uint8 if is_flag else array.dtype)
+        part[...] = found != 0 if is_flag else found  # a byte may be anything
     reader.end()
-    return Rolled(max(0, troubled), troubled == _OUTSIDE, found)
-
-
-def _read_like(reader: Reader, count: int, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    shape = len(array), count, *array.shape[2:]
-    if array.dtype != np.bool_:
-        return reader.array(shape, array.dtype)
-    flags: MaskArray = reader.array(shape, np.uint8) != 0  # a byte may be anything
-    return flags
+    return troubled

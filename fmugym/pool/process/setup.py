@@ -9,7 +9,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU
@@ -84,9 +84,14 @@ class Setup:
         spec: PoolSpec,
         num_instances: int,
         log: logging.Logger,
+        *,
         private_libraries: bool = False,
+        **options: Any,
     ) -> Setup:
-        """Extract an FMU, and say what a worker for all of its instances needs to know."""
+        """Extract an FMU, and say what a worker for all of its instances needs to know.
+
+        The options are those attributes that have a default.
+        """
         folder = fmu.extract()
         copies = copy_libraries(fmu, folder, num_instances) if private_libraries else None
         return cls(
@@ -102,6 +107,7 @@ class Setup:
             environment=dict(os.environ),
             block=slice(num_instances),
             wine=Wine.ready() if fmu.in_wine else None,
+            **options,
         )
 
     @property

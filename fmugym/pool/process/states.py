@@ -5,19 +5,21 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 
+import numpy as np
+
 from fmugym.errors import SimulationError
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import IndexArray, ended_state
-from fmugym.pool.process.requests import (
+from fmugym.pool.form import Writer
+from fmugym.pool.process.supervisor import Supervisor
+from fmugym.pool.process.worker_group import WorkerGroup
+from fmugym.pool.requests import (
     Reader,
     Request,
     read_states,
-    request_restore,
     request_restore_states,
     request_save_states,
 )
-from fmugym.pool.process.supervisor import Supervisor
-from fmugym.pool.process.worker_group import WorkerGroup
 
 __all__ = ["SnapshotOfWorkers", "StatesOfWorkers"]
 
@@ -76,7 +78,7 @@ class StatesOfWorkers:
         self._group.run(
             "restoring a state",
             concerned,
-            lambda s: s.tell(Request.RESTORE, request_restore(parts[s][1], mask[s.block])),
+            lambda s: s.tell(Request.RESTORE, _request_restore(parts[s][1], mask[s.block])),
         )
         self._group.note_lost()
 
@@ -132,6 +134,10 @@ def _read_number(reader: Reader) -> int:
     number = reader.integer()
     reader.end()
     return number
+
+
+def _request_restore(number: int, mask: MaskArray) -> bytes:
+    return Writer().integers(number).array(mask, np.bool_).form()
 
 
 def _within(supervisor: Supervisor, indices: IndexArray) -> IndexArray:

@@ -12,29 +12,33 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, NoReturn
 
-from fmugym.errors import FMULoadError, SimulationError, printable
+import numpy as np
+
+from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.callbacks import Receiver
+from fmugym.pool.form import Writer
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.last_words import describe_exit, lines_of_echo
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
-from fmugym.pool.process.requests import (
-    Answer,
-    DamagedError,
-    Reader,
-    Request,
-    read_failure,
-    request_indices,
-)
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
 from fmugym.pool.reports import loading_failed
+from fmugym.pool.requests import (
+    Answer,
+    Answers,
+    DamagedError,
+    Reader,
+    Request,
+)
 from fmugym.pool.spec import INITIALIZATION_FACTOR
 from fmugym.signals import Ignoring, ordinary
 
 __all__ = [
+    "A_STEP",
     "INSTANTIATION",
+    "RESET",
     "ROLLOUT",
     "Loss",
     "LostError",
@@ -45,8 +49,10 @@ __all__ = [
 ]
 
 INSTANTIATION: Final = "the instantiation"
+RESET: Final = "a reset"
+A_STEP: Final = "a step"
 ROLLOUT: Final = "a rollout"
-_SLOW: Final = (INSTANTIATION, "a reset")
+_SLOW: Final = (INSTANTIATION, RESET)
 """What may take ten times as long as other calls: models may need minutes to initialize."""
 
 _MOST_DEATHS: Final = 5
@@ -61,10 +67,10 @@ _LAST_MOMENT: Final = 0.5
 _LONGEST_KILL: Final = 2.0
 """Seconds that a killed process may take to end; a system call may hold it for longer."""
 
-_STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
+_GIVEN_UP: Final = "ended with exit status 1"
+"""What Wine does if it gets no server."""
 
-_TAIL: Final = 10
-"""How many of the FMU's last messages the cause of a death quotes."""
+_STEPPED: Final = (Answer.FINE, Answer.TROUBLE)
 
 
 def timeout_factor(doing: str) -> int:
@@ -114,11 +120,11 @@ class Supervisor:
 
     Attributes:
         block: The indices of the worker's instances.
+        answers: Reads the worker's answers.
         generation: The number of processes that have ended.
         reason: Why the last process died.
         growth: By how many bytes the process has grown since its first resets.
         is_new: Whether no reset has succeeded in this process yet.
-        known: The numbers of the lists of variables that this process knows.
         released: The snapshots without any reference left, by generation and number.
         receiver: Gets the messages of the worker's FMUs.
         deadline: Until when the worker has to read a request, in the time of ``time.monotonic``.
@@ -133,13 +139,13 @@ class Supervisor:
         log: logging.Logger,
     ) -> None:
         self.block = setup.block
+        self.answers = Answers(setup.description, setup.spec, setup.block)
         self.generation = 0
         self.reason = ""
         self.losses: list[Loss] = []
         self.initializations = 0
         self.growth = 0
         self.is_new = True
-        self.known: set[int] = set()
         self.released: deque[tuple[int, int]] = deque()
         self.deadline = math.inf
         self.receiver = Receiver(log, setup.description, setup.block.start)
@@ -197,12 +203,10 @@ class Supervisor:
             self.forget()
             self._opening = False
             raise
-        self._tail: deque[str] = deque(maxlen=_TAIL)
         self._echo[0] = 0
         self._fault: int | None = None
         self.growth, self.is_new = 0, True
         self._initializations = 0
-        self.known.clear()
         self._play = -1
         self.tell(Request.OPEN, self._content)
         self._content = b""
@@ -365,7 +369,7 @@ class Supervisor:
         while self.released:
             owner, number = self.released.popleft()
             numbers += [number] if owner == generation else []
-        self._channel.send(Request.RELEASE, request_indices(numbers), self.deadline)
+        self._channel.send(Request.RELEASE, Writer().array(numbers, np.int64).form(), self.deadline)
 
     def reply(self, deadline: float, doing: str) -> Any:
         """Wait for the reply.
@@ -397,6 +401,22 @@ class Supervisor:
         if isinstance(result, Exception):
             self.bury(f"{self._why_not_loaded(result.args[0])}{self.printed}")
             raise RefusedError(self.reason)
+
+    def opens_again(self) -> bool:
+        """Start a process in the place of one that Wine has ended before it could run.
+
+        Wine does so if its server takes more than six seconds to end. The next process gets a
+        server of its own.
+
+        Raises:
+            LostError: If the system refuses.
+        """
+        is_first = self._deaths == 1 and self._setup.wine is not None
+        if not is_first or not self.losses or self.losses[0].how != _GIVEN_UP:
+            return False
+        self.losses.clear()
+        self.start()
+        return True
 
     def _why_not_loaded(self, text: str) -> str:
         """Say which libraries are missing, or else what the worker has said."""
@@ -437,15 +457,10 @@ class Supervisor:
             self._pass_on(reader)
         elif code == Answer.FAULT:
             self._fault = reader.integer()
-        elif code == Answer.ERROR:
-            return (SimulationError(reader.text()),)
-        elif code == Answer.FAILURE:
-            index = reader.index(self._setup.count)
-            return (SimulationError(self.failure_in(reader, index)),)
-        elif code == Answer.RESULT and read is not None:
-            return (read(reader),)
-        else:
+        elif read is None:
             raise DamagedError(f"the code {code}")
+        else:
+            return (self.answers.result(code, reader, read),)
         return None
 
     def read_growth(self, reader: Reader) -> None:
@@ -455,17 +470,9 @@ class Supervisor:
         self.initializations += max(0, count - self._initializations)
         self._initializations = count
 
-    def failure_in(self, reader: Reader, index: int) -> str:
-        """Read why an instance has failed, counted within the block; "" if it has not."""
-        setup = self._setup
-        name = f"{setup.description.model_identifier}_{self.block.start + index}"
-        return read_failure(reader, setup.description, setup.spec, name)
-
     def _pass_on(self, reader: Reader) -> None:
         index = reader.index(self.receiver.sources * self._setup.count)
-        record = index, reader.integer(), reader.text(), reader.text()
-        self._tail.append(self.receiver.text_of(*record))
-        self.receiver(*record)
+        self.receiver(index, reader.integer(), reader.text(), reader.text())
 
     @property
     def _name(self) -> str:
@@ -510,7 +517,7 @@ class Supervisor:
         self.losses.append(Loss(how, is_late, self._last_messages() + self._output.lines()))
 
     def _last_messages(self) -> list[str]:
-        return lines_of_echo(self._echo.tobytes()) or list(self._tail)
+        return lines_of_echo(self._echo.tobytes())
 
     def _cause(self, text: str) -> str:
         said = quoted(as_messages(self._last_messages()))

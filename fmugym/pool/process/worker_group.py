@@ -82,7 +82,7 @@ class WorkerGroup:
             for supervisor in self.supervisors:
                 supervisor.confirm()
             for supervisor in self.supervisors:
-                supervisor.finish_opening(self._deadline(INSTANTIATION))
+                self._finish(supervisor)
         except RefusedError as refusal:
             self.close()
             raise FMULoadError(str(refusal)) from None
@@ -94,6 +94,16 @@ class WorkerGroup:
         except BaseException:
             self.close()
             raise
+
+    def _finish(self, supervisor: Supervisor) -> None:
+        try:
+            supervisor.finish_opening(self._deadline(INSTANTIATION))
+        except RefusedError:
+            raise
+        except LostError:
+            if not supervisor.opens_again():
+                raise
+            supervisor.finish_opening(self._deadline(INSTANTIATION))
 
     @property
     def losses(self) -> list[Loss]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from fmugym.archive.description import BASE_UNITS, Unit
+from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.errors import FMULoadError, shown
 
 __all__ = [
@@ -18,7 +19,6 @@ __all__ = [
     "Binding",
     "Element",
     "OwnConnector",
-    "Scaling",
     "SystemElement",
     "Wire",
     "children",
@@ -57,14 +57,6 @@ _MAPPINGS: Final = (
     *("BooleanMappingTransformation", "IntegerMappingTransformation"),
     "EnumerationMappingTransformation",
 )
-
-
-@dataclass(frozen=True)
-class Scaling:
-    """``gain * x + offset``."""
-
-    gain: float = 1.0
-    offset: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -133,7 +125,7 @@ class Wire:
 
     start: tuple[str | None, str]
     end: tuple[str | None, str]
-    scaling: Scaling
+    scaling: Conversion
     convert: bool
 
     def __str__(self) -> str:
@@ -287,7 +279,7 @@ def _read_wire(xml: Any) -> Wire:
     return Wire(ends[0], ends[1], scaling_of(xml), not suppressed)
 
 
-def scaling_of(xml: Any) -> Scaling:
+def scaling_of(xml: Any) -> Conversion:
     """Read the linear transformation of a connection or of an entry of a mapping.
 
     Raises:
@@ -297,8 +289,8 @@ def scaling_of(xml: Any) -> Scaling:
         for other in children(xml, name):
             raise FMULoadError(f"line {other.sourceline}: {name} is not supported here")
     for linear in children(xml, "LinearTransformation"):
-        return Scaling(number_in(linear, "factor", 1.0), number_in(linear, "offset"))
-    return Scaling()
+        return Conversion(number_in(linear, "factor", 1.0), number_in(linear, "offset"))
+    return IDENTITY
 
 
 def unit_of(xml: Any) -> str | None:

@@ -12,11 +12,11 @@ from functools import cached_property
 from typing import Any
 
 from fmugym.archive.description import ModelDescription, Unit
-from fmugym.archive.units import IDENTITY, conversion_of_link
+from fmugym.archive.units import IDENTITY, Conversion, conversion_of_link
 from fmugym.archive.variable import Variable
 from fmugym.errors import ConfigError, FMULoadError, shown
 from fmugym.systems.connections import Connection
-from fmugym.systems.ssp.elements import Element, OwnConnector, Scaling, SystemElement, Wire
+from fmugym.systems.ssp.elements import Element, OwnConnector, SystemElement, Wire
 from fmugym.systems.ssp.parameters import Setting, read_settings
 
 __all__ = ["Flat", "Node"]
@@ -28,13 +28,12 @@ Node = tuple[Path, str]
 
 @dataclass(frozen=True)
 class _Value:
-    """A value on its way: ``gain * x + offset`` in a unit; None if it is not known.
+    """A value on its way: what has become of it, and its unit; None if that is not known.
 
     ``units`` has the definition of the unit.
     """
 
-    gain: float = 1.0
-    offset: float = 0.0
+    change: Conversion = IDENTITY
     unit: str | None = None
     units: Mapping[str, Unit] = field(default_factory=dict)
 
@@ -203,23 +202,21 @@ class Flat:
         ends = _named(first), _named(target)
         told = self._is_told(first) or self._is_told(target)
         if len(chain) == 1 and not told:  # kept as in the file
-            return Connection(*ends, wire.scaling.gain, wire.scaling.offset, wire.convert)
+            return Connection(*ends, wire.scaling.factor, wire.scaling.offset, wire.convert)
         value = _Value(unit=self._unit(first), units=self._units_at(first))
         stops = [node for node, _ in chain[1:]] + [target]
         for (_, wire), stop in zip(chain, stops, strict=True):
             value = self._through(value, wire.convert, wire.scaling, stop)
-        return Connection(*ends, value.gain, value.offset, convert_units=False)
+        return Connection(*ends, value.change.factor, value.change.offset, convert_units=False)
 
-    def _through(self, value: _Value, convert: bool, scaling: Scaling, node: Node) -> _Value:
+    def _through(self, value: _Value, convert: bool, scaling: Conversion, node: Node) -> _Value:
         """Convert a value to the unit of a node, then scale it."""
         unit = self._unit(node)
         conversion = IDENTITY
         if convert and value.unit is not None and unit is not None:
             conversion = conversion_of_link(value.unit, value.units, unit, self._units_at(node))
-        factor = scaling.gain * conversion.factor
-        offset = scaling.gain * (conversion.factor * value.offset + conversion.offset)
         known = (value.unit, value.units) if unit is None else (unit, self._units_at(node))
-        return _Value(factor * value.gain, offset + scaling.offset, *known)
+        return _Value(scaling.after(conversion.after(value.change)), *known)
 
     def _unit(self, node: Node) -> str | None:
         """The unit of a connector; an FMU knows best what its variable has."""
@@ -295,9 +292,11 @@ class Flat:
                 yield end, value
             return
         units = {**self.units, **setting.units}
-        first = self._converted(_Value(0.0, float(value), setting.unit, units), setting, node)
+        given = _Value(Conversion(0.0, float(value)), setting.unit, units)
+        known = self._through(given, setting.convert, setting.scaling, node)
+        first = replace(known, unit=self._unit(node))
         for end, reached in self._reached(node, first):
-            yield end, reached.offset
+            yield end, reached.change.offset
 
     def _ends_of_array(
         self, node: Node, setting: Setting, values: tuple[float, ...]
@@ -305,16 +304,6 @@ class Flat:
         columns = [list(self._ends(node, replace(setting, value=value))) for value in values]
         for ends in zip(*columns, strict=True):
             yield ends[0][0], [value for _, value in ends]
-
-    def _converted(self, value: _Value, setting: Setting, node: Node) -> _Value:
-        """Convert the value of a parameter set to the unit of the first node, then scale it."""
-        unit = self._unit(node)
-        number = value.offset
-        if setting.convert and value.unit is not None and unit is not None:
-            conversion = conversion_of_link(value.unit, value.units, unit, self._units_at(node))
-            number = conversion(number)
-        scaled = setting.scaling.gain * number + setting.scaling.offset
-        return _Value(0.0, scaled, unit, self._units_at(node))
 
     def _reached(self, node: Node, value: _Value) -> Iterator[tuple[Node, _Value]]:
         if node[0] in self.components:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from fmugym.archive.description import Unit
+from fmugym.archive.units import IDENTITY, Conversion
 from fmugym.errors import FMULoadError, shown
 from fmugym.systems.ssp.elements import (
     Binding,
-    Scaling,
     children,
     number_in,
     read_units,
@@ -53,7 +53,7 @@ class Setting:
     unit: str | None
     units: dict[str, Unit]
     convert: bool = True
-    scaling: Scaling = field(default_factory=Scaling)
+    scaling: Conversion = IDENTITY
 
 
 def read_settings(

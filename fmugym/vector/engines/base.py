@@ -14,7 +14,6 @@ from fmugym.env import FMUEnv
 from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.task.future import Table
 from fmugym.task.snapshot import Columns
 
 __all__ = ["Engine", "StepResult"]
@@ -198,7 +197,7 @@ class Engine(ABC):
 
     @abstractmethod
     def assuming(
-        self, tables: Mapping[str, Table], offsets: FloatArray | None
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
     ) -> AbstractContextManager[None]:
         """Let hooks read other data and outputs inside of a ``with`` block.
 

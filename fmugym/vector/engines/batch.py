@@ -27,7 +27,7 @@ from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.construction import plan_of, plan_of_reset
 from fmugym.task.episode import EpisodePlan
-from fmugym.task.future import Table, assumed
+from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
@@ -495,22 +495,20 @@ class BatchEngine(Engine):
         return not own or not columns.keys() <= set(plan.parameter_names)
 
     @contextmanager
-    def assuming(self, tables: Mapping[str, Table], offsets: FloatArray | None) -> Iterator[None]:
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> Iterator[None]:
         """See ``Engine.assuming``."""
-        future = self.env.inside.future
-        pairs = [] if future is None else future.tables_of_programs(tables)
-        self.offsets = offsets
+        own, self.offsets = self._task, offsets
         try:
-            self._exchange_tables({own.tobytes(): other for own, other in pairs})
-            with assumed([future], tables):
+            with assumed([self.env.inside.future], tables) as others:
+                if others:
+                    self._prepare(own.with_tables(others))
                 yield
         finally:
             self.offsets = None
-            self._exchange_tables({other.tobytes(): own for own, other in pairs})
-
-    def _exchange_tables(self, tables: Mapping[bytes, FloatArray]) -> None:
-        if tables:
-            self._prepare(self._task.with_tables(tables))
+            if tables:
+                self._prepare(own)
 
     def set_variable(self, name: str, values: FloatArray) -> None:
         """See ``Engine.set_variable``."""

@@ -22,7 +22,7 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
 from fmugym.task.actions import take_action
 from fmugym.task.construction import plan_of, prepare_hooks
-from fmugym.task.future import Table, assumed
+from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
@@ -267,7 +267,9 @@ class PerEnvEngine(Engine):
         self.any_ended = bool(self.ended.any())
 
     @contextmanager
-    def assuming(self, tables: Mapping[str, Table], offsets: FloatArray | None) -> Iterator[None]:
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> Iterator[None]:
         """See ``Engine.assuming``."""
         if offsets is not None and not self._together:
             raise ConfigError(

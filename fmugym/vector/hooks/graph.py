@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Container, Hashable, Iterable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,7 +21,8 @@ class Node(NamedTuple):
 
     Attributes:
         kind: ``constant``, ``row``, ``action``, ``previous_action``, ``active``, ``stopped``,
-            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``.
+            ``missing``, ``ufunc``, ``cast``, ``where``, ``take`` or ``interpolate``; in the graphs
+            of declared tasks also ``function``, which is one of Python.
         what: The value, the row, the element, the reason, the function or the table.
         operands: The numbers of the nodes that it is computed from.
         dtype: The type of the value.
@@ -31,6 +32,12 @@ class Node(NamedTuple):
     what: Hashable
     operands: tuple[int, ...]
     dtype: np.dtype[Any]
+
+    @property
+    def number(self) -> Any:
+        """The value of a constant."""
+        bits: Any = self.what
+        return np.frombuffer(bits, self.dtype)[0]
 
 
 class Cell:
@@ -70,6 +77,29 @@ class Graph:
         """The node of a cell."""
         return self.nodes[cell.node]
 
+    def needed(self, numbers: Iterable[int], known: Container[int] = ()) -> list[int]:
+        """The numbers of some nodes, and of all that they are computed from.
+
+        Args:
+            numbers: Those of the nodes.
+            known: Nodes whose values are known, so that they need no others.
+
+        Returns:
+            The numbers in the order of evaluation, which is the same in any graph.
+        """
+        found, order = set[int](), list[int]()
+        waiting = [(number, False) for number in numbers][::-1]
+        while waiting:
+            number, has_operands = waiting.pop()
+            if has_operands:
+                order.append(number)
+            elif number not in found:
+                found.add(number)
+                operands = () if number in known else self.nodes[number].operands
+                waiting.append((number, True))
+                waiting.extend((operand, False) for operand in reversed(operands))
+        return order
+
     def load(self, kind: str, what: Hashable, dtype: npt.DTypeLike, lane: int | None) -> Cell:
         """A value that the program finds."""
         return Cell(self._number(Node(kind, what, (), np.dtype(dtype))), lane)
@@ -83,10 +113,7 @@ class Graph:
     def value(self, cell: Cell) -> Any:
         """The value of a constant; None for anything else."""
         node = self.node(cell)
-        if node.kind != "constant":
-            return None
-        bits: Any = node.what
-        return np.frombuffer(bits, node.dtype)[0]
+        return node.number if node.kind == "constant" else None
 
     def compute(
         self, kind: str, what: Any, cells: tuple[Cell, ...], dtype: np.dtype[Any], fold: Any

@@ -22,7 +22,7 @@ from fmugym.vector.hooks.program import (
     operation_of,
 )
 
-__all__ = ["Store", "compile_graph"]
+__all__ = ["Store", "compile_graph", "registers_of"]
 
 _MOST_INSTRUCTIONS: Final = 20_000
 
@@ -90,16 +90,10 @@ class _Compiler:
 
     def evaluate(self, node: int) -> None:
         """Add the instructions that a value needs."""
-        waiting = [(node, False)]
-        while waiting:
-            number, has_operands = waiting.pop()
-            if has_operands:
-                self._add(number, self._graph.nodes[number])
-            elif number not in self._known:
+        for number in self._graph.needed([node], self._known):
+            if number not in self._known:
                 self._known.add(number)
-                operands = self._graph.nodes[number].operands
-                waiting.append((number, True))
-                waiting.extend((operand, False) for operand in reversed(operands))
+                self._add(number, self._graph.nodes[number])
 
     def _add(self, number: int, node: Node) -> None:
         if node.kind == "constant":
@@ -179,7 +173,11 @@ class _Compiler:
 
     def program(self, results: Sequence[int], seen: int) -> Program:
         """Place all values in registers."""
-        registers = self._registers(results)
+        registers = registers_of(
+            [(step.node, step.operands) for step in self._steps], self._constants, results
+        )
+        if max(registers.values(), default=0) >= MOST_REGISTERS:
+            raise UntraceableError(f"it needs more than {MOST_REGISTERS} values at a time")
         code = np.zeros((len(self._steps), 6), np.uint16)
         for line, step in zip(code, self._steps, strict=True):
             line[:2] = OPERATIONS.index(step.operation), step.extra
@@ -197,27 +195,6 @@ class _Compiler:
             tuple(registers[node] for node in results),
         )
 
-    def _registers(self, results: Sequence[int]) -> dict[int, int]:
-        """Give each value a register until its last use; constants keep theirs."""
-        last = {operand: i for i, step in enumerate(self._steps) for operand in step.operands}
-        last.update(dict.fromkeys(results, len(self._steps)))
-        registers = {node: index for index, node in enumerate(self._constants)}
-        free: list[int] = []
-        count = len(registers)
-        for index, step in enumerate(self._steps):
-            if step.node is not None:
-                if not free:
-                    free, count = [count], count + 1
-                registers[step.node] = free.pop()
-                if step.node not in last:  # nobody reads it
-                    free.append(registers[step.node])
-            for operand in set(step.operands):
-                if last[operand] == index and operand not in self._constants:
-                    free.append(registers[operand])
-        if count > MOST_REGISTERS:
-            raise UntraceableError(f"it needs more than {MOST_REGISTERS} values at a time")
-        return registers
-
     def _constants_in(self, registers: dict[int, int]) -> Any:
         constants = np.zeros(len(self._constants), CONSTANT)
         for place, number in zip(constants, self._constants, strict=True):
@@ -227,3 +204,31 @@ class _Compiler:
         if sys.byteorder == "little":
             return constants
         raise UntraceableError("this processor stores numbers in another order")
+
+
+def registers_of(
+    steps: Sequence[tuple[int | None, tuple[int, ...]]],
+    constants: Sequence[int],
+    results: Sequence[int],
+) -> dict[int, int]:
+    """Give each value a register until its last use; constants keep theirs.
+
+    Args:
+        steps: The node that each step computes, if any, and its operands, in their order.
+        constants: The nodes of the constants.
+        results: The nodes whose values stay.
+    """
+    last = {operand: i for i, (_, operands) in enumerate(steps) for operand in operands}
+    last |= dict.fromkeys([*constants, *results], len(steps))
+    registers = {node: index for index, node in enumerate(constants)}
+    free: list[int] = []
+    count = len(registers)
+    for index, (node, operands) in enumerate(steps):
+        if node is not None:
+            if not free:
+                free, count = [count], count + 1
+            registers[node] = free.pop()
+            if node not in last:  # nobody reads it
+                free.append(registers[node])
+        free += [registers[operand] for operand in set(operands) if last[operand] == index]
+    return registers

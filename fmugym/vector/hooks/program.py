@@ -203,7 +203,6 @@ class Program:
             self.code.tobytes(),
             self.constants.tobytes(),
             self.slots.tobytes(),
-            range(len(self.rows)),
             self.tables,
             self.registers,
             self.seen,

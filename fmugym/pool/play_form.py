@@ -1,0 +1,77 @@
+"""The form of what surrounds the steps of a vector environment; ``native/play_form.c`` reads it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.pool.form import Writer
+
+__all__ = ["Rows", "form_of_play"]
+
+Row = npt.NDArray[Any]
+
+
+class Rows:
+    """Rows of memory that a form names by numbers.
+
+    Args:
+        rows: The first of them.
+
+    Attributes:
+        arrays: Those that have a number, in its order.
+    """
+
+    def __init__(self, rows: Iterable[Row] = ()) -> None:
+        self.arrays: list[Row] = []
+        self._numbers: dict[int, int] = {}
+        for row in rows:
+            self.number(row)
+
+    def number(self, row: Row) -> int:
+        """The number of the memory of a row, which gets one if it has none."""
+        address = row.__array_interface__["data"][0]
+        if address not in self._numbers:
+            self._numbers[address] = len(self.arrays)
+            self.arrays.append(row)
+        return self._numbers[address]
+
+
+def form_of_play(
+    rows: Rows,
+    programs: Iterable[tuple[bytes, Iterable[Row]]],
+    actions: Mapping[str, Any],
+    limit: int,
+    surroundings: Mapping[str, Any],
+) -> bytes:
+    """The form of a play.
+
+    Args:
+        rows: Get numbers.
+        programs: As for ``NativePool.prepare_play``.
+        actions: As for ``NativePool.prepare_play``.
+        limit: Steps after which an episode is truncated.
+        surroundings: As for ``NativePool.prepare_play``.
+    """
+    number, none = rows.number, actions["none"]
+    writer = Writer().integers(surroundings["reads_kept"], limit, none.size)
+    writer.integers(*(actions[name] for name in ("size", "check", "lowest", "highest")))
+    writer.integers(actions["current"] is not None).block(none.tobytes())
+    writer.array([[number(source), number(to)] for source, to in surroundings["copies"]], np.int64)
+    starts = surroundings["variable_starts"]
+    writer.array([(number(row), _bits_of(value)) for row, value in starts], np.int64)
+    writer.array([(number(row), draw) for row, draw in surroundings["drawn_variables"]], np.int64)
+    writer.array([parameter for parameter, _ in surroundings["input_starts"]], np.int64)
+    writer.array([value for _, value in surroundings["input_starts"]], np.float64)
+    for form, own in programs:
+        writer.block(form).array(list(map(number, own)), np.int64)
+    return writer.form()
+
+
+def _bits_of(value: bytes) -> int:
+    """The bits of a value of up to 8 bytes."""
+    return int.from_bytes(value.ljust(8, b"\0"), sys.byteorder, signed=True)

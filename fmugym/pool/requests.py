@@ -1,0 +1,235 @@
+"""What the engine is asked for besides steps, in this process or through a worker, and its answers.
+
+Both are forms; see ``fmugym.pool.form``. ``native/requests.c`` is the other end. A worker runs
+foreign code, so its answers may be anything. What does not fit the question is an error, which ends
+the worker.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from fmugym.archive.description import ModelDescription
+from fmugym.archive.variable import Variable
+from fmugym.errors import SimulationError
+from fmugym.pool.base import FloatArray
+from fmugym.pool.bundle import SIZE_OF_HEAD, IndexArray
+from fmugym.pool.form import Writer
+from fmugym.pool.reports import Failure, describe_failure
+from fmugym.pool.spec import PoolSpec
+
+__all__ = [
+    "Answer",
+    "Answers",
+    "DamagedError",
+    "Reader",
+    "Request",
+    "read_states",
+    "read_values",
+    "request_listing",
+    "request_restore_states",
+    "request_save_states",
+]
+
+
+class Request(IntEnum):
+    """The codes of requests, in the order of ``native/requests.h``."""
+
+    OPEN = 0
+    STEP = 1
+    STEP_SOME = 2
+    RESET = 3
+    SAVE = 4
+    RESTORE = 5
+    RELEASE = 6
+    WRITE = 7
+    READ = 8
+    SAVE_STATES = 9
+    RESTORE_STATES = 10
+    COUNT_STEPS = 11
+    FAILURE = 12
+    DIFFERENTIATE = 13
+    ROLL_OUT = 14
+    TEXT_OF = 15
+    CLOSE = 16
+
+
+class Answer(IntEnum):
+    """The codes of what workers send; the letters are those of ``native/requests.h``."""
+
+    FINE = ord("F")
+    """The step was done, and no status is worse than a warning."""
+    TROUBLE = ord("T")
+    """The step was done, and some statuses are worse than a warning."""
+    RESULT = ord("R")
+    ERROR = ord("E")
+    """Why there is no result: a text."""
+    FAILURE = ord("X")
+    """Why there is no result: the failure of an instance."""
+    MESSAGE = ord("L")
+    """A message of the FMU, which may come at any time."""
+    FAULT = ord("D")
+    """The exit status of the process, which ends now. Only programs in Wine tell it."""
+
+
+class DamagedError(Exception):
+    """A worker has sent what is no answer."""
+
+
+_INTEGER, _NUMBER = struct.Struct("=q"), struct.Struct("=d")
+_BLANK: Final = 8
+
+
+class Reader:
+    """Reads a form that a worker has sent.
+
+    Each method raises a ``DamagedError`` if what it reads is not there.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._place = data, 0
+
+    def _take(self, size: int) -> bytes:
+        begin = self._place
+        end = begin + size + -size % _BLANK
+        if size < 0 or end > len(self._data):
+            raise DamagedError("an answer ends too early")
+        self._place = end
+        return self._data[begin : begin + size]
+
+    def integer(self) -> int:
+        """Read an integer."""
+        return int(_INTEGER.unpack(self._take(_INTEGER.size))[0])
+
+    def index(self, count: int) -> int:
+        """Read an integer from 0 to below a count."""
+        number = self.integer()
+        if not 0 <= number < count:
+            raise DamagedError(f"{number} is not below {count}")
+        return number
+
+    def number(self) -> float:
+        """Read a floating-point number."""
+        return float(_NUMBER.unpack(self._take(_NUMBER.size))[0])
+
+    def block(self) -> bytes:
+        """Read bytes with their size."""
+        return self._take(self.integer())
+
+    def text(self) -> str:
+        """Read a text."""
+        data = self.block()
+        if not data.endswith(b"\0"):
+            raise DamagedError("a text does not end")
+        return data[:-1].decode(errors="replace")
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
+        """Read an array of this shape and type."""
+        data, wanted = self.block(), np.dtype(dtype)
+        if len(data) != wanted.itemsize * math.prod(shape):
+            raise DamagedError(f"an array of another shape than {shape}")
+        return np.frombuffer(data, wanted).reshape(shape)
+
+    def blocks(self, count: int) -> list[bytes]:
+        """Read so many blocks."""
+        return [self._take(_INTEGER.unpack(self._take(_BLANK))[0]) for _ in range(count)]
+
+    def end(self) -> None:
+        """Require that nothing follows."""
+        if self._place != len(self._data):
+            raise DamagedError("an answer is too long")
+
+
+class Answers:
+    """Reads the answers of some instances.
+
+    Args:
+        description: That of the FMU or system.
+        spec: That of their pool.
+        block: The indices of these instances.
+    """
+
+    def __init__(self, description: ModelDescription, spec: PoolSpec, block: slice) -> None:
+        self._description, self._spec, self._block = description, spec, block
+
+    @property
+    def count(self) -> int:
+        """How many instances there are."""
+        return int(self._block.stop - self._block.start)
+
+    def result(self, code: int, reader: Reader, read: Callable[[Reader], Any]) -> Any:
+        """What an answer says as ``read`` reads it, or the error that it tells.
+
+        Raises:
+            DamagedError: If it is no answer.
+        """
+        if code == Answer.RESULT:
+            return read(reader)
+        if code == Answer.ERROR:
+            return SimulationError(reader.text())
+        if code == Answer.FAILURE:
+            return SimulationError(self.failure(reader, reader.index(self.count)))
+        raise DamagedError(f"the code {code}")
+
+    def failure(self, reader: Reader, index: int) -> str:
+        """Read why an instance has failed, counted within the block; "" if it has not."""
+        if not reader.integer():
+            return ""
+        doing, in_warm_up, status = reader.text(), bool(reader.integer()), reader.integer()
+        time, reference, said = reader.number(), reader.integer(), reader.text()
+        has_values, values, part = bool(reader.integer()), reader.block(), reader.text()
+        reader.end()
+        failure = Failure(
+            doing, in_warm_up, status, time, reference, said, values if has_values else None, part
+        )
+        name = f"{self._description.model_identifier}_{self._block.start + index}"
+        try:
+            return describe_failure(failure, self._description, self._spec, name)
+        except (ValueError, StopIteration):  # another number of values, or unknown numbers
+            raise DamagedError("a failure that cannot be") from None
+
+
+def read_states(reader: Reader, count: int, outputs: int) -> list[bytes]:
+    """Read states, so many of them; each has a head and the outputs."""
+    states = reader.blocks(count)
+    reader.end()
+    if any(len(state) < SIZE_OF_HEAD + 8 * outputs for state in states):
+        raise DamagedError("a state is too short")
+    return states
+
+
+def read_values(reader: Reader, shape: tuple[int, ...]) -> FloatArray:
+    """Read floating-point numbers."""
+    values: FloatArray = reader.array(shape, np.float64)
+    reader.end()
+    return values
+
+
+# Requests
+
+
+@functools.lru_cache(maxsize=64)
+def request_listing(variables: tuple[Variable, ...], version: int) -> bytes:
+    """A list of variables; see ``fmugym.pool.form.table_of``."""
+    return Writer().listing(variables, version).form()
+
+
+def request_save_states(indices: IndexArray, records: bool) -> bytes:
+    """Save states; see ``SavingPool.save_states``."""
+    return Writer().array(indices, np.int64).integers(records).form()
+
+
+def request_restore_states(states: Sequence[bytes], indices: IndexArray) -> bytes:
+    """Restore states; see ``SavingPool.restore_states``."""
+    writer = Writer().array(indices, np.int64)
+    for state in states:
+        writer.block(state)
+    return writer.form()

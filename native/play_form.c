@@ -1,0 +1,191 @@
+#include "play_form.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+typedef struct {
+    const Row *rows;
+    size_t count;
+} Rows;
+
+/* Memory for so many items, and for one at least. */
+static void *room_for(Reader *reader, size_t count, size_t size) {
+    void *memory = calloc(count + 1, size);
+
+    if (memory == NULL) {
+        reader_refuse(reader, "out of memory");
+    }
+    return memory;
+}
+
+static Row row_of(Reader *reader, const Rows *rows, int64_t number) {
+    if (number < 0 || (uint64_t)number >= rows->count) {
+        reader_refuse(reader, "there is no such row");
+        return (Row){.data = NULL};
+    }
+    return rows->rows[number];
+}
+
+static void read_actions(Reader *reader, PlayForm *p) {
+    Actions *a = &p->play.actions;
+
+    a->elements = (size_t)read_integer_in(reader, 0, UINT16_MAX);
+    a->size = (size_t)read_integer_in(reader, 1, 8);
+    a->check = (ActionCheck)read_integer_in(reader, ACTIONS_ANY, ACTIONS_FLOAT32);
+    a->lowest = read_integer(reader);
+    a->highest = read_integer(reader);
+    p->keeps_actions = read_flag(reader);
+    const Block none = read_block(reader);
+    const size_t checked = a->check == ACTIONS_ANY ? a->size : a->check == ACTIONS_FLOAT32 ? 4 : 8;
+    if (none.size != a->elements * a->size || a->size != checked) {
+        reader_refuse(reader, "actions differ in type");
+    }
+    a->none = none.bytes;
+}
+
+static void read_copies(Reader *reader, PlayForm *p, const Rows *rows) {
+    size_t count;
+    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+
+    p->play.copies = p->copies = room_for(reader, count, sizeof *p->copies);
+    p->play.number_of_copies = count;
+    for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
+        p->copies[i] = (RowCopy){row_of(reader, rows, pairs[0]), row_of(reader, rows, pairs[1])};
+        if (p->copies[i].from.size != p->copies[i].to.size) {
+            reader_refuse(reader, "rows to copy differ in type");
+        }
+    }
+}
+
+/* A row and the bits of a value. */
+static void read_variable_starts(Reader *reader, PlayForm *p, const Rows *rows) {
+    size_t count;
+    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+
+    p->variable_starts = room_for(reader, count, sizeof *p->variable_starts);
+    p->play.variable_starts = p->variable_starts;
+    p->play.number_of_variable_starts = count;
+    for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
+        p->variable_starts[i] = (VariableStart){row_of(reader, rows, pairs[0]), (uint64_t)pairs[1]};
+    }
+}
+
+static void read_drawn_variables(Reader *reader, PlayForm *p, const Rows *rows) {
+    const size_t draws = p->play.draws == NULL ? 0 : p->play.draws->count;
+    size_t count;
+    const int64_t *pairs = read_array(reader, 2 * sizeof *pairs, &count);
+
+    p->drawn_variables = room_for(reader, count, sizeof *p->drawn_variables);
+    p->play.drawn_variables = p->drawn_variables;
+    p->play.number_of_drawn_variables = count;
+    for (size_t i = 0; i < count && reader->fault == NULL; i++, pairs += 2) {
+        p->drawn_variables[i] = (DrawnVariable){row_of(reader, rows, pairs[0]), (size_t)pairs[1]};
+        if (p->drawn_variables[i].row.size != sizeof(double) || (uint64_t)pairs[1] >= draws) {
+            reader_refuse(reader, "a drawn variable is no float64, or has no draw");
+        }
+    }
+}
+
+/* Each input starts with the value of a parameter or, if its number is negative, a constant. */
+static void read_input_starts(Reader *reader, PlayForm *p) {
+    Play *play = &p->play;
+    size_t count, constants;
+    const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
+    const double *values = read_array(reader, sizeof *values, &constants);
+
+    play->input_starts = p->input_starts = room_for(reader, count, sizeof *p->input_starts);
+    play->number_of_inputs = count;
+    if (constants != count) {
+        reader_refuse(reader, "the inputs differ in number");
+    }
+    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
+        p->input_starts[i].value = values[i];
+        if (numbers[i] >= 0 && (uint64_t)numbers[i] < play->number_of_parameters) {
+            p->input_starts[i].row = play->start_values + (size_t)numbers[i] * play->count;
+        }
+    }
+}
+
+static void read_program(Reader *reader, PlayForm *p, ProgramForm *program, const Rows *rows) {
+    const Block form = read_block(reader);
+    size_t count;
+    const int64_t *numbers = read_array(reader, sizeof *numbers, &count);
+    Row *own = room_for(reader, count, sizeof *own);
+
+    for (size_t i = 0; i < count && reader->fault == NULL; i++) {
+        own[i] = row_of(reader, rows, numbers[i]);
+    }
+    const char *fault = reader->fault;
+    fault = fault == NULL ? program_take(program, form.bytes, form.size, count) : fault;
+    fault = fault == NULL ? program_settle(program, own, p->play.actions.elements) : fault;
+    if (fault != NULL) {
+        reader_refuse(reader, fault);
+    }
+    free(own);
+}
+
+const char *play_take(PlayForm *p, const Settings *s, const void *form, size_t size,
+                      const Row *rows, size_t number_of_rows) {
+    const Rows all = {rows, number_of_rows};
+
+    p->form = malloc(size + 1);
+    if (p->form == NULL) {
+        return "out of memory";
+    }
+    memcpy(p->form, form, size);
+    Reader reader = {p->form, p->form + size, NULL};
+    p->play.count = s->count;
+    p->play.reads_kept = read_flag(&reader);
+    p->play.limit = read_integer(&reader);
+    read_actions(&reader, p);
+    read_copies(&reader, p, &all);
+    read_variable_starts(&reader, p, &all);
+    read_drawn_variables(&reader, p, &all);
+    read_input_starts(&reader, p);
+    read_program(&reader, p, &p->inputs, &all);
+    read_program(&reader, p, &p->judgement, &all);
+    if (reader.at != reader.end || p->play.number_of_inputs != s->inputs->count ||
+        p->inputs.program.number_of_seen > 0 ||
+        p->judgement.program.number_of_results != PROGRAM_RESULTS) {
+        reader_refuse(&reader, "a program does not fit the pool");
+    }
+    return reader.fault;
+}
+
+/* Notes which rows are those of the outputs, as long as the program only reads them. */
+static void note_outputs(ProgramForm *p, const Settings *s) {
+    for (size_t i = 0; i < p->program.number_of_rows; i++) {
+        Row *row = &p->rows[i];
+        for (uint32_t k = 0; k < s->outputs->count && !row->changes; k++) {
+            if (row->data == (const char *)(s->output_values + k * s->count)) {
+                row->output = k + 1;
+            }
+        }
+    }
+}
+
+void play_settle(PlayForm *p, const Settings *s, double *inputs, double *kept,
+                 int64_t *step_counts, uint8_t *ended) {
+    Play *play = &p->play;
+
+    note_outputs(&p->judgement, s);
+    play->inputs = p->inputs.program;
+    play->judgement = p->judgement.program;
+    play->source.statuses = s->status;
+    play->input_rows = inputs;
+    play->output_rows = s->output_values;
+    play->number_of_outputs = s->outputs->count;
+    play->kept_rows = kept;
+    play->step_counts = step_counts;
+    play->ended = ended;
+}
+
+void play_drop(PlayForm *p) {
+    program_drop(&p->inputs);
+    program_drop(&p->judgement);
+    free(p->copies);
+    free(p->variable_starts);
+    free(p->drawn_variables);
+    free(p->input_starts);
+    free(p->form);
+}
