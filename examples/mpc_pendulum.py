@@ -64,7 +64,7 @@ class Run(NamedTuple):
 def planner(candidates: int, **options: Any) -> MPC:
     """The controller, which looks 1.5 s ahead; it begins each decision in the observed state."""
     states = {"theta": "theta_0", "theta_dot": "theta_dot_0"}
-    return MPC(1.5, 30, candidates, states=states, correction=1.0, **options)
+    return MPC(1.5, candidates, states=states, correction=1.0, **options)
 
 
 def run(controller: MPC, steps: int) -> Run:

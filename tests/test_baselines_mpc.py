@@ -66,7 +66,7 @@ def lookup(period, times, values):
 
 
 def mpc(horizon="1h 40min", **arguments):
-    return MPC(horizon, **{"candidates": 128, "moves": 10} | arguments)
+    return MPC(horizon, **{"candidates": 128} | arguments)
 
 
 @pytest.fixture
@@ -111,14 +111,17 @@ class TestPlans:
         )
         assert first == second != other
 
-    def test_differ_by_moves_that_hold(self, opened, bound):
-        controller = bound(moves=3)
+    def test_differ_by_two_pulses(self, opened, bound):
+        """Most of them begin in the first half, with heights of all magnitudes."""
+        controller = bound("10h")
         controller.bind(opened(wheel()))
-        plan = np.linspace(0.4, 0.6, 10)[:, None]
-        moves = np.array([[0.0, 0.1, 0.5, -0.1]])
-        at_first, later = (controller._moved_by(step, plan, moves)[0] - plan for step in (0, 5))
-        assert at_first[:, 0] == pytest.approx([0.0] * 4 + [0.1] * 4 + [0.5] * 2, abs=0.1)
-        assert later[:, 0] == pytest.approx([0.0] * 3 + [0.1] * 4 + [0.5] * 3, abs=0.11)
+        changes = controller._changes(np.random.default_rng(0), 1000)[:, :, 0]
+        jumps = np.diff(changes, axis=1, prepend=0.0, append=0.0) != 0
+        assert jumps.any(axis=1).all()
+        assert jumps.sum(axis=1).max() == 4
+        assert 600 < (jumps[:, :30].sum(axis=1) > 1).sum() < 1000
+        heights = np.abs(changes).max(axis=1)
+        assert np.quantile(heights, [0.1, 0.9]) == pytest.approx([0.05, 0.6], rel=0.5)
 
     def test_go_on_with_that_of_the_step_before(self, opened, bound):
         """A search that finds nothing keeps what it had, step by step."""
@@ -133,7 +136,7 @@ class TestPlans:
     def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, opened, bound):
         """A search of two candidates a round finds little itself."""
         pid = {"of": "q_dot", "setpoint": 1.0, "kp": 2.0}
-        few = {"candidates": 16, "rounds": 2, "moves": 10}
+        few = {"candidates": 16, "rounds": 2}
         _, alone = play(opened(wheel()), PID(**pid), 10)
         _, rewards = play(opened(wheel()), bound(warm=PID(**pid), **few), 10)
         assert rewards.sum() > alone.sum() - 0.01
@@ -175,7 +178,7 @@ class TestPlans:
             assert np.array(rows)[:, index].tolist() == alone.tolist()
 
     def test_balance_a_cart_pole(self, opened, bound):
-        _, rewards = play(opened(CartPoleEnv), bound("0.4s", moves=20, perfect=True), 60)
+        _, rewards = play(opened(CartPoleEnv), bound("0.4s", perfect=True), 60)
         assert len(rewards) == 60
 
 
@@ -199,7 +202,7 @@ class TestFuture:
         same = [play(opened(wheel(wind)), bound("4h"), 12)[0].tolist() for wind in (CALM, later)]
         assert same[0] == same[1]
         known = [
-            play(opened(wheel(wind)), bound("8h", moves=12, perfect=True), 4)[0].tolist()
+            play(opened(wheel(wind)), bound("8h", perfect=True), 4)[0].tolist()
             for wind in (CALM, later)
         ]
         assert known[0] != known[1]
@@ -347,7 +350,7 @@ class TestModel:
             "reward": "-(4 * (1 - cos(theta)) + 0.1 * theta_dot**2)",
         }
         states = "theta:theta_0,theta_dot:theta_dot_0"
-        controller = bound("1.5s", moves=15, candidates=512, states=states)
+        controller = bound("1.5s", candidates=512, states=states)
         _, rewards = play(opened(task), controller, 200, seed=2)
         assert rewards[:10].max() < -7.0
         assert rewards[-60:].min() > -4 * (1 - np.cos(np.radians(15))) - 0.1  # upright
@@ -374,9 +377,8 @@ class TestRefusals:
         [
             ({"horizon": "soon"}, "horizon must be"),
             ({"horizon": 0}, "horizon"),
-            ({"moves": 0}, "moves"),
             ({"rounds": 2.5}, "rounds must be a whole number"),
-            ({"candidates": 8}, "candidates"),
+            ({"candidates": 3}, "candidates"),
             ({"correction": 2.0}, "correction"),
             ({"perfect": "maybe"}, "perfect must be true or false"),
             ({"budget": 0}, "budget"),
@@ -418,7 +420,7 @@ class TestRefusals:
         plant = opened(partial(CartPoleEnv, backend="fmpy"))
         with pytest.raises(ConfigError, match="a backend stands in for this one: give 'model'"):
             bound().bind(plant)
-        _, rewards = play(plant, bound("0.4s", moves=20, model=CartPoleEnv), 15)
+        _, rewards = play(plant, bound("0.4s", model=CartPoleEnv), 15)
         assert len(rewards) == 15
 
     def test_of_slow_replays(self, opened, bound):

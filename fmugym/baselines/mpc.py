@@ -9,14 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.base import Controller, FloatArray, attribute_of
-from fmugym.baselines.cma import CMA
 from fmugym.checks import check_number, check_seed, duration
 from fmugym.distributions import is_distribution
 from fmugym.env import FMUEnv
@@ -24,15 +23,15 @@ from fmugym.errors import ConfigError, shown
 from fmugym.task.future import Future
 from fmugym.task.snapshot import Snapshot
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector.rollouts import costs_in
 
 __all__ = ["MPC"]
 
 _DAY: Final = 86400.0
-_SIGMA: Final = 0.25
-_LEAST_SIGMA: Final = 0.02
-"""How far candidates go from the plan, in parts of the range of an action: at first, and at the
-least."""
+_PULSES: Final = 2
+"""By so many pulses a candidate differs."""
+
+_DECADES: Final = 1.5
+"""Over so many powers of ten the heights of pulses are spread."""
 
 _COPIES: Final = 9
 """So many copies run beside each environment."""
@@ -54,12 +53,10 @@ class MPC(Controller):
 
     In each step, candidates for the actions until the horizon play on copies of the environment,
     and the first action of the best one is taken. The reward is that of the task, and plans that
-    keep the limits of costs come first. The search begins with the better of the plan of the step
-    before and what simple controllers would do. Candidates differ from that by a few moves, each of
-    which holds for the same number of steps and keeps its time. Most of them come from the
-    adaptation of a covariance matrix (``fmugym.baselines.cma``), the others change the best plan in
-    some moves in a row. Those of the last round change the first moves only, since the next action
-    cannot be mended later.
+    keep the limits of costs come first. The search begins with the best of the plan of the step
+    before and what simple controllers would do. Candidates are the best plan until then and two
+    pulses, whose heights and lengths are random numbers of all magnitudes. Most pulses begin early,
+    since the next action cannot be mended later.
 
     The controller sees what an agent sees. Nine copies get the same actions as the environment.
     They differ in the parameters that the task draws, and the one whose observations fit best is
@@ -71,9 +68,8 @@ class MPC(Controller):
 
     Args:
         horizon: How far plans go: seconds, or a text such as ``"24h"``.
-        moves: The most moves by which a candidate differs.
         candidates: How many candidates play in a decision.
-        rounds: How often the search learns from them in a decision.
+        rounds: How often the search goes on from the best one in a decision.
         warm: A controller whose actions are a candidate, too, bound to nothing else. By default
             those that the task file declares; ranges in them have their middle.
         correction: By which part the offsets follow the differences in a step, from 0 to 1.
@@ -94,7 +90,6 @@ class MPC(Controller):
     def __init__(
         self,
         horizon: Any,
-        moves: float = 24,
         candidates: float = 256,
         rounds: float = 4,
         warm: Controller | None = None,
@@ -106,8 +101,8 @@ class MPC(Controller):
         model: Callable[[], Any] | None = None,
     ) -> None:
         self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
-        self.moves, self.rounds = _whole("moves", moves, 1), _whole("rounds", rounds, 2)
-        self.candidates = _whole("candidates", candidates, 4 * self.rounds)
+        self.rounds = _whole("rounds", rounds, 1)
+        self.candidates = _whole("candidates", candidates, self.rounds)
         self.warm = warm
         self.correction = check_number("correction", correction, 0.0, 1.0)
         self.budget = None if budget is None else check_number("budget", budget, positive=True)
@@ -145,7 +140,6 @@ class MPC(Controller):
                 f"the horizon of {self.horizon:g} s is shorter than the step of "
                 f"{self.time_step:g} s"
             )
-        self._hold = -(-steps // self.moves)
         self._plan_shape = steps, self._low.size
         make = self._model_of()
         for count in (_COPIES, self.candidates // self.rounds):
@@ -226,8 +220,10 @@ class MPC(Controller):
         with ExitStack() as stack:
             for envs in self._envs:
                 stack.enter_context(envs.inside.episodes.assuming(data))
-            episode.plan = self._search(episode, start, assumed, row)
-        episode.row, episode.steps = row, episode.steps + 1
+            best = self._search(episode, start, assumed, row)
+        episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
+        for name, paid in best.costs.items():
+            episode.costs[name] = episode.costs.get(name, 0.0) + paid
         episode.action = self._actions(episode.plan[np.newaxis])[0, 0]
         self._require_time(start, perf_counter() - begin)
         return np.asarray(episode.action, np.float64)
@@ -263,9 +259,6 @@ class MPC(Controller):
         episode.snapshot = copied.save_state()
         episode.plan = np.full(self._plan_shape, 0.5)
         episode.rng = np.random.default_rng(self.seed)
-        size = (-(-(self._plan_shape[0] - 1) // self._hold) + 1) * self._low.size
-        form = np.zeros(size), _SIGMA, self._envs[1].num_envs * 3 // 4, episode.rng, np.ones(size)
-        episode.cma = CMA(*form, largest_sigma=_SIGMA)
         episode.warm = copy.deepcopy(self._warm)
         if self._inverse is None:
             self._inverse = self._find_inverse(episode.snapshot[0])
@@ -281,14 +274,11 @@ class MPC(Controller):
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
             actions = np.repeat(episode.action[np.newaxis], _COPIES, axis=0)
-            observations, _, terminated, truncated, infos = copied.step(actions)
+            observations, _, terminated, truncated, _ = copied.step(actions)
             goes_on = np.flatnonzero(~(terminated | truncated))
             episode.have_ended = not len(goes_on)
             if episode.have_ended:
                 return
-            for name, values in costs_in(infos, (_COPIES,)).items():
-                paid = float(values[episode.best])
-                episode.costs[name] = episode.costs.get(name, 0.0) + paid
             sources = np.where(terminated | truncated, goes_on[0], np.arange(_COPIES))
             episode.snapshot = copied.save_state()[sources]
         episode.seen = np.asarray(observations, np.float64)[sources]
@@ -351,71 +341,48 @@ class MPC(Controller):
 
     def _search(
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
-    ) -> FloatArray:
+    ) -> _Plan:
         """The best plan of all that play."""
         beside, many = self._envs
-        value = partial(self._value, start, assumed, self._allowed(episode))
-        moved = partial(self._moved_by, episode.steps)
-        plans = self._first_plans(episode, start, assumed, row)
-        values = value(beside, plans)
-        best = base = plans[values.argmax()]
-        most, cma = values.max(), episode.cma
-        cma.mean = np.zeros_like(cma.mean)
-        for _ in range(self.rounds - 1):
-            cma.sigma = max(cma.sigma, _LEAST_SIGMA)
-            near = cma.ask()
-            pulses = self._pulses(episode, many.num_envs - len(near))
-            plans = np.concatenate([moved(base, near), moved(best, pulses)])
-            values = value(many, plans)
-            cma.tell(np.argsort(-values[: len(near)], kind="stable"))
-            if values.max() > most:
-                best, most = plans[values.argmax()], values.max()
-        plans = np.concatenate([best[np.newaxis], moved(base, cma.mean[np.newaxis])])
-        best = plans[value(beside, plans).argmax()]
-        last = moved(best, self._pulses(episode, many.num_envs, begin=0.0))
-        last[0] = best
-        chosen: FloatArray = last[value(many, last).argmax()]
-        return chosen
+        play = partial(self._best_of, start, assumed, self._allowed(episode))
+        best = play(beside, self._first_plans(episode, start, assumed, row))
+        for _ in range(self.rounds):
+            changed = best.numbers + self._changes(episode.rng, many.num_envs)
+            found = play(many, np.clip(changed, 0.0, 1.0))
+            best = found if found.value > best.value else best
+        return best
 
-    def _pulses(self, episode: _Episode, count: int, begin: float = 1.0) -> FloatArray:
-        """Changes of one number of the action in some moves in a row, shape (n, moves * m).
+    def _changes(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Pulses of single numbers of the action, shape (n, steps, m)."""
+        steps, width = self._plan_shape
+        changes = np.zeros((count, steps, width))
+        for _ in range(_PULSES):
+            lengths = np.exp(rng.uniform(0.0, np.log(max(2.0, steps / 2)), count)).astype(int)
+            begins = (steps + lengths - 1) * rng.uniform(size=count) ** 2
+            since = np.arange(steps)[:, np.newaxis] - np.floor(begins) + lengths - 1
+            heights = rng.uniform(-1.0, 1.0, count) * 10.0 ** -rng.uniform(0.0, _DECADES, count)
+            pulses = heights * ((since >= 0) & (since < lengths))
+            changes[np.arange(count), :, rng.integers(width, size=count)] += pulses.T
+        return changes
 
-        Args:
-            episode: Has what draws them.
-            count: The number n.
-            begin: How far away they may begin, as a part of the plan; most of them begin early.
-        """
-        rng, size, width = episode.rng, episode.cma.mean.size, self._low.size
-        moves = np.arange(size // width)[:, np.newaxis]
-        since = moves - np.floor(begin * len(moves) * rng.uniform(size=count) ** 2)
-        heights = rng.uniform(-1.0, 1.0, count) * 10.0 ** -rng.uniform(0.0, 1.5, count)
-        heights = heights * (since >= 0) * (since < rng.integers(1, 5, count))
-        pulses = np.zeros((count, len(moves), width))
-        pulses[np.arange(count), :, rng.integers(width, size=count)] = heights.T
-        return pulses.reshape(count, size)
-
-    def _moved_by(self, step: int, plan: FloatArray, moves: FloatArray) -> FloatArray:
-        """A plan with other moves, which have shape (n, moves * m); they keep their time."""
-        move_of = (np.arange(len(plan)) + step % self._hold) // self._hold
-        changes = moves.reshape(len(moves), -1, self._low.size)[:, move_of]
-        return np.clip(plan + changes, 0.0, 1.0)
-
-    def _value(
+    def _best_of(
         self,
         start: Snapshot,
         assumed: Mapping[str, Any],
         limits: Mapping[str, float],
         envs: FMUVectorEnv,
         plans: FloatArray,
-    ) -> FloatArray:
-        """The returns of plans; whatever goes beyond the limit of a cost counts far more."""
+    ) -> _Plan:
+        """The best of some plans; whatever goes beyond the limit of a cost counts far more."""
         found = envs.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
         for name, limit in limits.items():
             if name in found.costs:
                 excess = np.maximum(found.costs[name].sum(axis=1) - limit, 0.0)
                 values = values - _PENALTY * excess
-        return values
+        place = int(values.argmax())
+        costs = {name: float(paid[place, 0]) for name, paid in found.costs.items()}
+        return _Plan(float(values[place]), plans[place], costs)
 
     def _allowed(self, episode: _Episode) -> dict[str, float]:
         """What costs may add up to until the horizon, from what the episode has left of them."""
@@ -449,6 +416,20 @@ class MPC(Controller):
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
 
+class _Plan(NamedTuple):
+    """A plan that has played.
+
+    Attributes:
+        value: The return.
+        numbers: The actions until the horizon, from 0 to 1, shape (steps, m).
+        costs: Those of the first step by name.
+    """
+
+    value: float
+    numbers: FloatArray
+    costs: Mapping[str, float]
+
+
 class _Episode:
     """What is known of the episode of one environment.
 
@@ -463,9 +444,8 @@ class _Episode:
         row: The latest observation.
         steps: How many there were before.
         told: The latest forecast of data for each step, by name.
-        cma: Finds moves.
         rng: Draws candidates.
-        costs: What the costs of the best copy add up to, by name.
+        costs: What the costs of past steps add up to, by name, as the plans have foreseen them.
         warm: The simple controllers, as if they had seen the same.
     """
 
@@ -477,7 +457,6 @@ class _Episode:
     action: Any
     row: FloatArray
     warm: list[Controller]
-    cma: CMA
     rng: np.random.Generator
 
     def __init__(self) -> None:
