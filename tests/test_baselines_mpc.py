@@ -62,7 +62,9 @@ def play(env, controller, steps, seed=0):
 
 def lookup(period, times, values):
     """That of a series of its own."""
-    return Lookup({"wind": np.array([*times, *values, 0.0, values[-1]])}, "wind", 0.0, period, False)
+    return Lookup(
+        {"wind": np.array([*times, *values, 0.0, values[-1]])}, "wind", 0.0, period, False
+    )
 
 
 def mpc(horizon="1h 40min", **arguments):

@@ -253,7 +253,7 @@ class MPC(Controller):
         keys = () if env.inside.future is None else env.inside.future.keys
         for name, value in env.variables.items():
             if np.ndim(value) == 0 and name not in keys and name in self._prototype.variables:
-                copied.inside.engine.set_variable(name, np.full(_COPIES, float(value)))
+                copied.inside.engine.set_variable(name, float(value))
         episode.seen = np.asarray(observations, np.float64)
         episode.errors = np.zeros(episode.seen.shape)
         episode.snapshot = copied.save_state()

@@ -452,8 +452,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
                 come.
             offsets: What is added to outputs and monitored variables of the FMU for all that
                 hooks read, in the FMU's units, by name. The FMU itself does not notice.
-            seed: The noise and the random set points of candidate i follow from ``seed + i``. By
-                default all candidates go on with those of the snapshot.
+            seed: The noise and the random set points of all candidates are those of an episode
+                with this seed. By default they go on with those of the snapshot.
 
         Raises:
             ConfigError: If the snapshot, the actions or what candidates assume do not fit.
@@ -466,7 +466,7 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         candidates.parameters = tunable_values(prototype, parameters, count)
         candidates.tables = tables_of(prototype, data)
         candidates.offsets = offsets_of(prototype, offsets)
-        candidates.variables = keys_of(prototype, seed, count)
+        candidates.variables = keys_of(prototype, seed)
         present = self.save_state() if self.inside.episodes.is_ready else None
         start = self.inside.episodes.start_of_rollout(snapshot, present, candidates.count)
         with self.inside.episodes.returning_to(present):

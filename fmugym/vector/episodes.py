@@ -170,5 +170,5 @@ class Episodes:
             variables = tuple(map(self._prototype.fmu.variable, values))
             self._pool.write(variables, np.stack(list(values.values())))
             self._engine.show_parameters(values)
-        for name, column in candidates.variables.items():
-            self._engine.set_variable(name, column[places])
+        for name, value in candidates.variables.items():
+            self._engine.set_variable(name, value)

@@ -148,8 +148,8 @@ class Candidates:
     parameters: Mapping[str, FloatArray] = MappingProxyType({})
     """What the tunable parameters of each candidate are, arrays of shape (n,) by name."""
 
-    variables: Mapping[str, FloatArray] = MappingProxyType({})
-    """What episode variables of each candidate are at the beginning, arrays of shape (n,)."""
+    variables: Mapping[str, float] = MappingProxyType({})
+    """What episode variables of all candidates are at the beginning, by name."""
 
     tables: Mapping[str, FloatArray] = MappingProxyType({})
     """What candidates look up in the place of data, by name."""
@@ -277,14 +277,13 @@ def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
     return np.array([given.get(name, 0.0) for name in names]) if given else None
 
 
-def keys_of(env: FMUEnv, seed: Any, count: int) -> dict[str, FloatArray]:
+def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
     """Draw what the random numbers of later steps follow from.
 
     Args:
         env: The prototype.
-        seed: That of the first candidate, the next one has the next; None if candidates go on
-            with the random numbers of their snapshot.
-        count: The number of candidates.
+        seed: That of all candidates, which nobody's luck then tells apart; None if they go on with
+            the random numbers of their snapshot.
 
     Raises:
         ConfigError: If it is no seed.
@@ -292,11 +291,8 @@ def keys_of(env: FMUEnv, seed: Any, count: int) -> dict[str, FloatArray]:
     first, future = check_seed(seed), env.inside.future
     if first is None or future is None:
         return {}
-    streams = [np.random.default_rng(first + index) for index in range(count)]
-    return {
-        name: np.array([env.config.episode_variables[name].sample(one) for one in streams])
-        for name in future.keys
-    }
+    stream = np.random.default_rng(first)
+    return {name: env.config.episode_variables[name].sample(stream) for name in future.keys}
 
 
 def _require_tunable(variable: Variable) -> None:

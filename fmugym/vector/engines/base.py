@@ -207,8 +207,8 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def set_variable(self, name: str, values: FloatArray) -> None:
-        """Give an episode variable one value for each environment, shape (N,)."""
+    def set_variable(self, name: str, value: float) -> None:
+        """Give an episode variable of all environments a value."""
 
     @abstractmethod
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:

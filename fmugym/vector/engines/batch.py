@@ -510,9 +510,9 @@ class BatchEngine(Engine):
             if tables:
                 self._prepare(own)
 
-    def set_variable(self, name: str, values: FloatArray) -> None:
+    def set_variable(self, name: str, value: float) -> None:
         """See ``Engine.set_variable``."""
-        self._row(name)[:] = values
+        self._row(name)[:] = value
 
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
         """See ``Engine.show_parameters``."""

@@ -282,9 +282,9 @@ class PerEnvEngine(Engine):
         finally:
             self.offsets = None
 
-    def set_variable(self, name: str, values: FloatArray) -> None:
+    def set_variable(self, name: str, value: float) -> None:
         """See ``Engine.set_variable``."""
-        for env, value in zip(self._envs, values.tolist(), strict=True):
+        for env in self._envs:
             env.variables[name] = value
 
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
