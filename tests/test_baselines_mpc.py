@@ -379,10 +379,10 @@ class TestRefusals:
         [
             ({"horizon": "soon"}, "horizon must be"),
             ({"horizon": 0}, "horizon"),
-            ({"rounds": 2.5}, "rounds must be a whole number"),
+            ({"rounds": 2.5}, "rounds must be an integer"),
             ({"candidates": 3}, "candidates"),
             ({"correction": 2.0}, "correction"),
-            ({"perfect": "maybe"}, "perfect must be true or false"),
+            ({"perfect": "maybe"}, "perfect must be True or False"),
             ({"budget": 0}, "budget"),
             ({"states": "theta"}, "states must be as in"),
             ({"model": "house.toml"}, "model must be a function"),

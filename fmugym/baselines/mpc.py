@@ -16,7 +16,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.base import Controller, FloatArray, attribute_of
-from fmugym.checks import check_number, check_seed, duration
+from fmugym.checks import (
+    LARGEST_COUNT,
+    check_flag,
+    check_integer,
+    check_number,
+    check_seed,
+    duration,
+)
 from fmugym.distributions import is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
@@ -90,27 +97,25 @@ class MPC(Controller):
     def __init__(
         self,
         horizon: Any,
-        candidates: float = 256,
-        rounds: float = 4,
+        candidates: int = 256,
+        rounds: int = 4,
         warm: Controller | None = None,
         correction: float = 0.3,
         budget: float | None = 1.0,
         states: Mapping[str, str] | str | None = None,
-        perfect: bool | str = False,
-        seed: float = 0,
+        perfect: bool = False,
+        seed: int = 0,
         model: Callable[[], Any] | None = None,
     ) -> None:
         self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
-        self.rounds = _whole("rounds", rounds, 1)
-        self.candidates = _whole("candidates", candidates, self.rounds)
+        self.rounds = check_integer("rounds", rounds, 1, LARGEST_COUNT)
+        self.candidates = check_integer("candidates", candidates, self.rounds, LARGEST_COUNT)
         self.warm = warm
         self.correction = check_number("correction", correction, 0.0, 1.0)
         self.budget = None if budget is None else check_number("budget", budget, positive=True)
-        if perfect not in (True, False, "true", "false"):
-            raise ConfigError(f"perfect must be true or false, got {shown(perfect)}")
-        self.perfect = perfect in (True, "true")
+        self.perfect = check_flag("perfect", perfect)
         self.states = _pairs(states)
-        self.seed = check_seed(_whole("seed", seed, 0)) or 0
+        self.seed = check_seed(seed) or 0
         if model is not None and not callable(model):
             raise ConfigError(f"model must be a function, got {shown(model)}")
         self.model = model
@@ -176,7 +181,11 @@ class MPC(Controller):
                 f"{', '.join(self.names)} and {self.space}"
             )
         for name, lookup in future.lookups.items():
-            _require_within(self.horizon, name, lookup.period)
+            if self.horizon > lookup.period:
+                raise ConfigError(
+                    f"the horizon of {self.horizon:g} s is longer than the data {name!r}, which "
+                    f"repeat after {lookup.period:g} s; take horizon={lookup.period:g} or less"
+                )
         if self.states and future.lookups:
             raise ConfigError(
                 "MPC takes 'states' for tasks without data only, but there is "
@@ -558,21 +567,6 @@ class _Foresight:
             values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
-
-
-def _require_within(horizon: float, name: str, period: float) -> None:
-    if horizon > period:
-        raise ConfigError(
-            f"the horizon of {horizon:g} s is longer than the data {name!r}, which repeat after "
-            f"{period:g} s; take horizon={period:g} or less"
-        )
-
-
-def _whole(what: str, value: float, least: int) -> int:
-    number = check_number(what, value, least)
-    if number != int(number):
-        raise ConfigError(f"{what} must be a whole number, got {shown(value)}")
-    return int(number)
 
 
 def _limits(space: spaces.Space[Any]) -> tuple[FloatArray, FloatArray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import re
@@ -230,10 +231,10 @@ def _argument(word: str) -> tuple[str, Any]:
     name, separator, value = word.partition("=")
     if not separator:
         raise ConfigError(f"expected an argument such as 'kp=0.5', got {shown(word)}")
-    try:
-        return name, float(value)
-    except ValueError:
-        return name, value
+    for read in (int, float):
+        with contextlib.suppress(ValueError):
+            return name, read(value)
+    return name, {"true": True, "false": False}.get(value, value)
 
 
 def _made(cls: type[Controller], arguments: dict[str, Any]) -> Controller:
