@@ -1,15 +1,16 @@
-"""Measure the cost of worker processes, and the time to handle their faults."""
+"""Measure the cost of worker processes, and the time of their starts and faults."""
 
 from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from c_fmus import build_busy
 from measure import Effort, MissingError
 from tables import Table, duration, share
 
+import fmugym
 from fmugym.envs import CartPoleEnv
 from fmugym.vector.making import make_with_pool
 
@@ -36,7 +38,7 @@ TIMEOUT = 0.2
 def tables(effort: Effort) -> list[Table]:
     """Measure."""
     with ExitStack() as stack:
-        return [_cost(stack, effort), _faults(stack, effort)]
+        return [_cost(stack, effort), _faults(stack, effort), _starts(effort)]
 
 
 def _cost(stack: ExitStack, effort: Effort) -> Table:
@@ -140,6 +142,70 @@ def _hang(stack: ExitStack) -> float:
     while not env.step(0)[3]:
         continue
     return time.perf_counter() - begin - TIMEOUT
+
+
+class _Met(fmugym.FMI2CSEnv):
+    """A cart-pole whose FMU is not known to be one of the package."""
+
+    def __init__(self, path: Path) -> None:
+        config = {
+            "model_input_names": "f",
+            "model_output_names": ["x", "theta"],
+            "bounds": {"f": (-10.0, 10.0)},
+            "time_step": 0.05,
+        }
+        super().__init__(path, config)
+
+    def _is_done(self) -> Any:
+        return abs(self.state[0]) > MEAN
+
+
+def _starts(effort: Effort) -> Table:
+    table = Table("Worker processes: starts", ["what", "median", "longest"])
+    count = 1 if effort.quick else 11
+    name = f"{SIZE} cart-poles in {SIZE} workers: until the first step is answered"
+    _add_times(table, name, [_first_step() for _ in range(count)])
+    meetings = [_meetings() for _ in range(count)]
+    names = "an FMU that is new here: constructor, with the trial", "the same, when it is known"
+    for what, times in zip(names, zip(*meetings, strict=True), strict=True):
+        _add_times(table, what, list(times))
+    return table
+
+
+def _first_step() -> float:
+    begin = time.perf_counter()
+    envs = fmugym.FMUVectorEnv(_quiet_env, SIZE, isolation="process", workers=SIZE)
+    envs.reset(seed=0)
+    envs.step(np.zeros(SIZE, np.int64))
+    end = time.perf_counter()
+    envs.close()
+    return end - begin
+
+
+def _meetings() -> tuple[float, float]:
+    """The times of the first and of the second environment over an FMU."""
+    times = []
+    with tempfile.TemporaryDirectory() as folder, _variable("FMUGYM_CACHE_DIR", folder):
+        path = Path(shutil.copy(fmugym.bundled_fmu("CartPole"), folder))
+        for _ in range(2):
+            begin = time.perf_counter()
+            env = _Met(path)
+            times.append(time.perf_counter() - begin)
+            env.close()
+    return times[0], times[1]
+
+
+@contextmanager
+def _variable(name: str, value: str) -> Iterator[None]:
+    """Set an environment variable."""
+    before = os.environ.get(name)
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        del os.environ[name]
+        if before is not None:
+            os.environ[name] = before
 
 
 def _add_times(table: Table, name: str, times: list[float]) -> None:

@@ -81,7 +81,7 @@ HEADER = [
     *("task", "minutes", "wanted", "reached, median", "worst of five", "reached by"),
     *("baseline", "agent, most often"),
 ]
-QUICK = ("--rounds", "9", "--candidates", "8", "--episodes", "1")
+QUICK = ("--rounds", "9", "--episodes", "1")
 
 
 def tables(effort: Effort) -> list[Table]:

@@ -121,6 +121,17 @@ def processes_of_session(leader):
     return found
 
 
+def processes_told_of(folder):
+    """The numbers of the processes that live and whose environment variables name a folder."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):  # it has ended, or is another user's
+                told = os.fsencode(folder) in (process / "environ").read_bytes()
+                found += [int(process.name)] if told else []
+    return found
+
+
 @contextlib.contextmanager
 def no_descriptors_left(left=0):
     """Let this process open no files, sockets or pipes, or only a few."""

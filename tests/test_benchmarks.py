@@ -102,12 +102,13 @@ def test_heavy_steps_are_measured_on_an_fmu_made_for_it(temp_root):
     assert list(temp_root.iterdir()) == []
 
 
-def test_isolation_is_measured_with_its_faults():
+def test_isolation_is_measured_with_its_faults_and_starts():
     result = run("--only", "isolation")
     assert (result.returncode, result.stderr) == (0, "")
     rows = tables_in(result.stdout)
     assert len(rows["1 cart-pole"]) == 4
-    assert any("hangs" in row for row in rows)
+    for what in ("hangs", "64 workers", "with the trial", "when it is known"):
+        assert any(what in row for row in rows)
 
 
 @pytest.fixture(name="tasks", scope="module")

@@ -31,7 +31,7 @@ def shortened(words):
     """A training of seconds instead of a minute."""
     if words[1] != "train":
         return words
-    return [*words, "--rounds", "23", "--candidates", "8", "--episodes", "1"]
+    return [*words, "--rounds", "23", "--episodes", "1"]
 
 
 def test_its_task_is_that_of_the_house():

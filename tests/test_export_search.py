@@ -52,7 +52,8 @@ def agent_for(env, text, form, seed=0):
     known, rng = Policy(None).bind(env), np.random.default_rng(seed)
     if form is None:
         return Agent("by hand", text)
-    form = replace(form, observed=len(known.names), acting=known.acting)
+    observed = 0 if form.name == "constant" else len(known.names)
+    form = replace(form, observed=observed, acting=known.acting)
     values = gymnasium.spaces.flatten(env.observation_space, env.reset(seed=seed)[0])
     count = form.features
     mean = np.concatenate([values, 0 * values, values, np.zeros(form.acting)])[:count]
@@ -131,7 +132,7 @@ class Agents:
     @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
     def test_of_a_constant(self, text, tmp_path):
         env = heater({"agent": PRESENT})
-        agent = agent_for(env, text, Form("constant", 0, 0, blind=True))
+        agent = agent_for(env, text, Form("constant", 0, 0))
         made = agent_of(env, agent)
         assert made.network is None
         assert [one.name for one in made.logic.measurements] == ["T_op"] * (text is not None)

@@ -1,20 +1,17 @@
-"""The native pool: an instance among others, threads, messages, isolation and memory."""
+"""The native pool: threads, messages, isolation and memory."""
 
 import gc
 import logging
 import os
-import re
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from pathlib import Path
 
 import building
 import fmu_tools
 import numpy as np
 import pytest
-from combinations import in_turn
 from plants import ONCE
 
 import fmugym
@@ -37,9 +34,6 @@ INTERFACES = {
     "DoublePendulum": (["tau2", "tau1"], ["q2_dot", "q1"], ["q1_0", "P1"]),
     "House": (["u", "T_out"], ["T_air", "T_w"], ["T_w_0", "H_w"]),
 }
-START_VALUES = {"theta_0": (1.5, 1.6), "m_pole": (1.0, 2.0), "solver": (1, 3), "q_0": (0.1, 3.0)}
-START_VALUES |= {"max_step": (0.01, 0.05), "q1_0": (-1.0, 3.0), "P1": (7e-4, 9e-4)}
-START_VALUES |= {"T_w_0": (293.0, 313.0), "H_w": (20.0, 60.0)}
 
 
 def make(cls, path, inputs, outputs, count=1, time_step=0.05, **options):
@@ -101,125 +95,6 @@ def busy(tmp_path_factory):
 def shared(tmp_path_factory):
     """An FMU whose instances count their steps together."""
     return busy_fmu(tmp_path_factory.mktemp("shared"), "-DSHARED")
-
-
-# Agreement of an instance among others with the same one alone
-
-
-class Company:
-    """The same calls to a pool of many instances and to a pool of each; all is equal to the bit."""
-
-    def __init__(self, path, inputs, outputs, start, count, seed, **options):
-        self.many = make(NativePool, path, inputs, outputs, count, threads=2, **options)
-        self.alone = [make(NativePool, path, inputs, outputs, **options) for _ in range(count)]
-        self.count, self.inputs = count, len(inputs)
-        self.start = start
-        self.rng = np.random.default_rng(seed)
-        self.snapshots = None
-
-    def close(self):
-        for pool in (self.many, *self.alone):
-            pool.close()
-
-    def chosen(self, mask):
-        """The index, as a slice, and the pool of each instance in a mask."""
-        for index, pool in enumerate(self.alone):
-            if mask is None or mask[index]:
-                yield slice(index, index + 1), pool
-
-    def compare(self):
-        for index, pool in self.chosen(None):
-            assert pool.outputs.tobytes() == self.many.outputs[:, index].tobytes()
-            assert pool.statuses == self.many.statuses[index]
-            if pool.statuses > Status.WARNING:
-                texts = pool.failure(0), self.many.failure(index.start)
-                assert len({re.sub(r"Probe_\d+", "Probe", text) for text in texts}) == 1
-
-    def mask(self):
-        mask = self.rng.random(self.count) < self.rng.choice([0.2, 0.5, 1.0])
-        return None if mask.all() and self.rng.random() < 0.5 else mask
-
-    def reset(self, values, mask):
-        variables = tuple(map(self.many.variable, self.start))
-        self.many.reset(variables, values, mask)
-        for index, pool in self.chosen(mask):
-            pool.reset(variables, values[:, index])
-        self.compare()
-
-    def random_reset(self):
-        rows = [self.rng.choice(START_VALUES[name], self.count) for name in self.start]
-        self.reset(np.array(rows, float).reshape(-1, self.count), self.mask())
-
-    def random_step(self):
-        self.step(0.1 * self.rng.normal(size=(self.inputs, self.count)), self.mask())
-
-    def step(self, inputs, skip):
-        self.many.step(inputs, skip, self.many.observations)
-        for index, pool in self.chosen(None if skip is None else ~skip):
-            pool.step(inputs[:, index])
-        self.compare()
-        observed = self.many.outputs.T.astype(np.float32)
-        np.testing.assert_array_equal(self.many.observations, observed)
-
-    def random_save(self):
-        try:
-            snapshot = self.many.save()
-        except SimulationError:
-            with pytest.raises(SimulationError):
-                self.alone[0].save()
-        else:
-            self.snapshots = snapshot, [pool.save() for pool in self.alone]
-
-    def random_restore(self):
-        if self.snapshots is not None:
-            mask, (snapshot, others) = self.mask(), self.snapshots
-            self.many.restore(snapshot, mask)
-            for index, pool in self.chosen(mask):
-                pool.restore(others[index.start])
-            self.compare()
-
-    def random_read(self):
-        variables = tuple(map(self.many.variable, self.start))
-        values = self.many.read(variables)
-        for index, pool in self.chosen(None):
-            assert pool.read(variables).tobytes() == values[:, index].tobytes()
-
-    def play(self, count):
-        actions = [self.random_step] * 6 + [self.random_reset] * 2
-        actions += [self.random_save, self.random_restore, self.random_read]
-        for _ in range(count):
-            self.rng.choice(actions)()
-
-
-@in_turn(
-    {
-        "model,version": BUNDLED,
-        "options": [{}, {"substeps": 3, "start_time": 0.3}, {"warm_up_steps": 2}],
-    }
-)
-def test_any_calls(model, version, options):
-    inputs, outputs, start = INTERFACES[model]
-    company = Company(bundled_fmu(model, version), inputs, outputs, start, 7, 0, **options)
-    with closing(company):
-        company.random_reset()
-        company.reset(np.array([[START_VALUES[n][0]] * 7 for n in start], float), None)
-        company.play(120)
-
-
-@in_turn({"width": [2, 70], "count": [1, 3]})
-def test_values_beyond_those_of_observations(probe, count, width):
-    """Outputs may exceed a float32; with inputs that are not finite nothing is stepped."""
-    outputs, exceeds = ["sum", "steps"] * (width // 2), False
-    with (
-        closing(Company(probe(2), ["a"], outputs, ["gain"], count, 0)) as company,
-        np.errstate(over="ignore"),
-    ):
-        for a in (0.5, np.nan, 1e42, np.inf, 0.5):
-            company.reset(np.full((1, count), 1.5), None)
-            company.step(np.full((1, count), a), None)
-            assert np.isfinite(a) == (company.many.statuses <= Status.WARNING).all()
-            exceeds |= np.abs(company.many.outputs).max() > np.finfo(np.float32).max
-    assert exceeds
 
 
 # Threads

@@ -140,6 +140,13 @@ def test_opening_is_answered_by_nothing_else(deceived, monkeypatch):
         deceived(None)
 
 
+def test_a_worker_of_another_version_refuses_to_open(monkeypatch):
+    monkeypatch.setattr("fmugym.pool.form._VERSION", 0)
+    fmu = FMU(bundled_fmu("CartPole"))
+    with pytest.raises(FMULoadError, match="is of another version of fmugym"):
+        ProcessPool(fmu, PoolSpec((), (), 0.05), 1, LOG)
+
+
 @linux_only
 def test_shared_memory_cannot_be_shrunk():
     memory = Memory(PoolSpec((), (), 1.0), 1, 1)

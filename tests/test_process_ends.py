@@ -1,6 +1,7 @@
 """What becomes of worker processes when they fork, or when the process that uses them ends."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,19 +12,24 @@ from pathlib import Path
 import pytest
 from process_tools import (
     INTERRUPTIBLE,
+    FaultyEnv,
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
     fixture_opened,  # noqa: F401  # the fixture "opened"
     is_alive,
     linux_only,
     posix_only,
     processes_of_session,
+    processes_told_of,
     processes_with,
     wait_until,
 )
+from wine_tools import for_windows
 from zoo_tools import ZooEnv, parameters, zoo_fmu
 
 from fmugym.archive.temporary import folder_name, make_folder
 from fmugym.caching import sweep
+from fmugym.pool.process.launcher import _guard
+from fmugym.pool.process.supervisor import Supervisor
 
 HERE = Path(__file__).parent
 
@@ -149,7 +155,13 @@ def kill_in(module, path, when, number):
     setattr(owner, name, call)
 
 kill_in(*sys.argv[2:5], int(sys.argv[5]))
-process_tools.FaultyEnv(sys.argv[1]).reset()
+env = process_tools.FaultyEnv(sys.argv[1])
+env.reset()
+env.step([1.0])
+os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+assert env.step([1.0])[3]
+env.reset()
+env.close()
 """
 """Ends when a function is called for the n-th time, or has been called."""
 
@@ -167,33 +179,43 @@ MOMENTS = {
     "end of it": (SUPERVISOR, "Supervisor.finish_opening", "after", 1),
     "before the first reset": (SUPERVISOR, "Supervisor.reply", "before", 1),
     "after the first reset": (SUPERVISOR, "Supervisor.reply", "after", 1),
+    "before a step": (SUPERVISOR, "Supervisor.step", "before", 1),
+    "step": (SUPERVISOR, "Supervisor.step", "after", 1),
+    "burial of a worker": (SUPERVISOR, "Supervisor.bury", "before", 1),
+    "start of its successor": (LAUNCHER, "_Guard.start", "after", 2),
+    "opening of its successor": (SUPERVISOR, "Supervisor.finish_opening", "before", 2),
+    "end of a worker": (SUPERVISOR, "Supervisor.begin_closing", "after", 1),
+    "removal of its files": ("shutil", "rmtree", "before", 1),
 }
 MOMENTS_OF_TRIAL = {
     **MOMENTS,
     "first episode": (SUPERVISOR, "Supervisor.reply", "before", 20),
-    "start of the second worker": (LAUNCHER, "_Guard.start", "after", 2),
     "rehearsal": ("fmugym.trial.rehearsal", "Rehearsal._worst_grade", "before", 1),
-    "end of a worker": (SUPERVISOR, "Supervisor.begin_closing", "after", 1),
-    "removal of its files": ("shutil", "rmtree", "before", 1),
     "verdict": ("os", "replace", "after", 1),
 }
+MOMENTS_IN_WINE = [
+    *("start of a worker", "a worker is there", "instantiation", "after the first reset"),
+    *("step", "start of its successor", "end of a worker"),
+]
 
 
-class TestKilledInTheConstructor:
+class TestKilled:
     """The parent is killed; what it has in memory has no name and goes with the processes."""
 
     @pytest.fixture(name="is_clean_after")
     def fixture_is_clean_after(self, faulty, temp_root, tmp_path):
-        def is_clean_after(moment, probe):
+        def is_clean_after(moment, probe, fmu=faulty):
+            cache = tmp_path / "cache"
             program = subprocess.Popen(
-                [sys.executable, "-c", KILLED, faulty, *map(str, moment)],
+                [sys.executable, "-c", KILLED, fmu, *map(str, moment)],
                 env=os.environ
                 | {"PYTHONPATH": str(HERE), "FMUGYM_PROBE": probe}
-                | {"FMUGYM_CACHE_DIR": str(tmp_path / "cache")},
+                | {"FMUGYM_CACHE_DIR": str(cache)},
                 start_new_session=True,
             )
             assert program.wait() == -signal.SIGKILL
             wait_until(lambda: not processes_of_session(program.pid))
+            wait_until(lambda: not processes_told_of(cache))
             sweep.cache_clear()
             sweep(temp_root)  # as the next process does that needs a folder
             assert list(temp_root.iterdir()) == []
@@ -209,6 +231,34 @@ class TestKilledInTheConstructor:
     @pytest.mark.parametrize("moment", MOMENTS_OF_TRIAL.values(), ids=MOMENTS_OF_TRIAL)
     def test_of_an_unknown_fmu(self, is_clean_after, moment):
         is_clean_after(moment, "on")
+
+    @linux_only
+    @pytest.mark.parametrize("moment", MOMENTS_IN_WINE)
+    def test_of_an_fmu_in_wine(self, is_clean_after, wine, faulty, tmp_path, moment):
+        copy_of_wine(wine, tmp_path / "cache")
+        is_clean_after(MOMENTS[moment], "off", for_windows(faulty, tmp_path))
+
+
+@linux_only
+def test_an_interrupt_while_wine_starts(wine, faulty, tmp_path, monkeypatch):
+    _guard()  # which is told nothing of this folder
+    cache = copy_of_wine(wine, tmp_path / "cache")
+    monkeypatch.setenv("FMUGYM_CACHE_DIR", str(cache))
+
+    def interrupted(supervisor, deadline):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Supervisor, "finish_opening", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        FaultyEnv(for_windows(faulty, tmp_path))
+    wait_until(lambda: not processes_told_of(cache))
+
+
+def copy_of_wine(wine, cache):
+    """A cache folder with a Wine of its own, because others may keep Wine's server busy."""
+    left_out = shutil.ignore_patterns("server-*", "*.lock")
+    shutil.copytree(wine.prefix.parent, cache / "wine", symlinks=True, ignore=left_out)
+    return cache
 
 
 class TestEndOfParent:

@@ -31,10 +31,10 @@ from process_tools import (
 )
 
 import fmugym
-from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
+from fmugym import FMU, ConfigError, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
-from fmugym.pool.process import launcher
+from fmugym.pool.process import guard, launcher
 from fmugym.pool.process.launcher import _guard
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.trial import opening
@@ -377,6 +377,15 @@ class TestPool:
     def test_blocks_and_processes(self, make_pool):
         assert len(set(make_pool(5, workers=3).processes())) == 3
         assert len(make_pool(2, workers=9).processes()) == 2
+
+    @linux_only
+    def test_workers_load_nothing_but_the_extension(self, make_pool):
+        (worker,) = make_pool(1).processes()
+        maps = Path(f"/proc/{worker}/maps").read_text()
+        assert _native.__file__ in maps
+        assert str(Path(np.__file__).parent) not in maps
+        command = Path(f"/proc/{worker}/cmdline").read_text().split("\0")
+        assert command[1:4] == ["-I", "-S", guard.__file__]
 
     def test_lost_instances_stay_so_until_their_own_reset(self, make_pool, faulty):
         pool = make_pool(4)

@@ -27,11 +27,11 @@ def new(capsys):
     return lambda fmu: proposed(capsys, fmu)
 
 
-def trained(folder, capsys, fmu, candidates=8):
+def trained(folder, capsys, fmu):
     """The facts of the agent that a newcomer gets by two commands."""
     path, agent = folder / "task.toml", folder / "agent"
     assert main(["new", str(fmu), "--output", str(path)]) == 0
-    options = "--rounds", "30", "--candidates", str(candidates), "--episodes", "2"
+    options = "--rounds", "30", "--episodes", "2"
     code = main(["train", str(path), "--output", str(agent), *options])
     assert code == 0, capsys.readouterr().err
     return json.loads((agent / "agent.json").read_text())

@@ -435,7 +435,7 @@ FORMS = [  # for 3 observations and 2 outputs
     Form("linear with history", 3, 2, history=True),
     Form("network", 3, 2, hidden=(5, 4)),
     Form("network with history", 3, 2, hidden=(4,), history=True),
-    Form("constant action", 3, 2, blind=True),
+    Form("constant action", 0, 2),
 ]
 ACTING = [
     spaces.Box(np.array([-2.0, 10.0]), np.array([4.0, 30.0]), dtype=np.float64),
@@ -448,7 +448,7 @@ ACTING = [
 def sized(form, env):
     """The form for an environment."""
     bare = Policy(None).bind(env)
-    return replace(form, observed=len(bare.names), acting=bare.acting)
+    return replace(form, observed=form.observed and len(bare.names), acting=bare.acting)
 
 
 def policy_with(form, env_of_one, seed=0, rows=None, baseline=None):
@@ -752,13 +752,56 @@ def test_a_search_goes_on_from_a_candidate_that_is_better_than_their_mean():
     assert sum(found) >= 25
 
 
+class Noisy:
+    """Stands for an arena and for a search whose candidates are always as different."""
+
+    mean = np.zeros(1)
+
+    def __init__(self, noise):
+        self.noise, self.rng = noise, np.random.default_rng(0)
+
+    def ask(self):
+        return self.rng.normal(size=(400, 1))
+
+    def tell(self, order):
+        pass
+
+    def play(self, make, numbers, seeds, watch=None):
+        returns = numbers + self.rng.normal(0.0, self.noise, (400, len(seeds)))
+        return Outcome(returns, np.empty((*returns.shape, 0)), np.empty(0))
+
+
+@pytest.mark.parametrize(
+    ("noise", "expected"),
+    [(0.0, 4), (np.sqrt(8), 4), (np.sqrt(24), 8), (1e9, 64)],
+    ids=["none", "correlations of 0.2", "correlations of 0.08", "noise only"],
+)
+def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
+    """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
+    field = Noisy(noise)
+    entrant = Entrant(field, None, 4)
+    for _ in range(120):
+        entrant.play(field, range(entrant.episodes), ())
+    assert entrant.episodes == expected
+
+
+def test_a_search_that_gains_nothing_ends():
+    search, field = Search((2, 1), [], []), Field(-1e-9)
+    while not search.is_over:
+        search.advance(field)
+        assert search.rounds < 2000
+    assert search.rounds > 100
+    assert search.winner(field) is search.baseline
+
+
 def names_of(search):
-    return [agent.name for agent, _ in search.known()]
+    found = [one for one in search._contenders if one.gained]
+    return [search.baseline.name, *(one.make.agent(one.best).name for one in found)]
 
 
 def test_a_history_enters_when_a_correction_gains_nothing_without_it():
     fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
-    search, field = Search((2, 1), fixed, {}, []), Field(1.0)
+    search, field = Search((2, 1), fixed, []), Field(1.0)
     while search.rounds < 60:
         search.advance(field)
     assert names_of(search) == ["given", "given + linear", "linear", "network"]
@@ -777,7 +820,7 @@ def test_what_the_search_has_come_to_may_win_without_an_earlier_gain():
             return super().play(make, own, seeds, watch)
 
     fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
-    search, field = Search((2, 1), fixed, {}, []), Late(1.0)
+    search, field = Search((2, 1), fixed, []), Late(1.0)
     while search.rounds < 60:
         search.advance(field)
     leader = max(search._contenders, key=lambda one: one.cma.mean.sum())
@@ -793,7 +836,7 @@ def test_who_is_worse_than_the_baseline_has_no_more_than_its_share():
             return outcome._replace(returns=outcome.returns - 1e6 * alone)
 
     fixed = [Agent("given", "pid of=theta setpoint=0 kp=1")]
-    search, field = Search((2, 1), fixed, {}, []), Uneven(1e9)
+    search, field = Search((2, 1), fixed, []), Uneven(1e9)
     for _ in range(200):
         search.advance(field)
     rounds = {one.make.agent(one.best).name: one.rounds for one in search._contenders}
@@ -1010,7 +1053,7 @@ def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS
     fields = {name for name in options if name in Quest.__dataclass_fields__}
     changes = {name: value for name, value in options.items() if name not in fields}
     make_env = load(document, **{"controllers": CONTROLLERS, **changes})
-    given = {"candidates": 8, "episodes": 3} | {name: options[name] for name in fields}
+    given = {"episodes": 3} | {name: options[name] for name in fields}
     given |= {} if told is None else {"tell": told.append}
     quest = Quest(make_env, {"unseen episodes": make_env}, folder, rounds=rounds, **given)
     return searching.search(quest, resume=resume)
@@ -1073,6 +1116,7 @@ class TestSearch:
             Arena, "play", lambda arena, *rest: calls.append(rest) or play(arena, *rest)
         )
         searched(tmp_path / "agent")
+        _, *calls = calls  # the first one was a look at the task
         several = [(len(numbers), list(seeds)) for _, numbers, seeds, *_ in calls]
         training = {seed for count, seeds in several if count > 2 for seed in seeds}
         other = {seed for count, seeds in several if count <= 2 for seed in seeds}
@@ -1085,16 +1129,17 @@ class TestSearch:
         assert firsts == sorted(firsts)  # the test is played once, at the end
 
     def test_equal_episodes_are_played_once(self, tmp_path, monkeypatch):
-        counts, told, play = set(), [], Arena.play
+        counts, told, play = [], [], Arena.play
 
         def spy(arena, make, numbers, seeds, *watch):
-            counts.add(len(seeds))
+            counts.append(len(seeds))
             return play(arena, make, numbers, seeds, *watch)
 
         monkeypatch.setattr(Arena, "play", spy)
         parameters = {"q_0": "pi", "theta_0": 0.5}
         verdict, _ = searched(tmp_path / "agent", parameters=parameters, told=told)
-        assert counts == {1}
+        assert counts[0] > 1  # how it knows, and how quick a step is
+        assert set(counts[2:]) == {1}
         assert any("one episode" in line for line in told)
         assert np.isnan(verdict.gain(*list(verdict.outcomes)[:2])[1])
 
@@ -1149,7 +1194,7 @@ class TestSearch:
 
     def test_a_search_that_finds_nothing_leaves_no_folder(self, tmp_path):
         one = {"pi": CONTROLLERS["pi"]}
-        limits = {"rounds": None, "steps": MOST_PROBED + 20, "candidates": 32}
+        limits = {"rounds": None, "steps": MOST_PROBED + 20}
         with pytest.raises(ConfigError, match="0 rounds are too few"):
             searched(tmp_path / "agent", controllers=one, terminated=None, **limits)
         assert not (tmp_path / "agent").exists()
@@ -1211,7 +1256,7 @@ class TestBudget:
         facts = []
         for seconds, envs in ((100.0, 512), (0.0, 512), (0.0, 11)):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.search.probe.perf_counter", clock.__next__)
+            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
             folder = tmp_path / str(len(facts))
             limits = {"rounds": None, "minutes": 1e9, "steps": 20_000, "envs": envs}
             facts.append(searched(folder, **limits)[1] | {"steps": None})
@@ -1219,8 +1264,8 @@ class TestBudget:
 
     def test_a_ceiling_below_a_look_at_the_task_is_refused(self, tmp_path, monkeypatch):
         budget = Budget(monkeypatch)
-        with pytest.raises(ConfigError, match=f"1000 steps.*{MOST_PROBED}"):
-            searched(tmp_path / "agent", steps=1000)
+        with pytest.raises(ConfigError, match=f"{MOST_PROBED} steps.*{MOST_PROBED}"):
+            searched(tmp_path / "agent", steps=MOST_PROBED)
         assert budget.steps == 0
         assert not (tmp_path / "agent").exists()
 
@@ -1241,12 +1286,12 @@ class TestBudget:
         with monkeypatch.context() as patch:
             patch.setattr(Probe, "round_time", lambda self, candidates, _: candidates / 8)
             patch.setattr(searching, "monotonic", lambda: 0.0)
-            limits = {"minutes": 0.05, "candidates": None, "told": told}
+            limits = {"minutes": 0.05, "told": told}
             _, facts = searched(tmp_path / "a", rounds=None, **limits)
-        assert (facts["candidates"], facts["rounds"]) == (8, 15)
+        assert facts["rounds"] == 30
         assert facts["agent"] == facts["baseline"] in {"lazy", "tuned pi"}
         assert any("baseline only" in line and "--minutes 1" in line for line in told)
-        _, again = searched(tmp_path / "b", rounds=15)
+        _, again = searched(tmp_path / "b", rounds=30)
         assert content(tmp_path / "b") == content(tmp_path / "a")
         assert again["test"] == facts["test"]
         _, more = searched(tmp_path / "a", rounds=ROUNDS, resume=True)
@@ -1265,24 +1310,9 @@ class TestProbe:
         found = []
         for seconds in (100.0, 0.0):
             clock = itertools.count(step=seconds)
-            monkeypatch.setattr("fmugym.search.probe.perf_counter", clock.__next__)
+            monkeypatch.setattr("fmugym.baselines.arena.perf_counter", clock.__next__)
             found.append(Probe.of(load(parameters=HIDDEN), envs))
         slow, fast = found
         assert slow.seconds > fast.seconds
         assert replace(slow, seconds=fast.seconds) == fast
-        assert (slow.is_same, slow.only_reward) == (False, None)
-
-    def test_no_episode_is_stepped_beyond_an_end(self, monkeypatch):
-        ends, counts, step = [], [], FMUVectorEnv.step
-
-        def spied(envs, actions):
-            result = step(envs, actions)
-            counts.append(envs.num_envs)
-            ends.append(bool((result[2] | result[3]).any()))
-            return result
-
-        monkeypatch.setattr(FMUVectorEnv, "step", spied)
-        Probe.of(load(), 8)
-        *before, _ = ends[: ends.index(True) + 1]
-        assert not any(before)
-        assert sum(counts) <= MOST_PROBED
+        assert (slow.is_same, slow.only_return) == (False, None)

@@ -1,6 +1,7 @@
 """Environments that are saved, restored, stepped and reset in any order, against plain re-runs."""
 
 import pickle
+from functools import partial
 
 import hypothesis.strategies as st
 import numpy as np
@@ -34,18 +35,17 @@ class Machine(RuleBasedStateMachine):
     """Each environment has a history of its own; a snapshot carries that of its environments."""
 
     options: dict = {}  # noqa: RUF012  (of subclasses)
-    version = "2.0"
     make = Track
 
     @initialize(seed=st.integers(0, 5))
     def start(self, seed):
         self.envs = fmugym.FMUVectorEnv(
-            lambda: self.make(fmi_version=self.version),
+            self.make,
             N,
             autoreset_mode="Disabled",
             **self.options,
         )
-        self.single = self.make(fmi_version=self.version)
+        self.single = self.make()
         self.histories = [[] for _ in range(N)]
         self.results = [[] for _ in range(N)]
         self.saved = []
@@ -136,9 +136,13 @@ WAYS = {
 }
 
 
-@in_turn({"way": list(WAYS), "version": ["1.0", "2.0", "3.0"]})
-def test_any_order(version, way):
-    machine = type("Own", (Machine,), {"options": WAYS[way], "version": version})
+CHANGES = ({"substeps": 3, "warm_up": 0.06, "start_time": 0.3}, {})
+
+
+@in_turn({"way": list(WAYS), "version": ["2.0", "3.0", "1.0"], "changes": CHANGES})
+def test_any_order(version, way, changes):
+    make = staticmethod(partial(Track, version, **changes))
+    machine = type("Own", (Machine,), {"options": WAYS[way], "make": make})
     examples = 4 if way == "processes" else 25
     limits = settings(max_examples=examples, stateful_step_count=25, deadline=None)
     run_state_machine_as_test(machine, settings=limits)

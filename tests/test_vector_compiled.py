@@ -4,7 +4,6 @@ import contextlib
 import itertools
 import signal
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from vector_tools import (
@@ -14,14 +13,12 @@ from vector_tools import (
     RingError,
     fixture_outside,  # noqa: F401  # the fixture "outside"
     handler,  # noqa: F401  # the fixture "handler"
-    in_each_mode,
     require_pair_equal,
     require_same_starts,
     results_of_both,
     run_side_by_side,
 )
 
-from fmugym import Uniform
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.symbols import Symbols
 
@@ -53,54 +50,6 @@ def test_the_exception_of_a_signal_handler_is_not_that_of_a_hook():
         assert rewards[0].all()
 
 
-class Arithmetic(Drawing):
-    """All that is compiled."""
-
-    def __init__(self, **changes):
-        parameters = {"q_0": Uniform(-1.0, 1.0), "q_dot_0": 0.3, "m": Uniform(0.05, 0.07)}
-        super().__init__(model_parameters=parameters, max_episode_steps=20, start_time=1.0)
-
-    def _get_action_space(self):
-        return gym.spaces.Discrete(3, start=-1)
-
-    def _get_inputs(self):
-        return [np.where(self.action == 1, 0.004, 0.01) * np.minimum(self.action, 0.5)]
-
-    def _is_done(self):
-        q, q_dot = self.state
-        near, slow = (abs(q) > 0.9) & np.logical_not(q_dot < -1.0), np.less_equal(q_dot, 0.2)
-        return near | np.logical_and(q > 0.5, slow) | np.logical_or(q == 0.25, q_dot >= 8.0)
-
-    def _is_truncated(self):
-        return (self.time > 1.2) & (self.step_count != 12) & np.not_equal(self.step_count, 13)
-
-    def _reward_policy(self):
-        q, q_dot = self.state
-        first = np.sqrt(np.abs(q)) + np.square(q_dot) / (1.0 + np.fabs(self.inputs[0]))
-        second = np.maximum(2 * q, -0.1) * np.negative(self.out["q_dot"]) - self.parameters["m"]
-        return first - second + np.where(self.done, -1.0, -0.0) * (0.5 - self.action)
-
-
-class MoreArithmetic(Arithmetic):
-    def _is_done(self):
-        return self.state[0] > 0.9
-
-    def _is_truncated(self):
-        return np.equal(self.step_count, 7)
-
-    def _reward_policy(self):
-        q, q_dot = self.state
-        first = np.true_divide(np.add(q, 1), 3) + np.multiply(q, np.subtract(2.0, q_dot))
-        second = np.where(np.greater(q, 0.3) | np.greater_equal(q_dot, 1.0), -first, 4.0 / (5 + q))
-        return first + second - 1
-
-
-@in_each_mode({"cls": [Arithmetic, MoreArithmetic]})
-def test_compiled_arithmetic_is_that_of_numbers(cls, mode, hooks):
-    way = hooks if hooks != "auto" else "compiled"
-    assert require_pair_equal(cls, steps=150, mode=mode, num_envs=7, hooks=way) > 20
-
-
 RARE = {
     "numpy.piecewise": lambda env: np.piecewise(env.state[0], [env.state[0] < 0], [-1.0, 1.0]),
     "float16": lambda env: np.asarray(env.state[0], np.float16),
@@ -114,7 +63,7 @@ RARE = {
 
 @pytest.mark.parametrize("reason", RARE)
 def test_hooks_with_rare_functions_run_on_arrays_beside_compiled_ones(reason, caplog):
-    class Other(Arithmetic):
+    class Other(Drawing):
         def _reward_policy(self):
             return RARE[reason](self)
 
@@ -125,7 +74,7 @@ def test_hooks_with_rare_functions_run_on_arrays_beside_compiled_ones(reason, ca
     run_side_by_side(ours, theirs, 40)
 
 
-class Differing(Arithmetic):
+class Differing(Drawing):
     """Its truncation is another one as a program, as if it hung on the last bit of a sine."""
 
     def _is_truncated(self):

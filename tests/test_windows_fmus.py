@@ -4,13 +4,10 @@ That pools in Wine keep the contract of all pools is shown by test_pool.py.
 """
 
 import logging
-import os
 import shutil
 import subprocess
 import sys
-import textwrap
 import threading
-import time
 from functools import partial
 from pathlib import Path
 
@@ -257,27 +254,6 @@ class TestInWine:
         for _ in range(1000):
             pool.step_own()
         assert sleeps() - before < 1000
-
-    def test_it_ends_with_its_parent(self, cart_pole):
-        script = """
-            import sys
-            from test_windows_fmus import open_pool
-            pool = open_pool(sys.argv[1], 2, workers=1)
-            print(pool.processes()[0], flush=True)
-            sys.stdin.read()
-        """
-        command = [sys.executable, "-c", textwrap.dedent(script), str(cart_pole)]
-        environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
-        with subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
-        ) as parent:
-            worker = int(parent.stdout.readline())
-            assert Path(f"/proc/{worker}").exists()
-            parent.kill()
-        deadline = time.monotonic() + 20
-        while Path(f"/proc/{worker}").exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
 
     def test_a_server_that_takes_long_to_end(self, cart_pole, opened):
         """Wine gives up after six seconds; then a worker is started again."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from time import perf_counter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -59,7 +60,8 @@ class Arena:
 
     Attributes:
         steps: The steps of all episodes until now.
-        ceiling: The largest number of them.
+        seconds: The real time that they have taken.
+        ceiling: The largest number of steps.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class Arena:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
         self._costs = tuple(costs)
         self._envs: dict[int, FMUVectorEnv] = {}
-        self.steps, self.ceiling = 0, math.inf
+        self.steps, self.seconds, self.ceiling = 0, 0.0, math.inf
 
     def close(self) -> None:
         """Close the environments."""
@@ -105,7 +107,9 @@ class Arena:
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
             own = [seeds[index] for index in which.tolist()]
+            begin = perf_counter()
             totals = self._play(envs, controller, own, len(part), watch)
+            self.seconds += perf_counter() - begin
             groups.append(totals[:, : len(part)])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
         costs, watched = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._costs)], axis=-1)
@@ -114,13 +118,13 @@ class Arena:
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
         size = min(jobs, self._most_envs, _WIDEST)
-        if size not in self._envs and sum(self._envs) + size > self._most_envs:
-            larger = [count for count in self._envs if count > size]
-            if larger:
-                return self._envs[min(larger)]
+        fitting = [count for count in self._envs if count >= size]
+        is_full = sum(self._envs) + size > self._most_envs
+        if fitting and (is_full or size in fitting):
+            return self._envs[min(fitting)]
+        if is_full:
             self.close()
-        if size not in self._envs:
-            self._envs[size] = FMUVectorEnv(self._make_env, size)
+        self._envs[size] = FMUVectorEnv(self._make_env, size)
         return self._envs[size]
 
     def _play(
@@ -139,13 +143,10 @@ class Arena:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
             self.steps += count
             actions = controller.act(observations, infos)
-            counted: Any = True  # whose numbers count; for all, that takes less time
-            if count == len(seeds):
-                result = envs.step(actions)
-            else:
-                counted = running
-                result = envs.step_around(actions, ~running)
+            are_all = count == len(seeds)
+            result = envs.step(actions) if are_all else envs.step_around(actions, ~running)
             observations, rewards, terminated, truncated, infos = result
+            counted: Any = are_all or running  # for all, that takes less time
             costs = (infos["costs"][name] for name in self._costs)
             for total, values in zip(totals, (rewards, *costs), strict=True):
                 np.add(total, values, out=total, where=counted)

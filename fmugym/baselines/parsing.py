@@ -118,7 +118,7 @@ class Search:
         }
         return self.make(**middles)
 
-    def text(self, numbers: Mapping[str, float]) -> str:
+    def text(self, numbers: Mapping[str, Any]) -> str:
         """The controller with some numbers, as ``controller_of`` reads it."""
         found = self.numbers(numbers)
         given = {name: found.get(name, value) for name, value in self._in_order().items()}

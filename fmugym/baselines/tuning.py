@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
-import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, Final
@@ -17,11 +15,11 @@ from fmugym.baselines.cma import CMA
 from fmugym.baselines.entrants import Entrant
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution
-from fmugym.errors import ConfigError, shown, unknown_name
+from fmugym.errors import ConfigError, shown
 
-__all__ = ["LEAST_CANDIDATES", "Axes", "Tuning", "tune"]
+__all__ = ["Axes", "Tuning", "tune"]
 
-LEAST_CANDIDATES: Final = 8
+_LEAST_CANDIDATES: Final = 8
 _SIGMA: Final = 0.3
 """Of the first candidates, as a part of the ranges."""
 
@@ -60,7 +58,7 @@ class Axes:
     def numbers(self, places: FloatArray) -> dict[str, FloatArray]:
         """The numbers for places of shape (n, k), each of shape (n,).
 
-        Places beyond 0 and 1 are folded back.
+        For one place, of shape (k,), each is a number. Places beyond 0 and 1 are folded back.
         """
         folded = 1.0 - np.abs(1.0 - np.mod(places, 2.0))
         pairs = zip(self.ranges.items(), folded.T, strict=True)
@@ -69,10 +67,8 @@ class Axes:
 
 def _value(given: Uniform | LogUniform, places: FloatArray) -> FloatArray:
     low, high = given.low, given.high
-    if isinstance(given, LogUniform):
-        values = np.exp(math.log(low) + places * (math.log(high) - math.log(low)))
-    else:
-        values = low + places * (high - low)
+    is_log = isinstance(given, LogUniform)
+    values = low * (high / low) ** places if is_log else low + places * (high - low)
     return np.clip(values, low, high)
 
 
@@ -115,10 +111,11 @@ def tune(
     """
     for what, value in (("episodes", episodes), ("rounds", rounds), ("most_steps", most_steps)):
         check_count(what, value)
-    check_number("candidates", check_count("candidates", candidates), LEAST_CANDIDATES)
+    check_number("candidates", check_count("candidates", candidates), _LEAST_CANDIDATES)
     given = check_mapping("search", search)
     axes = Axes({name: _range(name, one) for name, one in given.items()})
-    _check_names(make_controller, axes.ranges)
+    if not axes.ranges:
+        raise ConfigError("search needs the name of at least one number")
     seed = check_seed(seed) or 0
     cma = axes.search(candidates, np.random.default_rng(seed))
     entrant = Entrant(cma, lambda rows: make_controller(**axes.numbers(rows)), episodes)
@@ -127,8 +124,7 @@ def tune(
         for _ in range(rounds):
             _, reached = entrant.play(arena, range(seed, seed + episodes), ())
             returns.append(reached)
-            numbers = axes.numbers(entrant.leader[None])
-            best = {name: float(values[0]) for name, values in numbers.items()}
+            best = {name: float(one) for name, one in axes.numbers(entrant.leader).items()}
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
             if watch is not None:
                 watch(found)
@@ -140,14 +136,3 @@ def _range(name: str, given: Any) -> Uniform | LogUniform:
     if not isinstance(distribution, Uniform | LogUniform):
         raise ConfigError(f"search[{name!r}] must be Uniform or LogUniform, got {shown(given)}")
     return distribution
-
-
-def _check_names(make_controller: Callable[..., Controller], names: Collection[str]) -> None:
-    if not names:
-        raise ConfigError("search needs the name of at least one number")
-    parameters = inspect.signature(make_controller).parameters
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
-        return
-    for name in names:
-        if name not in parameters:
-            raise unknown_name("number in search", name, parameters)

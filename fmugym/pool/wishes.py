@@ -18,7 +18,7 @@ class Wishes:
     """What a caller wishes of a pool.
 
     Attributes:
-        backend: ``"native"``, ``"fmpy"`` (see ``fmpy_pool``), or ``"auto"`` (also ``"fmu"``):
+        backend: ``"native"``, ``"fmpy"`` (see ``FMPyInstance``), or ``"auto"`` (also ``"fmu"``):
             native if the extension was built. Or an object that replaces the FMU; see
             ``BackendPool``.
         reset_method: One of ``ResetMethod``; by default the fastest one that gives correct

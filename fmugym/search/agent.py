@@ -48,10 +48,9 @@ class Agent:
     @classmethod
     def constant(cls, name: str, value: float, ranges: Sequence[tuple[float, float]]) -> Self:
         """The agent that always gives all numbers of the action one value."""
-        middles = np.array([(low + high) / 2 for low, high in ranges])
-        halves = np.array([(high - low) / 2 for low, high in ranges])
-        form = Form("constant action", 0, len(ranges), blind=True)
-        return cls(name, None, form, (value - middles) / halves)
+        low, high = np.transpose(ranges)
+        weights = (2.0 * value - low - high) / (high - low)
+        return cls(name, None, Form("constant action", 0, len(ranges)), weights)
 
     def policy(self) -> Policy:
         """The controller, to be bound to an environment.

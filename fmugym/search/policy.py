@@ -46,12 +46,11 @@ class Form:
 
     Attributes:
         name: What it is called.
-        observed: The number of observations.
+        observed: The number of observations; 0 for a network that gives constants.
         acting: The number of outputs.
         hidden: The widths of the hidden layers, which end in a tanh.
         history: Whether the network also sees the last change of each observation, its leaky
             integral, and the last action.
-        blind: Whether the network sees nothing, so that it gives constants.
     """
 
     name: str
@@ -59,13 +58,10 @@ class Form:
     acting: int
     hidden: tuple[int, ...] = ()
     history: bool = False
-    blind: bool = False
 
     @property
     def features(self) -> int:
         """How many numbers the network sees."""
-        if self.blind:
-            return 0
         return 3 * self.observed + self.acting if self.history else self.observed
 
     @property
@@ -108,6 +104,12 @@ class Form:
         given = weights.reshape(count, self.acting) * math.sqrt(len(found) / count)
         found[: self.observed], found[-1] = given[:-1], given[-1]
         return found.ravel()
+
+    def constants(self, values: FloatArray) -> FloatArray:
+        """The weights of N linear policies that give constants of shape (N, outputs)."""
+        found = np.zeros((len(values), self.size))
+        found[:, -self.acting :] = values * math.sqrt(self.shapes[0][0])
+        return found
 
     def layers(self, weights: FloatArray) -> Iterator[FloatArray]:
         """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
@@ -292,8 +294,7 @@ class Policy(Controller):
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
         """What the network sees, and what it shall see of this step in the next one."""
         if not memory:
-            is_blind = self.form is not None and self.form.blind
-            return (observed[..., :0] if is_blind else observed,)
+            return (observed[..., : self.form.observed] if self.form else observed,)
         last, leaky, told = memory
         is_first = np.isnan(last)
         change = np.where(is_first, 0.0, observed - last)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from fmugym.baselines.tuning import Axes
 from fmugym.search.agent import Agent
 from fmugym.search.policy import Form, Policy, Scale
 
-__all__ = ["EPISODES", "POPULATION", "VALIDATION", "Search"]
+__all__ = ["FEW", "VALIDATION", "Search"]
 
 VALIDATION: Final = 500_000
 """Episodes of validation have seeds from here on, those of training have smaller ones."""
@@ -26,8 +26,15 @@ VALIDATION: Final = 500_000
 _FINAL: Final = VALIDATION + 1000
 """The first seed of the last validation, in which all candidates compete."""
 
-POPULATION: Final = 32
-EPISODES: Final = 4
+FEW: Final = 8
+"""The candidates of a round for a controller, which has few numbers."""
+
+_MANY: Final = 32
+"""Those of a round for policies."""
+
+_EPISODES: Final = 4
+"""Each candidate plays so many, or one if all are the same."""
+
 _VALIDATED: Final = 32
 _EVERY: Final = 5
 """Rounds from one validation to the next."""
@@ -37,11 +44,8 @@ _PART: Final = 5
 """The last validation has so many episodes for each agent, but in all no more than this part of the
 episodes of all rounds."""
 
-_TUNING: Final = 15
-"""Rounds for the numbers of a controller."""
-
-_TRYING: Final = 5
-"""Rounds for each guess, of which the best then has the others, and for a constant action."""
+_TUNING: Final = 30
+"""Rounds for the numbers of each controller, and for a constant action."""
 
 _LEAST: Final = 10
 _SHARE: Final = 10
@@ -58,13 +62,16 @@ _LARGEST: Final = 30.0
 _GROWTH: Final = 5.0
 """Steps become so many times as large as the first ones, at most."""
 
-_MANY: Final = 200
-"""More weights than this are searched without covariances."""
+_MANY_WEIGHTS: Final = 200
+"""More than these are searched without covariances."""
 
 _SIGMA: Final = 1.0
-_SIGMA_OF_NETWORKS: Final = 4.0
-_CORRECTION: Final = 0.4
-"""The first steps of the weights, and the part of them where they correct a controller."""
+_OF_NETWORKS: Final = 4.0
+_OF_CORRECTIONS: Final = 0.4
+"""The first steps of the weights, and how many times as large they are in networks, and where they
+correct a controller."""
+
+_MIDDLE: Final = Agent("", None)
 
 
 @dataclass(frozen=True)
@@ -78,9 +85,8 @@ class _Tuned:
         return Policy(self.tunable.make(**Axes(self.tunable.ranges).numbers(rows)))
 
     def agent(self, best: FloatArray) -> Agent:
-        numbers = Axes(self.tunable.ranges).numbers(best[None])
-        found = {name: float(values[0]) for name, values in numbers.items()}
-        return Agent(f"tuned {self.name}", self.tunable.text(found))
+        numbers = Axes(self.tunable.ranges).numbers(best)
+        return Agent(f"tuned {self.name}", self.tunable.text(numbers))
 
 
 @dataclass(frozen=True)
@@ -89,17 +95,16 @@ class _Policies:
 
     under: Agent
     form: Form
-    scale: Any
-    correlations: FloatArray | None = None
+    scale: Scale
 
     def __call__(self, rows: FloatArray) -> Controller:
         return self.agent(rows).policy()
 
     def agent(self, best: FloatArray) -> Agent:
-        name = (
-            self.form.name if self.under.text is None else f"{self.under.name} + {self.form.name}"
-        )
-        return Agent(name, self.under.text, self.form, best, self.scale)
+        count, name = self.form.features, self.form.name
+        parts = self.scale.mean[:count], self.scale.divisor[:count]
+        name = name if self.under.text is None else f"{self.under.name} + {name}"
+        return Agent(name, self.under.text, self.form, best, parts)
 
 
 class Search:
@@ -108,62 +113,61 @@ class Search:
     Args:
         sizes: How many numbers are observed, and how many choose an action.
         fixed: Controllers that are ready.
-        tunable: Those with numbers to be found, by name.
-        guesses: Such controllers that nobody has declared: only the best of them is tuned.
+        tunable: Those with numbers to be found, and their names.
         limits: What each cost may add up to in an episode.
-        population: The candidates of a round.
-        episodes: How many each plays; 1 if all episodes are the same.
+        is_same: Whether all episodes are the same.
         seed: Of the candidates and of the episodes.
 
     Attributes:
-        population, episodes, seed: As given.
+        episodes: How many each candidate plays in the first rounds.
+        seed: As given.
         rounds: How many there have been.
-        is_over: Whether nothing more is gained.
+        best: The best agent in validation, once there is one.
+        merit: Its merit.
         baseline: The best agent without a network, once it is known.
-        merit_of_baseline: Its merit in validation.
+        merit_of_baseline: Its merit.
     """
 
     def __init__(
         self,
         sizes: tuple[int, int],
         fixed: Sequence[Agent],
-        tunable: Mapping[str, Tunable],
-        guesses: Sequence[Tunable],
+        tunable: Sequence[tuple[str, Tunable]],
         limits: Sequence[float] = (),
-        population: int = POPULATION,
-        episodes: int = EPISODES,
+        is_same: bool = False,
         seed: int = 0,
     ) -> None:
         self._sizes, self._limits, self._fixed = sizes, tuple(limits), list(fixed)
-        self.population, self.episodes, self.seed = population, episodes, seed
+        self.episodes, self.seed = 1 if is_same else _EPISODES, seed
         self._rng = np.random.default_rng(seed)
-        self._tuned = [self._tuner(name, one) for name, one in tunable.items()]
-        self._guesses = [self._tuner("PI", one, _TRYING) for one in guesses]
-        if not (fixed or tunable or guesses):
-            form = Form("constant action", *sizes, blind=True)
-            make = _Policies(Agent("", None), form, (np.empty(0), np.empty(0)))
-            self._tuned = [replace(self._entrant(make), quota=_TRYING)]
+        self._tuned = [
+            Entrant(Axes(one.ranges).search(FEW, self._rng), _Tuned(name, one), self.episodes)
+            for name, one in tunable
+        ]
+        if not (fixed or tunable):
+            nothing = Scale(np.empty(0), np.empty(0), None)
+            make = _Policies(_MIDDLE, Form("constant action", 0, sizes[1]), nothing)
+            self._tuned = [self._entrant(make, FEW)]
         self._contenders: list[Entrant] = []
-        self._gone: list[Entrant] = []
+        self.best: Agent | None = None
         self.baseline: Agent | None = None
-        self.merit_of_baseline = NO_MERIT
-        self.rounds, self.is_over, self._played = 0, False, 0
+        self.merit = self.merit_of_baseline = NO_MERIT
+        self.rounds = 0
 
     @property
     def is_tuned(self) -> bool:
         """Whether the numbers of all controllers are found, so that policies come next."""
-        return not self._guesses and all(one.rounds >= one.quota for one in self._tuned)
+        return all(one.rounds >= _TUNING for one in self._tuned)
 
-    def known(self) -> list[tuple[Agent, Merit]]:
-        """The agents that were found until now, and their merits in validation."""
-        if self.baseline is not None:
-            first, entrants = (
-                [(self.baseline, self.merit_of_baseline)],
-                self._contenders + self._gone,
-            )
-        else:
-            first, entrants = [], self._tuned + self._guesses
-        return [*first, *((one.make.agent(one.best), one.merit) for one in entrants if one.gained)]
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more is gained."""
+        return self.baseline is not None and not self._active
+
+    @property
+    def _active(self) -> list[Entrant]:
+        """The classes of policies that have not gone."""
+        return [one for one in self._contenders if one.starts < _STARTS]
 
     def others(self) -> list[Agent]:
         """The controllers that were declared, and have numbers now."""
@@ -173,40 +177,27 @@ class Search:
 
     def advance(self, arena: Arena) -> None:
         """Go on by one round, or by the two that tell what observations are like."""
-        waiting = self._waiting()
-        if waiting is not None:
-            self._play(waiting, arena)
+        if not self.is_tuned:
+            self._play(min(self._tuned, key=lambda one: one.rounds), arena)
         elif self.baseline is None:
-            self.baseline, self.merit_of_baseline = self._best_of(
-                arena, self.others(), self._validation
-            )
+            self.best, self.merit = self._best_of(arena, self.others(), self._validation)
+            self.baseline, self.merit_of_baseline = self.best, self.merit
             self._enter(arena, self.baseline)
         else:
             leaders = self._leaders()
             self._play(self._next(leaders), arena)
             self._let_go(leaders)
 
-    def _waiting(self) -> Entrant | None:
-        """The controller that is to be tuned next."""
-        for one in [*self._tuned, *self._guesses]:
-            if one.rounds < one.quota:
-                return one
-        if self._guesses:
-            self._tuned.append(max(self._guesses, key=lambda one: one.merit))
-            self._tuned[-1].quota, self._guesses = _TUNING, []
-            return self._waiting()
-        return None
-
     def _leaders(self) -> list[Entrant]:
         """The best two; one that is not better than the baseline leads only if none is."""
-        ranked = sorted(self._contenders, key=lambda one: one.merit)
+        ranked = sorted(self._active, key=lambda one: one.merit)
         return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[-2:]
 
     def _next(self, leaders: Sequence[Entrant]) -> Entrant:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
         share = max(_LEAST, self.rounds // _SHARE)
-        behind = [one for one in self._contenders if one.rounds < share]
-        return behind[0] if behind else min(leaders, key=lambda one: one.rounds)
+        behind = [one for one in self._active if one.rounds < share]
+        return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
 
     def _let_go(self, leaders: Sequence[Entrant]) -> None:
         """Give a leader that gains nothing more episodes, and let it go if that is no use."""
@@ -220,22 +211,19 @@ class Search:
                 one.cma = self._cma(one.make, one.best)
             one.gained = one.rounds
             if one.then is not None:
-                start = one.then.form.extended(one.best)
-                self._contenders.append(
-                    Entrant(self._cma(one.then, start), one.then, self.episodes)
-                )
+                longer = self._entrant(one.then)
+                longer.cma.mean = one.then.form.extended(one.best)
+                self._contenders.append(longer)
                 one.then = None
-            if one.starts == _STARTS:
-                self._contenders.remove(one)
-                self._gone.append(one)
-        self.is_over = not self._contenders
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
-        self._played += self.population * entrant.episodes
         entrant.play(arena, self._training(entrant.episodes), self._limits)
         self.rounds += 1
+        entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
             entrant.validate(arena, self._validation, self._limits)
+            if entrant.merit > self.merit:
+                self.best, self.merit = entrant.make.agent(entrant.best), entrant.merit
 
     def _training(self, count: int) -> list[int]:
         return [int(seed) for seed in self._rng.integers(VALIDATION, size=count)]
@@ -246,53 +234,42 @@ class Search:
 
     # Who takes part.
 
-    def _tuner(self, name: str, tunable: Tunable, quota: int = _TUNING) -> Entrant:
-        cma = Axes(tunable.ranges).search(self.population, self._rng)
-        return Entrant(cma, _Tuned(name, tunable), self.episodes, quota)
-
-    def _entrant(self, make: _Policies) -> Entrant:
-        cma = self._cma(make, np.zeros(make.form.size))
+    def _entrant(self, make: _Policies, population: int = _MANY) -> Entrant:
+        cma = self._cma(make, np.zeros(make.form.size), population)
         return Entrant(cma, make, self.episodes)
 
-    def _cma(self, make: _Policies, start: FloatArray) -> CMA:
-        sigma = _SIGMA_OF_NETWORKS if make.form.hidden else _SIGMA
-        sigma *= 1.0 if make.under.text is None else _CORRECTION
+    def _cma(self, make: _Policies, start: FloatArray, population: int = _MANY) -> CMA:
+        is_correction = make.under.text is not None
+        sigma = _SIGMA * (_OF_NETWORKS if make.form.hidden else 1.0)
+        sigma *= _OF_CORRECTIONS if is_correction else 1.0
         alike = np.ones(len(start))
-        if len(start) <= _MANY:
-            alike = make.form.covariance(make.correlations)
+        if len(start) <= _MANY_WEIGHTS:
+            alike = make.form.covariance(make.scale.correlations if is_correction else None)
         limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
-        return CMA(start, sigma, self.population, self._rng, alike, **limits)
+        return CMA(start, sigma, population, self._rng, alike, **limits)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
         linear = Form("linear", *self._sizes)
         history = Form("linear with history", *self._sizes, history=True)
         network = Form("network", *self._sizes, hidden=(16,))
-        middle = Agent("", None)
-        scale = self._scale(arena, history, baseline, middle)
-
-        def make(under: Agent, form: Form, correlations: FloatArray | None = None) -> _Policies:
-            parts = scale.mean[: form.features], scale.divisor[: form.features]
-            return _Policies(under, form, parts, correlations)
-
+        scale = self._scale(arena, history, baseline, _MIDDLE)
         if baseline.text is None:
             alone = [linear, history, network]
         else:  # only these observations are like those that were seen
             alone = [linear, network]
-            first = self._entrant(make(baseline, linear, scale.correlations))
-            first.then = make(baseline, history, scale.correlations)
+            first = self._entrant(_Policies(baseline, linear, scale))
+            first.then = _Policies(baseline, history, scale)
             self._contenders.append(first)
-        self._contenders += [self._entrant(make(middle, form)) for form in alone]
+        self._contenders += [self._entrant(_Policies(_MIDDLE, form, scale)) for form in alone]
 
     def _scale(self, arena: Arena, history: Form, *agents: Agent) -> Scale:
         """What observations are like while each candidate adds another constant."""
-        count, acting = history.features, history.acting
+        count = history.features
         moments: FloatArray = np.zeros(())
         for agent in agents:
-            rows = np.zeros((self.population, history.size))
-            rows[:, -acting:] = self._rng.uniform(-1, 1, (self.population, acting))
-            rows *= np.sqrt(history.shapes[0][0])
-            make = _Policies(agent, history, (np.zeros(count), np.ones(count)))
+            rows = history.constants(self._rng.uniform(-1, 1, (_MANY, history.acting)))
+            make = _Policies(agent, history, Scale(np.zeros(count), np.ones(count), None))
             seeds = self._training(self.episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
             moments = moments + outcome.watched.sum(axis=(0, 1))
@@ -317,12 +294,13 @@ class Search:
         validations.
         """
         if self.baseline is None:
-            agents, searches = list(self._fixed), [*self._tuned, *self._guesses]
+            agents, searches = list(self._fixed), self._tuned
         else:
-            agents, searches = [self.baseline], [*self._contenders, *self._gone]
-            searches = sorted(searches, key=lambda one: one.merit)[-2:]
+            agents = [self.baseline]
+            searches = sorted(self._contenders, key=lambda one: one.merit)[-2:]
         agents += [one.make.agent(numbers) for one in searches for numbers in one.offers()]
-        count = min(_LAST, max(self.episodes, self._played // (_PART * max(1, len(agents)))))
+        most = self.rounds * FEW * self.episodes // (_PART * max(1, len(agents)))
+        count = min(_LAST, max(self.episodes, most))
         return agents, range(_FINAL, _FINAL + (count if self.episodes > 1 else 1))
 
     def winner(self, arena: Arena) -> Agent | None:

@@ -12,7 +12,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
-from fmugym.baselines.tuning import LEAST_CANDIDATES
 from fmugym.checks import check_number
 from fmugym.episodes.evaluation import Score, table
 from fmugym.episodes.output_files import title_of
@@ -61,9 +60,6 @@ def add_train(commands: Commands) -> None:
     command.add_argument("--minutes", type=float, help="of the search, without its test; default 1")
     command.add_argument(
         "--rounds", type=int, help="that the search ends with: repeats an earlier one"
-    )
-    command.add_argument(
-        "--candidates", type=int, metavar="N", help="of a round; default 32, 8 for slow FMUs"
     )
     command.add_argument("--steps", type=int, help="of all environments together, at most")
     command.add_argument("--envs", type=int, help="that step together; default 512, or 8 with PPO")
@@ -121,9 +117,9 @@ _OF_ALGORITHMS: Final = (
     *("arguments", "normalize", "tune", "tune_steps", "record", "record_env"),
     *("record_every", "record_format", "track"),
 )
-_OF_SEARCHES: Final = ("minutes", "rounds", "candidates")
+_OF_SEARCHES: Final = ("minutes", "rounds")
 _OTHERWISE: Final = {"arguments": "KEY=VALUE", "normalize": "--no-normalize"}
-_COUNTS: Final = ("rounds", "candidates", "steps", "envs", "episodes")
+_COUNTS: Final = ("rounds", "steps", "envs", "episodes")
 _BETWEEN_LINES: Final = 10.0
 
 
@@ -133,7 +129,7 @@ def _train(arguments: argparse.Namespace) -> None:
     if is_search:
         _refuse(arguments, _OF_ALGORITHMS, "is for trainings with --algorithm, such as PPO")
         if arguments.resume:
-            _refuse(arguments, ("seed", "candidates"), "cannot be changed by --resume")
+            _refuse(arguments, ("seed",), "cannot be changed by --resume")
     else:
         _refuse(arguments, _OF_SEARCHES, "is for searches, without --algorithm")
     try:
@@ -154,8 +150,6 @@ def _search(arguments: argparse.Namespace) -> None:
     given = {name: getattr(arguments, name) for name in _COUNTS}
     counts = {name: value for name, value in given.items() if value is not None}
     check_numbers(arguments, *counts)
-    if arguments.candidates is not None:
-        check_number("--candidates", arguments.candidates, LEAST_CANDIDATES)
     if arguments.minutes is not None:
         check_number("--minutes", arguments.minutes, positive=True)
     task, master = arguments.task, arguments.master
@@ -185,9 +179,7 @@ def _search(arguments: argparse.Namespace) -> None:
         say_json({"task": arguments.task, "output": arguments.output, **facts})
     else:
         say(verdict.text())
-        options = (
-            f"; --rounds {facts['rounds']} --candidates {facts['candidates']} repeats the search"
-        )
+        options = f"; --rounds {facts['rounds']} repeats the search"
         tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
 
 

@@ -17,12 +17,7 @@ enum mode { INSTANTIATED, CONFIGURING, INITIALIZING, RUNNING };
 
 static const double LONGEST_STEP = 1e-3;
 
-typedef void Update(void *environment, double time, bool set, bool get, bool finished, bool early,
-                    bool *early_requested, double *early_time);
-
 typedef struct {
-    Update *update; /* called after each small step if anything is wanted there, otherwise NULL */
-    void *environment;
     bool exchange;
     enum mode mode;
     double time;
@@ -129,12 +124,8 @@ Model *fmi3InstantiateModelExchange(const char *name, const char *token, const c
 Model *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *resources,
                                    bool visible, bool logging, bool event_mode, bool early_return,
                                    const unsigned *intermediate, size_t intermediate_count,
-                                   void *environment, void *logger, Update *intermediate_update) {
-    Model *me = make(false);
-
-    me->update = intermediate_count > 0 ? intermediate_update : NULL;
-    me->environment = environment;
-    return me;
+                                   void *environment, void *logger, void *intermediate_update) {
+    return make(false);
 }
 
 void fmi3FreeInstance(Model *me) {
@@ -181,13 +172,7 @@ int fmi3DoStep(Model *me, double time, double step, bool no_set_state, bool *eve
     const int parts = (int)(step / LONGEST_STEP) + 1;
 
     for (int i = 0; i < parts; i++) {
-        bool requested = false;
-        double wanted = 0.0;
         small_step(me, step / parts);
-        if (me->update != NULL) {
-            me->update(me->environment, time + (i + 1) * (step / parts), false, true, true, false,
-                       &requested, &wanted);
-        }
     }
     *event = *terminate = *early = false;
     *last = me->time = time + step;

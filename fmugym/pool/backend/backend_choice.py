@@ -8,9 +8,11 @@ from typing import Final
 from fmugym.archive.fmu import FMU
 from fmugym.errors import ConfigError, FMULoadError, unknown_name
 from fmugym.pool.backend.backend_pool import BackendPool
-from fmugym.pool.backend.by_fmpy import fmpy_pool
+from fmugym.pool.backend.by_fmpy import FMPyInstance
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
+from fmugym.pool.licences import licence_errors
+from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.wishes import Wishes
 from fmugym.retired import warn_of_gone
@@ -39,8 +41,7 @@ def pool_of_backend(
     if isinstance(wishes.backend, str):
         if not _steps_by_fmpy(wishes.backend):
             return None
-        method, isolation = wishes.reset_method, wishes.isolation
-        return fmpy_pool(fmu, spec, num_instances, log, reset_method=method, isolation=isolation)
+        return _fmpy_pool(fmu, spec, num_instances, log, wishes)
     if spec.fault_retries:
         fmu.close()
         raise ConfigError("config key 'fault_retries': a backend's steps cannot be repeated")
@@ -58,3 +59,44 @@ def _steps_by_fmpy(backend: str) -> bool:
         warn_of_slow_path()
         return True
     return backend in ("fmpy", "python")
+
+
+@licence_errors()
+def _fmpy_pool(
+    fmu: FMU, spec: PoolSpec, num_instances: int, log: logging.Logger, wishes: Wishes
+) -> BackendPool:
+    """Make a pool of instances that FMPy steps, one after another, in this process.
+
+    Each of them has a copy of the FMU's library.
+    """
+    refused = [name for name, is_needed in _beyond_fmpy(fmu, spec, wishes).items() if is_needed]
+    if refused:
+        fmu.close()
+        raise ConfigError(
+            "FMPy steps FMUs for co-simulation with scalar variables here. "
+            f"{fmu.path.name} needs the C extension (backend='native') for: {', '.join(refused)}"
+        )
+
+    def instances(count: int) -> list[FMPyInstance]:
+        fmu.prepare_libraries()
+        libraries = copy_libraries(fmu, fmu.extract(), count)
+        return [FMPyInstance(fmu, spec, log, library) for library in libraries]
+
+    return BackendPool(fmu, spec, num_instances, instances, is_real=False)
+
+
+def _beyond_fmpy(fmu: FMU, spec: PoolSpec, wishes: Wishes) -> dict[str, bool]:
+    """What only the engine can do, and whether it is needed."""
+    about, variables = fmu.description, (*spec.inputs, *spec.outputs)
+    return {
+        "a system": bool(fmu.parts),
+        "model exchange": about.interface != "co_simulation",
+        "clocks and event mode": about.uses_event_mode,
+        "libraries for Windows": fmu.in_wine,
+        "Strings": any(variable.kind == "string" for variable in variables),
+        "arrays": bool(about.structure) or any(not v.is_scalar for v in variables),
+        "samplings": bool(spec.samplings),
+        "fault_retries": bool(spec.fault_retries),
+        "reset_method": wishes.reset_method is not None,
+        "isolation='process'": wishes.isolation == "process",
+    }

@@ -16,17 +16,14 @@ from fmpy.fmi3 import FMU3Slave
 
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
-from fmugym.errors import ConfigError, FMULoadError, SimulationError
+from fmugym.errors import FMULoadError, SimulationError
 from fmugym.fmi.status import Status, failed_call, sane
-from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.messages import Messages, fmi1_callbacks, fmi2_callbacks
 from fmugym.pool.backend.rig import FaultError
-from fmugym.pool.licences import licence_errors
-from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.spec import START_TIME, PoolSpec
 from fmugym.signals import ordinary
 
-__all__ = ["FMPyInstance", "fmpy_pool"]
+__all__ = ["FMPyInstance"]
 
 _SLAVES: Final = {1: FMU1Slave, 2: FMU2Slave, 3: FMU3Slave}
 _MISDECLARED: Final = ("fmi1InitializeSlave", "fmi1DoStep")
@@ -210,62 +207,3 @@ class FMPyInstance:
         kind = of_enumerations if variable.kind == "enumeration" else variable.type
         method: Callable[..., Any] = getattr(self._slave, f"{verb}{kind}")
         return method
-
-
-@licence_errors()
-def fmpy_pool(
-    fmu: FMU,
-    spec: PoolSpec,
-    num_instances: int,
-    log: logging.Logger,
-    *,
-    reset_method: str | None = None,
-    isolation: str | None = None,
-) -> BackendPool:
-    """Make a pool of instances that FMPy steps, one after another, in this process.
-
-    Each of them has a copy of the FMU's library.
-
-    Args:
-        fmu: The FMU; closed with the pool.
-        spec: What to do at each reset and step.
-        num_instances: N.
-        log: Gets the FMU's messages.
-        reset_method: What the user asks for; refused, because each episode has a new instance.
-        isolation: What the user asks for.
-
-    Raises:
-        ConfigError: If the FMU or the user needs what FMPy's classes are not used for here.
-        FMULoadError: If the FMU cannot be loaded or instantiated.
-    """
-    needs = _needs(fmu, spec) | {"reset_method": reset_method is not None}
-    needs |= {"isolation='process'": isolation == "process"}
-    refused = [name for name, is_needed in needs.items() if is_needed]
-    if refused:
-        fmu.close()
-        raise ConfigError(
-            "FMPy steps FMUs for co-simulation with scalar variables here. "
-            f"{fmu.path.name} needs the C extension (backend='native') for: {', '.join(refused)}"
-        )
-
-    def instances(count: int) -> list[FMPyInstance]:
-        fmu.prepare_libraries()
-        libraries = copy_libraries(fmu, fmu.extract(), count)
-        return [FMPyInstance(fmu, spec, log, library) for library in libraries]
-
-    return BackendPool(fmu, spec, num_instances, instances, is_real=False)
-
-
-def _needs(fmu: FMU, spec: PoolSpec) -> dict[str, bool]:
-    """What only the engine can do, and whether it is needed."""
-    about, variables = fmu.description, (*spec.inputs, *spec.outputs)
-    return {
-        "a system": bool(fmu.parts),
-        "model exchange": about.interface != "co_simulation",
-        "clocks and event mode": about.uses_event_mode,
-        "libraries for Windows": fmu.in_wine,
-        "Strings": any(variable.kind == "string" for variable in variables),
-        "arrays": bool(about.structure) or any(not v.is_scalar for v in variables),
-        "samplings": bool(spec.samplings),
-        "fault_retries": bool(spec.fault_retries),
-    }

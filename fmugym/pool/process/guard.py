@@ -26,19 +26,24 @@ import signal
 import socket
 import struct
 import sys
+import time
 from collections.abc import Sequence
 from typing import Any, Final, NoReturn
 
 if sys.platform != "win32":
     import select
 
-__all__ = ["ANSWER", "SIZE", "main"]
+__all__ = ["ANSWER", "LONGEST_START", "SIZE", "main"]
 
 ANSWER: Final = struct.Struct("<q")
 """First the process number or minus an error number, then the exit status, negative for signals."""
 
 SIZE: Final = struct.Struct("<q")
 """The size of the rest of a request: that of its marshalled order."""
+
+LONGEST_START: Final = 10.0
+"""How long Wine may take until its server knows a worker, in s. If the worker is killed before, the
+server stays for ever. A worker whose channel is closed ends by itself."""
 
 _DESCRIPTORS: Final = 5
 _MOST_DESCRIPTORS: Final = 4096
@@ -47,6 +52,9 @@ _IGNORED_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGTTIN", "SIGTTOU")
 stop a process in the background that uses the terminal."""
 
 _STREAMS: Final = (1, 2)
+
+_LOOK: Final = 100
+"""How long to wait before another look at the time, in ms."""
 
 
 def main(extension: str, descriptor: int, parent: int) -> NoReturn:
@@ -78,8 +86,13 @@ def _load(path: str) -> Any:
 
 
 class _Worker:
-    def __init__(self, pid: int, lifeline: socket.socket) -> None:
+    def __init__(self, pid: int, lifeline: socket.socket, longest_start: float) -> None:
         self.pid, self.lifeline = pid, lifeline
+        self._starts_until = time.monotonic() + longest_start
+
+    def may_be_starting(self) -> bool:
+        """Whether Wine may still be on its way to the program."""
+        return time.monotonic() < self._starts_until
 
     def kill(self) -> None:
         _kill_group(self.pid)
@@ -150,7 +163,8 @@ class _Guard:
         if pid < 0:
             lifeline.close()
             return
-        self._workers[lifeline.fileno()] = _Worker(pid, lifeline)
+        longest_start = LONGEST_START if order["command"] else 0.0
+        self._workers[lifeline.fileno()] = _Worker(pid, lifeline, longest_start)
         self._folders = {order["folder"], *filter(os.path.isdir, self._folders)}
         self._poll.register(lifeline, select.POLLIN)
 
@@ -190,7 +204,17 @@ class _Guard:
     def _kill(self, descriptor: int) -> None:
         """Kill a worker that the parent has given up; its end is reported like any other."""
         self._poll.unregister(descriptor)
-        self._workers[descriptor].kill()
+        worker = self._workers[descriptor]
+        if not (worker.may_be_starting() and self._parent_ends()):
+            worker.kill()
+
+    def _parent_ends(self) -> bool:
+        """Whether the parent ends right now: its lifelines are cut a moment before."""
+        if self._parent < 0:
+            return False
+        poll = select.poll()
+        poll.register(self._parent, select.POLLIN)
+        return bool(poll.poll(_LOOK))
 
     def _bury(self) -> None:
         """Report the exit status of each worker that has ended."""
@@ -212,10 +236,21 @@ class _Guard:
 
     def clean_up(self) -> None:
         """End all workers and remove their folders."""
-        for worker in self._workers.values():
-            worker.kill()
+        ended = select.poll()
+        ended.register(self._ended, select.POLLIN)
+        while self._kill_those_that_run():
+            ended.poll(_LOOK)
+            self._bury()
         for folder in self._folders:
             _remove(folder)
+
+    def _kill_those_that_run(self) -> bool:
+        """Returns whether there are others."""
+        starting = [worker.may_be_starting() for worker in self._workers.values()]
+        for worker, is_starting in zip(self._workers.values(), starting, strict=True):
+            if not is_starting:
+                worker.kill()
+        return any(starting)
 
 
 def _received(lifeline: socket.socket) -> Any:

@@ -19,6 +19,7 @@ from fmugym.fmi.words import as_messages, quoted
 from fmugym.pool.callbacks import Receiver
 from fmugym.pool.form import Writer
 from fmugym.pool.process.channel import Channel, LateError
+from fmugym.pool.process.guard import LONGEST_START
 from fmugym.pool.process.last_words import describe_exit, lines_of_echo
 from fmugym.pool.process.launcher import Process, launch
 from fmugym.pool.process.output import Output
@@ -255,10 +256,19 @@ class Supervisor:
         """End the process if there is one, and free its resources."""
         if self._process is None:
             return
-        self._process.kill()
-        self._process.exit_status(_LONGEST_KILL)
+        if not self._ends_by_itself(self._process):
+            self._process.kill()
+            self._process.exit_status(_LONGEST_KILL)
         self._output.drain()
         self._forget_process(reason)
+
+    def _ends_by_itself(self, process: Process) -> bool:
+        """Let a worker end that Wine may still be starting; see ``LONGEST_START``."""
+        time_left = self._asked + LONGEST_START - time.monotonic()
+        if self._setup.wine is None or not self._opening or time_left <= 0.0:
+            return False
+        self._channel.close()
+        return process.exit_status(time_left) is not None
 
     def _forget_process(self, reason: str) -> None:
         self.forget()
