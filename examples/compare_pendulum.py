@@ -1,4 +1,4 @@
-"""Compare random torques, PID, LQR, a trained agent and thinking ahead on one pendulum.
+"""Compare random torques, PID, LQR, a trained agent and MPC on one pendulum.
 
     python examples/compare_pendulum.py
 
@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from lqr_pendulum import regulator, start
 from matplotlib.figure import Figure
-from mpc_pendulum import PERIOD, TORQUE, Array, PathIntegral, SwingUp
+from mpc_pendulum import PERIOD, TORQUE, Array, SwingUp, planner
 
 import fmugym
 from fmugym.baselines import PID, Random
@@ -79,17 +79,6 @@ def train(generations: int, seed: int = 0) -> tuple[Array, list[float]]:
     return mean, returns
 
 
-def ahead(candidates: int, envs: fmugym.FMUVectorEnv) -> Act:
-    """Model predictive control, with a plan of its own for each environment."""
-    plans = [PathIntegral(candidates) for _ in STARTS]
-
-    def act(seen: Array) -> Array:
-        states = envs.save_state()
-        return np.array([p.decide(s)[0] for p, s in zip(plans, states, strict=True)])
-
-    return act
-
-
 def play(make: Callable[[fmugym.FMUVectorEnv], Act]) -> Score:
     """Play all episodes with a controller, which is made for the environments."""
     envs, rows = fmugym.FMUVectorEnv(SwingUp, len(STARTS)), []
@@ -132,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "PID": lambda envs: PID("theta", 0.0, kp=8.0, ti=10.0, td=0.25).bind(envs).act,
         "LQR": lambda envs: regulator(envs).act,
         "agent": lambda envs: partial(policy, weights),
-        "MPC": partial(ahead, options.candidates),
+        "MPC": lambda envs: planner(options.candidates).bind(envs).act,
     }
     scores = {name: play(make) for name, make in controllers.items()}
     print("controller  upright at the end, from above  from below  mean return  ms a decision")

@@ -36,7 +36,7 @@ def regulator(envs: fmugym.FMUVectorEnv) -> LQR:
 
 def start(envs: fmugym.FMUVectorEnv, angles: Array) -> Array:
     """Begin at angles from upright, in degrees; returns the observations."""
-    envs.set_attr("q_0", np.pi + np.radians(angles))
+    envs.set_attr("theta_0", np.radians(angles))
     return envs.reset(seed=0)[0]
 
 

@@ -1,13 +1,11 @@
-"""Swing a pendulum up and hold it upright by thinking ahead, 20 times a second.
+"""Swing a pendulum up and hold it upright by model predictive control, 20 times a second.
 
     python examples/mpc_pendulum.py
 
-Nothing is learnt. In each step of 50 ms, the controller tries 2,048 sequences of 30 torques on
-copies of the FMU and averages them, the better ones with more weight: model predictive path
-integral control (G. Williams, A. Aldrich, E. Theodorou, "Model Predictive Path Integral Control",
-Journal of Guidance, Control, and Dynamics 40(2), 2017). The plant is a rod of 1 kg and 1 m, whose
-largest torque of 2 N m is too weak to lift it directly. The FMU solves it by the classical
-Runge-Kutta method of order 4 with internal steps of 25 ms, for the controller as for the plant.
+Nothing is learnt. In each step of 50 ms, the controller tries sequences of 30 torques on copies of
+the FMU. The plant is a rod of 1 kg and 1 m, whose largest torque of 2 N m is too weak to lift it
+directly. The FMU solves it by the classical Runge-Kutta method of order 4 with internal steps of
+25 ms, for the controller as for the plant.
 """
 
 from __future__ import annotations
@@ -23,6 +21,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 import fmugym
+from fmugym.baselines import MPC
 
 Array = npt.NDArray[np.float64]
 
@@ -40,7 +39,7 @@ class SwingUp(fmugym.FMI2CSEnv):
         config = {
             "model_input_names": "tau",
             "model_output_names": ["theta", "theta_dot"],  # theta is 0 upright
-            "model_parameters": PLANT | SOLVER | {"q_0": 0.0},  # it starts hanging
+            "model_parameters": PLANT | SOLVER | {"theta_0": -np.pi},  # hanging
             "bounds": {"tau": (-TORQUE, TORQUE)},
             "time_step": PERIOD,
         }
@@ -54,52 +53,33 @@ class SwingUp(fmugym.FMI2CSEnv):
         return -(4 * (1 - np.cos(theta)) + 0.1 * theta_dot**2 + 0.001 * self.inputs[0] ** 2)
 
 
-class PathIntegral:
-    """The controller: how many sequences of torques it tries in a decision, and how long ones."""
-
-    temperature = 1.0  # how much worse than the best a sequence may be and still count
-
-    def __init__(self, candidates: int = 2048, horizon: int = 30, model: Any = SwingUp) -> None:
-        self.envs = fmugym.FMUVectorEnv(model, candidates, hooks="compiled")
-        self._limit = self.envs.single_action_space.high[0]
-        self._plan = np.zeros((horizon, 1))
-        self._rng = np.random.default_rng(0)
-
-    def decide(self, snapshot: fmugym.Snapshot) -> tuple[npt.NDArray[np.float32], Array]:
-        """Return the next torque, and the angles that the 30 best candidates lead to."""
-        shape = (self.envs.num_envs, *self._plan.shape)
-        noise = self._rng.normal(0, 0.75 * self._limit, shape)
-        noise[0] = 0.0  # the plan itself is a candidate
-        tried = np.clip(self._plan + noise, -self._limit, self._limit).astype(np.float32)
-        found = self.envs.rollout(snapshot, tried)
-        returns = found.rewards.sum(axis=1)
-        weights = np.exp((returns - returns.max()) / self.temperature)
-        plan = np.tensordot(weights / weights.sum(), tried, axes=1)
-        self._plan = np.append(plan[1:], plan[-1:], axis=0)
-        best = np.argsort(returns)[-30:]
-        return plan[0].astype(np.float32), found.observations[best, :, 0]
-
-
 class Run(NamedTuple):
-    """A row for each step: angle in rad, torque in N m, seconds of the decision, angles ahead."""
+    """A row for each step: angle in rad, torque in N m, seconds of the decision."""
 
     angles: Array
     torques: Array
     seconds: Array
-    ahead: Array
 
 
-def run(controller: PathIntegral, steps: int) -> Run:
+def planner(candidates: int, **options: Any) -> MPC:
+    """The controller, which looks 1.5 s ahead; it begins each decision in the observed state."""
+    states = {"theta": "theta_0", "theta_dot": "theta_dot_0"}
+    return MPC(1.5, candidates, states=states, correction=1.0, **options)
+
+
+def run(controller: MPC, steps: int) -> Run:
     """Let the controller swing the pendulum up."""
     rows = []
     with SwingUp() as env:
-        env.reset(seed=0)
+        controller.bind(env)
+        state, _ = env.reset(seed=0)
         for _ in range(steps):
-            angle, begin = env.out["theta"], time.perf_counter()
-            action, ahead = controller.decide(env.save_state())
-            rows.append((angle, float(action[0]), time.perf_counter() - begin, ahead))
-            env.step(action)
-    return Run(*map(np.array, zip(*rows, strict=True)))
+            begin = time.perf_counter()
+            torque = controller.act(state)
+            rows.append((state[0], torque[0], time.perf_counter() - begin))
+            state = env.step(torque)[0]
+        controller.close()
+    return Run(*np.array(rows).T)
 
 
 def seconds_upright(found: Run) -> float:
@@ -109,16 +89,12 @@ def seconds_upright(found: Run) -> float:
 
 
 def plot(found: Run) -> Figure:
-    """Draw what happened, and what the controller expected every half second."""
+    """Draw what happened."""
     figure = Figure(figsize=(7, 6), layout="constrained")
     angle, torque, clock = figure.subplots(3, 1, height_ratios=[3, 1, 1])
     seconds = np.arange(len(found.angles)) * PERIOD
-    for index in range(0, len(seconds), 10):
-        later = seconds[index] + PERIOD * np.arange(1, found.ahead.shape[2] + 1)
-        angle.plot(later, np.degrees(found.ahead[index]).T, color="tab:orange", alpha=0.1, lw=0.7)
-    angle.plot(seconds, np.degrees(found.angles), color="tab:blue", lw=2)
+    angle.plot(seconds, np.degrees(found.angles))
     angle.set(ylabel="angle from upright [degrees]", xlim=(0, seconds[-1]))
-    angle.set_title("The pendulum (blue), and the best futures tried every 0.5 s (orange)")
     torque.step(seconds, found.torques, where="post")
     torque.set(ylabel="torque [N m]", xlabel="time [s]", xlim=(0, seconds[-1]))
     clock.hist(1e3 * found.seconds, bins=40, color="0.5")
@@ -130,11 +106,11 @@ def plot(found: Run) -> Figure:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Swing up, and plot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--candidates", type=int, default=2048, metavar="N")
+    parser.add_argument("--candidates", type=int, default=512, metavar="N")
     parser.add_argument("--steps", type=int, default=200, metavar="N", help="of 50 ms each")
     parser.add_argument("--output", type=Path, default=Path("mpc_pendulum.png"))
     options = parser.parse_args(arguments)
-    found = run(PathIntegral(options.candidates), options.steps)
+    found = run(planner(options.candidates), options.steps)
     decision, late = 1e3 * np.median(found.seconds), np.mean(found.seconds > PERIOD)
     print(f"upright in the last {seconds_upright(found):.1f} s of {options.steps * PERIOD:g} s")
     print(f"Runge-Kutta of order 4 by {1e3 * SOLVER['max_step']:g} ms; ", end="")

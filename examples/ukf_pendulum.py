@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from mpc_pendulum import PERIOD, TORQUE, Array, PathIntegral, SwingUp
+from mpc_pendulum import PERIOD, TORQUE, Array, SwingUp, planner
 
 import fmugym
 
@@ -48,8 +48,8 @@ class Filter:
         """Go on by one step."""
         root = np.linalg.cholesky((2 + CENTRE) * self.covariance).T
         points = self.mean + np.concatenate([np.zeros((1, 2)), root, -root])
-        self.envs.set_attr("q_0", points[:, 0] + np.pi)
-        self.envs.set_attr("q_dot_0", points[:, 1])
+        self.envs.set_attr("theta_0", points[:, 0])
+        self.envs.set_attr("theta_dot_0", points[:, 1])
         self.envs.reset()
         ahead = self.envs.rollout(None, np.tile(torque, (5, 1, 1))).observations[:, 0]
         self.mean = self._weights @ ahead
@@ -91,22 +91,20 @@ class Run(NamedTuple):
 
 def run(estimator: Filter | Differences, steps: int, candidates: int, seed: int = 0) -> Run:
     """Let the controller act on estimates."""
-    controller, model, rows = PathIntegral(candidates), SwingUp(), []
+    controller, rows = planner(candidates), []
     rng = np.random.default_rng(seed)
     with SwingUp() as plant:
+        controller.bind(plant)
         state, _ = plant.reset(seed=seed)
         for _ in range(steps):
             measured = state[0] + rng.normal(0, NOISE)
             estimator.correct(measured)
             rows.append((state, estimator.mean, measured))
-            start = {"q_0": estimator.mean[0] + np.pi, "q_dot_0": estimator.mean[1]}
-            model.reset(options={"model_parameters": start})
-            torque, _ = controller.decide(model.save_state())
+            torque = controller.act(estimator.mean)
             disturbed = torque + rng.normal(0, DISTURBANCE)
             state = plant.step(np.clip(disturbed, -TORQUE, TORQUE).astype(np.float32))[0]
             estimator.predict(torque)
-    controller.envs.close()
-    model.close()
+        controller.close()
     return Run(*map(np.array, zip(*rows, strict=True)))
 
 

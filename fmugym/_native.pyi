@@ -273,6 +273,7 @@ class Pool:
         rewards: Array,
         terminated: Array,
         truncated: Array,
+        offsets: Array,
         /,
     ) -> int:
         """Do many steps with all that was taken over; see ``NativePool.roll_out``."""

@@ -85,6 +85,7 @@ typedef struct {
     const Play *play;
     const char *actions;
     bool has_inputs; /* whether they are made already */
+    const double *offsets; /* what is added to the outputs of each instance, or NULL */
     double *rewards;
     uint8_t *terminated, *truncated;
     char *const *seen; /* the arrays of the observations and infos that the judgement stores */

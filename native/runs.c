@@ -397,12 +397,21 @@ static size_t hand_out(Task *task, size_t begin, size_t count, Scratch scratch,
     return troubled;
 }
 
+static void add_offsets(const Turn *turn, size_t width, size_t count, double *outputs) {
+    for (size_t j = 0; turn != NULL && turn->offsets != NULL && j < count; j++) {
+        for (size_t i = 0; i < width; i++) {
+            outputs[j * width + i] += turn->offsets[i];
+        }
+    }
+}
+
 /* Steps or resets a run, and leaves the outputs in the scratch memory. */
 static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
     records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = are_finite(scratch.inputs, count * task->pool->settings.inputs->count);
     const size_t troubled = do_each(task, begin, count, scratch);
+    add_offsets(task->call->turn, task->pool->settings.outputs->count, count, scratch.outputs);
     return troubled + hand_out(task, begin, count, scratch, fits_floats);
 }
 

@@ -231,7 +231,7 @@ class Subject:
         observations = np.empty((*shape, len(self.outputs)), np.float32)
         actions = self.rng.integers(0, 2, shape)
         with contextlib.suppress(ValueError):  # there may be nothing prepared
-            self.pool.roll_out(actions, observations, np.empty(shape), *flags)
+            self.pool.roll_out(actions, observations, np.empty(shape), *flags, np.empty(0))
             counts["rolled out"] += 1
 
     def forget(self):

@@ -16,8 +16,9 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.episodes.evaluation import HELD_OUT_SEED, confidence, evaluate, warning_of_one_reward
+from fmugym.episodes.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_reward
 from fmugym.episodes.simulation import Player, action_of
+from fmugym.series.intervals import confidence
 from fmugym.tools.cli import main
 from fmugym.training.training import Plan, arguments_of, train
 

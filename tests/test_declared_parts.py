@@ -9,10 +9,10 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.archive.description import Unit
 from fmugym.archive.units import conversion_between
+from fmugym.checks import duration
 from fmugym.declared.computed import Value, function_of
 from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import FUNCTIONS
-from fmugym.declared.quantities import duration
 from fmugym.vector.hooks.graph import Graph
 
 

@@ -1,4 +1,4 @@
-"""The example heat_house.py: three controllers in a cold week."""
+"""The example heat_house.py: four controllers in a cold week."""
 
 from PIL import Image
 
@@ -7,8 +7,9 @@ def test_thinking_ahead_costs_least(example, tmp_path, capsys):
     picture = tmp_path / "house.png"
     example("heat_house").main(["--days", "2", "--candidates", "64", "--output", str(picture)])
     lines = capsys.readouterr().out.splitlines()
-    costs = [float(row.split()[-6]) + float(row.split()[-3]) for row in lines[:3]]
-    assert costs[0] > costs[2] < costs[1]
+    costs = [float(row.split()[-6]) + float(row.split()[-3]) for row in lines[:4]]
+    assert costs[2] < 0.98 * min(costs[:2])
+    assert costs[3] < costs[0]  # what it stores for the third day is not paid back yet
     with Image.open(picture) as image:
         assert image.size == (900, 800)
-    assert lines[3] == f"plot: {picture}"
+    assert lines[4] == f"plot: {picture}"

@@ -47,14 +47,6 @@ def swing_up(drawn, torques):
     return np.stack([q - np.pi, v], axis=1), rewards, np.zeros(STEPS)
 
 
-def model(drawn, torques):
-    """Of mpc_cell.py."""
-    q, v = swing(0, 0, torques, 0.02, c=2e-3).T
-    lost = 100.0 * (abs(q) > 5.5)
-    rewards = -away(q) - 0.02 * v**2 - 0.01 * (torques / 0.08) ** 2 - lost
-    return np.stack([q - np.pi, v], axis=1), rewards, np.zeros(STEPS)
-
-
 def brake(drawn, torques):
     """Of own_fmu.py."""
     states = swing(drawn["q_0"], 0, torques, 0.02, m=drawn["m"], b=1e-5)
@@ -65,7 +57,6 @@ def brake(drawn, torques):
 
 TASKS = {
     ("mpc_pendulum", "SwingUp"): (swing_up, 1e-5),
-    ("mpc_cell", "Model"): (model, 2e-2),  # its steps of 10 ms miss where the friction turns
     ("own_fmu", "BrakeEnv"): (brake, 1e-9),
 }
 """By file and class: what it gives, and by how much angles may be off; other values ten times."""

@@ -516,6 +516,14 @@ class TestReport:
         with pytest.raises(FileExistsError):
             write_report(path, {"a": series}, title="T")
 
+    def test_it_has_the_interval_of_the_mean(self, series, tmp_path):
+        stats = pytest.importorskip("scipy.stats", reason="needs scipy: the extra test")
+        path = tmp_path / "a.html"
+        write_report(path, {"a": series, "b": series}, title="T")
+        rewards = [one["reward"].sum() for one in series.episodes().values()]
+        half = stats.t.ppf(0.975, len(rewards) - 1) * stats.sem(rewards)
+        assert f"<td>{half:.4g}</td>" in path.read_text(encoding="utf-8")
+
     def test_it_has_the_totals(self, series, tmp_path):
         path = tmp_path / "a.html"
         write_report(path, {"a": series}, title="T")

@@ -13,11 +13,13 @@ All read the observation by the names of its elements and return actions of the 
 from fmugym.baselines.base import Controller
 from fmugym.baselines.feedback import LQR, PID, Hysteresis
 from fmugym.baselines.feedforward import Constant, Random, Schedule
+from fmugym.baselines.mpc import MPC
 from fmugym.baselines.parsing import controller_of
 from fmugym.baselines.tuning import Tuning, tune
 
 __all__ = [
     "LQR",
+    "MPC",
     "PID",
     "Constant",
     "Controller",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import math
 import re
@@ -15,15 +16,27 @@ import numpy as np
 from fmugym.baselines.base import Controller, FloatArray
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
+from fmugym.baselines.mpc import MPC
 from fmugym.distributions import LogUniform, Uniform
 from fmugym.errors import ConfigError, shown, unknown_name
 
-__all__ = ["Search", "controller_of", "has_range", "search_of"]
+__all__ = [
+    "Search",
+    "controller_of",
+    "has_range",
+    "plans_ahead",
+    "search_of",
+    "simple_controllers",
+    "warmed",
+]
 
-_KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "pid": PID}
+_KINDS: Final[dict[str, type[Controller]]] = {"hysteresis": Hysteresis, "mpc": MPC, "pid": PID}
+
+_UNTUNED: Final = {"mpc", "schedule"}
 
 _EXAMPLES: Final[dict[type[Controller], str]] = {
     Hysteresis: "hysteresis of=T setpoint=21 band=0.5",
+    MPC: "mpc horizon=24h",
     PID: "pid of=T setpoint=21 kp=0.5",
 }
 
@@ -44,7 +57,8 @@ def controller_of(text: str) -> Controller:
 
     Args:
         text: ``"pid of=T setpoint=21 kp=0.5 ti=14400"``, ``"hysteresis of=T setpoint=T_set
-            band=0.5"`` with the arguments of the classes, or ``"schedule 06:00=1 22:00=0.3"``.
+            band=0.5"`` with the arguments of the classes, ``"schedule 06:00=1 22:00=0.3"``, or
+            ``"mpc horizon=24h warm='pid of=T setpoint=21 kp=0.5'"``.
 
     Raises:
         ConfigError: If there is no such controller, or its arguments are wrong.
@@ -58,6 +72,8 @@ def controller_of(text: str) -> Controller:
                 f"{name}={value} is a range, of which 'fmugym tune' and 'fmugym train' find the "
                 "best number"
             )
+    if isinstance(arguments.get("warm"), str):
+        arguments["warm"] = controller_of(arguments["warm"])
     return _made(_KINDS[kind], arguments)
 
 
@@ -91,6 +107,16 @@ class Search:
     def make(self, **numbers: Any) -> Controller:
         """Make the controller with some numbers, which are rounded as in ``text``."""
         return _made(_KINDS[self.kind], {**self.fixed, **self.numbers(numbers)})
+
+    def middle(self) -> Controller:
+        """Make the controller with the middle of each range."""
+        middles = {
+            name: math.sqrt(one.low * one.high)
+            if isinstance(one, LogUniform)
+            else (one.low + one.high) / 2
+            for name, one in self.ranges.items()
+        }
+        return self.make(**middles)
 
     def text(self, numbers: Mapping[str, Any]) -> str:
         """The controller with some numbers, as ``controller_of`` reads it."""
@@ -129,8 +155,9 @@ def search_of(text: str) -> Search:
             wrong.
     """
     kind, arguments = _parts(text)
-    if kind == "schedule":
-        raise ConfigError(f"a schedule cannot be tuned; known are: {', '.join(_KINDS)}")
+    if kind in _UNTUNED:
+        known = ", ".join(sorted(_KINDS.keys() - _UNTUNED))
+        raise ConfigError(f"{kind!r} cannot be tuned; known are: {known}")
     ends = {name: _ends(name, value) for name, value in arguments.items() if has_range(value)}
     negative = frozenset(name for name, (_, high) in ends.items() if high < 0)
     ranges = {
@@ -147,6 +174,23 @@ def search_of(text: str) -> Search:
             "such as kp=0.05..5"
         )
     return search
+
+
+def plans_ahead(text: Any) -> bool:
+    """Whether a text names a controller that plans with copies, and so takes its time."""
+    return isinstance(text, str) and text.split()[:1] == ["mpc"]
+
+
+def simple_controllers(texts: Mapping[str, Any]) -> list[Controller]:
+    """The controllers of a task file that do not plan; ranges in them have their middle."""
+    given = [one for one in texts.values() if isinstance(one, str) and not plans_ahead(one)]
+    return [search_of(one).middle() if has_range(one) else controller_of(one) for one in given]
+
+
+def warmed(text: str, warm: str | None) -> str:
+    """A controller that plans ahead, and begins with the plan of another one if it names none."""
+    _, arguments = _parts(text)
+    return text if warm is None or "warm" in arguments else f"{text} {shlex.quote(f'warm={warm}')}"
 
 
 def has_range(text: Any) -> bool:
@@ -187,10 +231,10 @@ def _argument(word: str) -> tuple[str, Any]:
     name, separator, value = word.partition("=")
     if not separator:
         raise ConfigError(f"expected an argument such as 'kp=0.5', got {shown(word)}")
-    try:
-        return name, float(value)
-    except ValueError:
-        return name, value
+    for read in (int, float):
+        with contextlib.suppress(ValueError):
+            return name, read(value)
+    return name, {"true": True, "false": False}.get(value, value)
 
 
 def _made(cls: type[Controller], arguments: dict[str, Any]) -> Controller:

@@ -18,11 +18,12 @@ from fmugym.checks import (
     check_number,
     check_option,
     check_text,
+    duration,
     integer_of,
 )
 from fmugym.config import CONFIG, FOREIGN
 from fmugym.declared.expressions import Expression
-from fmugym.declared.quantities import duration, finite, number, number_or_distribution
+from fmugym.declared.quantities import finite, number, number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown
 from fmugym.keys import (

@@ -1,50 +1,18 @@
-"""Numbers, distributions and durations of a task."""
+"""Numbers and distributions of a task."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any
 
 from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
 from fmugym.distributions import as_distribution, is_distribution
-from fmugym.errors import ConfigError, shown
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["duration", "finite", "number", "number_or_distribution", "steps_in"]
-
-_SECONDS: Final = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-_NEGATIVE: Final = re.compile(r"\s*-\s*\d")
-_PART: Final = re.compile(r"\s*(\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)\s*(ms|s|min|h|d)(?![A-Za-z])")
-
-
-def duration(what: str, value: Any) -> float:
-    """Return a duration in seconds.
-
-    Args:
-        what: Its name, for the error.
-        value: A number of seconds, or a text such as ``"15min"``, ``"0.02s"`` or ``"1h 30min"``.
-            The units are ms, s, min, h and d.
-
-    Raises:
-        ConfigError: If it is no duration, or negative.
-    """
-    if not isinstance(value, str):
-        return check_number(what, value, minimum=0)
-    if _NEGATIVE.match(value):
-        raise ConfigError(f"{what} must not be negative, got {shown(value)}")
-    total, place = 0.0, 0
-    while match := _PART.match(value, place):
-        total, place = total + float(match[1]) * _SECONDS[match[2]], match.end()
-    if not place or value[place:].strip() or not math.isfinite(total):
-        raise ConfigError(
-            f"{what} must be a number of seconds, or a text such as '15min' or '1h 30min' "
-            f"(units: {', '.join(_SECONDS)}), got {shown(value)}"
-        )
-    return total
+__all__ = ["finite", "number", "number_or_distribution", "steps_in"]
 
 
 def steps_in(entry: Entry, length: float, step: float, most: float = math.inf) -> int:

@@ -41,6 +41,7 @@ from fmugym.declared.observing import (
 from fmugym.declared.parts import Term
 from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
 from fmugym.declared.quantities import steps_in
+from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
 from fmugym.declared.variables import Record, inverted, is_plain
 from fmugym.distributions import is_distribution
@@ -111,7 +112,15 @@ class ResolvedTask:
         data = self._root.child("data").value or {}
         lookups = {name: one for name, one in self._naming.lookups.items() if name in data}
         keys = (NOISE,) if NOISE in self.config["episode_variables"] else ()
-        return Future(lookups, keys, function_of(self._naming.clock))
+        clock = function_of(self._naming.clock)
+        held_out = held_out_times((self._task.outside or self._task).root)
+        return Future(lookups, keys, clock, tuple((one.start, one.length) for one in held_out))
+
+    def controllers(self) -> list[Any]:
+        """Make the controllers that the task declares and that do not plan ahead."""
+        from fmugym.baselines.parsing import simple_controllers
+
+        return [*simple_controllers(self._root.child("controllers").value or {})]
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""

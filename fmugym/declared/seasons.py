@@ -10,7 +10,7 @@ from fmugym.declared.entries import Entry
 from fmugym.distributions import Choice
 from fmugym.errors import ConfigError, unknown_name
 
-__all__ = ["Scenario", "read_begin", "read_scenarios", "scenario_of"]
+__all__ = ["Scenario", "held_out_times", "read_begin", "read_scenarios", "scenario_of"]
 
 _YEAR: Final = 365 * 86400.0
 _MOST_STARTS: Final = 10_000
@@ -94,6 +94,21 @@ def _excluded(entry: Entry, scenarios: Mapping[str, Scenario]) -> list[Scenario]
         if name not in scenarios:
             raise entry.child("exclude").error(unknown_name("scenario", name, scenarios))
     return [scenarios[name] for name in names]
+
+
+def held_out_times(root: Entry) -> list[Scenario]:
+    """When in a year a task has no episodes but those of its scenarios: in these, and off season.
+
+    Args:
+        root: The task outside of its scenarios.
+    """
+    found = list(read_scenarios(root.child("scenarios")).values())
+    begins = (root.child(name).value for name in ("clock", "start_time"))
+    for season in (one for one in begins if isinstance(one, Mapping)):
+        length = (season["to"] - season["from"]) % _YEAR + (root.child("episode_length").value or 0)
+        if length < _YEAR:
+            found.append(Scenario(season["from"] + length, _YEAR - length))
+    return found
 
 
 def scenario_of(scenarios: Mapping[str, Scenario], name: str) -> Scenario:

@@ -46,11 +46,13 @@ class Task:
             dict may hold other objects.
         sources: The files that it was read from, the file itself first, or the dict.
         is_physical: Whether it is in its physical form; no file says so. See ``physical``.
+        outside: The task before one of its scenarios was chosen; None if none was.
     """
 
     document: Mapping[str, Any]
     sources: tuple[Source, ...] = field(compare=False)
     is_physical: bool = False
+    outside: Task | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         if "class" in self.document:
@@ -164,7 +166,8 @@ class Task:
                 self.root.child("warm_up").child("period").value or 0.0
             )
             del times["clock"]
-        return replace(self, document={**self.document, **times})
+        outside = self.outside or self
+        return replace(self, document={**self.document, **times}, outside=outside)
 
     @property
     def name(self) -> str:

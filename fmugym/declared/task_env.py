@@ -70,6 +70,7 @@ class TaskEnv(FMUEnv):
         with self.task.root.placing():
             resolved = ResolvedTask(self.task, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
+        self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
         self.unphysical_keys = resolved.unphysical_keys
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):

@@ -61,6 +61,8 @@ def read_warm_up(
     Raises:
         ConfigError: If it has no period, or a controller of no action.
     """
+    from fmugym.baselines import MPC
+
     known = _named_controllers(root)
     entry = root.child("warm_up")
     if entry.value is None:
@@ -74,6 +76,12 @@ def read_warm_up(
         else _controller(one, known)
         for name, one in entries.items()
     }
+    for name, one in entries.items():
+        if isinstance(controllers[name], MPC):
+            raise one.error(
+                "MPC plans with copies of the environment, which there are none of in a warm-up; "
+                "take a pid, a hysteresis or a number"
+            )
     return WarmUpTable(entry, entry.value["period"], controllers, entry.value["cache"])
 
 

@@ -60,22 +60,16 @@ def found_in(
         if not places:
             raise ConfigError(f"the agent does not observe {name!r}, so that nobody need give it")
         for place in places:
-            node = _lookup_in(graph, observation[place], _key_of(series[name]))
+            node = _lookup_in(graph, observation[place], series[name])
             found.append(External(node, _variable(seen[place], series[name], env)))
     return found
 
 
-def _key_of(series: Any) -> Any:
-    """How the graph calls the table of a series; see ``Graph.tables``."""
-    values = np.asarray(series.values, np.float64)
-    table = np.concatenate([np.asarray(series.times, np.float64), values, values[[0, -1]]])
-    return table.dtype.char, table.tobytes()
-
-
-def _lookup_in(graph: Graph, root: int, key: Any) -> int:
+def _lookup_in(graph: Graph, root: int, series: Any) -> int:
+    points = np.concatenate([series.times, series.values])
     for number in reversed(graph.needed([root])):
         node = graph.nodes[number]
-        if node.kind == "interpolate" and node.what == key:
+        if node.kind == "interpolate" and np.array_equal(graph.tables[node.what][:-2], points):
             return number
     raise ConfigError("data that do not change cannot be given from outside")
 

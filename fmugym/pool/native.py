@@ -385,7 +385,7 @@ class NativePool(AskingPool):
 
         Args:
             arrays: Actions, observations, rewards, terminated and truncated of steps, each with a
-                first axis for the steps.
+                first axis for the steps; and what is added to each output, or nothing, float64.
 
         Returns:
             How many instances or numbers were in trouble; if there are any, not all steps are done.

@@ -12,6 +12,7 @@ from statistics import fmean
 from typing import Final
 
 from fmugym.checks import check_path
+from fmugym.series.intervals import confidence
 from fmugym.series.plots import as_svg
 from fmugym.series.summary import (
     Course,
@@ -200,11 +201,12 @@ def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> 
         [
             _text(name, "first"),
             _cell(str(len(found[name]))),
+            _cell(_number(confidence([episode.reward for episode in found[name]]))),
             *figures.cells(one, "best" if one.reward == best else ""),
         ]
         for name, one in means.items()
     ]
-    return _table(["", "episodes", *figures.header], cells)
+    return _table(["", "episodes", "± (95 %)", *figures.header], cells)
 
 
 def _mean(episodes: Sequence[EpisodeSummary]) -> EpisodeSummary:

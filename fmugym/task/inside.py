@@ -84,6 +84,7 @@ class Inside:
         plan: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
         future: What a declared task reads of the future; None for other tasks.
+        controllers: Makes the simple controllers of a declared task; None for other tasks.
         own: The hooks that the class has itself.
         readings: What hooks read now.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -113,6 +114,7 @@ class Inside:
     elements: Any
     ended: bool
     future: Future | None
+    controllers: Callable[[], list[Any]] | None
     guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
@@ -158,7 +160,7 @@ class Inside:
         self.in_hooks = self.was_reset = False
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
-        self.future = None
+        self.future = self.controllers = None
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any
 

@@ -11,10 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Outcome
-from fmugym.episodes.evaluation import HELD_OUT_SEED, student
+from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.search.agent import Agent
+from fmugym.series.intervals import student
 
-__all__ = ["Verdict", "judge"]
+__all__ = ["Verdict", "episodes_of", "judge"]
 
 _EPISODES: Final = 100
 _OF_SCENARIO: Final = 4
@@ -99,6 +100,16 @@ class Verdict:
         }
 
 
+def episodes_of(scenarios: int, episodes: int | None) -> int:
+    """How many episodes of each scenario are played.
+
+    Args:
+        scenarios: How many there are.
+        episodes: What the user says; None for the default.
+    """
+    return episodes or (_EPISODES if scenarios < 2 else _OF_SCENARIO)
+
+
 def judge(
     agents: Mapping[str, Agent],
     arenas: Mapping[str, Arena],
@@ -113,8 +124,7 @@ def judge(
         limits: What each cost may add up to in an episode, by name.
         episodes: How many episodes of each scenario; None for the default.
     """
-    count = episodes or (_EPISODES if len(arenas) < 2 else _OF_SCENARIO)
-    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + count)
+    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes_of(len(arenas), episodes))
     outcomes: dict[str, list[Outcome]] = {name: [] for name in agents}
     for arena in arenas.values():
         with closing(arena):

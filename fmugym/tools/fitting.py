@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from fmugym.declared.quantities import duration
+from fmugym.checks import duration
 from fmugym.errors import ConfigError, shown
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison

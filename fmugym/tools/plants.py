@@ -10,9 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from fmugym.checks import check_count, check_number
+from fmugym.checks import check_count, check_number, duration
 from fmugym.declared import Task
-from fmugym.declared.quantities import duration
 from fmugym.episodes.output_files import Recording
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Summary, simulate

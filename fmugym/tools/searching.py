@@ -15,7 +15,7 @@ import numpy as np
 
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
 from fmugym.baselines.entrants import NO_MERIT
-from fmugym.baselines.parsing import has_range, search_of
+from fmugym.baselines.parsing import controller_of, has_range, plans_ahead, search_of, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reason, shown
@@ -23,7 +23,7 @@ from fmugym.search.agent import Agent
 from fmugym.search.probe import MOST_PROBED, Probe, task_of
 from fmugym.search.search import FEW, Search
 from fmugym.signals import Ignoring, ordinary
-from fmugym.tools.comparing import Verdict, judge
+from fmugym.tools.comparing import Verdict, episodes_of, judge
 from fmugym.training.agents import FACTS
 from fmugym.training.diary import EVALUATIONS
 from fmugym.training.training import require_new
@@ -122,7 +122,8 @@ def _begun(quest: Quest) -> _Course:
             f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
         )
     probe = Probe.of(quest.make_env, quest.envs)
-    given = probe.task.get("controllers", {})
+    declared = probe.task.get("controllers", {})
+    given = {name: one for name, one in declared.items() if not plans_ahead(one)}
     tunable = [(name, search_of(one)) for name, one in given.items() if has_range(one)]
     fixed = [
         Agent(name, one) if isinstance(one, str) else Agent.constant(name, one, probe.ranges)
@@ -323,14 +324,49 @@ class _Run:
                 f"nothing was found that beats {winner.name}: the folder has that controller"
             )
         agents = {winner.name: winner}
-        for other in [found.baseline or winner, *found.others()]:
+        count = 1 if probe.is_same else quest.episodes
+        baseline = found.baseline or winner
+        for other in [baseline, *found.others(), *self._planners(baseline.text, count)]:
             agents.setdefault(other.name, other)
         arenas = {
             name: self._arena_of(make, probe.most_steps if make is quest.make_env else _LONGEST)
             for name, make in quest.scenarios.items()
         }
-        verdict = judge(agents, arenas, probe.limits, 1 if probe.is_same else quest.episodes)
+        verdict = judge(agents, arenas, probe.limits, count)
         return verdict, self._save(winner, test=verdict.as_dict())
+
+    def _planners(self, baseline: str | None, episodes: int | None) -> Iterator[Agent]:
+        """The controllers that plan ahead and whose test takes no longer than the search.
+
+        They begin with the plan of the baseline.
+        """
+        declared = self._probe.task.get("controllers", {})
+        for name, text in declared.items():
+            if plans_ahead(text):
+                warm = warmed(text, baseline)
+                minutes = self._minutes_of_test(warm, episodes)
+                if minutes <= (self._quest.minutes or _MINUTES):
+                    yield Agent(name, warm)
+                else:
+                    self._quest.tell(
+                        f"left out: {name}, whose test would take about {minutes:.0f} min; "
+                        "'fmugym evaluate' compares it with the agent"
+                    )
+
+    def _minutes_of_test(self, text: str, episodes: int | None) -> float:
+        """How long a controller would take for the test, by the time of its second decision."""
+        steps = 0
+        for make_env in self._quest.scenarios.values():
+            with closing(make_env()) as env:
+                steps += env.config.max_episode_steps or self._probe.most_steps
+        with closing(self._quest.make_env()) as env:
+            controller = controller_of(text).bind(env)
+            observation, _ = env.reset(seed=self._quest.seed)
+            observation, *_ = env.step(controller.act(observation))
+            begin = monotonic()
+            controller.act(observation)
+            took = monotonic() - begin
+        return took * steps * episodes_of(len(self._quest.scenarios), episodes) / 60.0
 
 
 def _resumed(quest: Quest) -> _Course:

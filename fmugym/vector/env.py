@@ -37,7 +37,14 @@ from fmugym.vector.infos import final_infos, merged, observations_of, restricted
 from fmugym.vector.inside import VectorInside
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
-from fmugym.vector.rollouts import Candidates, Rollout, tunable_values
+from fmugym.vector.rollouts import (
+    Candidates,
+    Rollout,
+    keys_of,
+    offsets_of,
+    tables_of,
+    tunable_values,
+)
 from fmugym.vector.saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv", "require_open"]
@@ -419,6 +426,9 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
         *,
         horizon: int | None = None,
         parameters: Mapping[str, Any] | None = None,
+        data: Mapping[str, Any] | None = None,
+        offsets: Mapping[str, float] | None = None,
+        seed: int | None = None,
     ) -> Rollout:
         """Find out what candidates for the next actions would lead to.
 
@@ -436,15 +446,27 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             parameters: Tunable parameters of the FMU that candidates have from here on: an array of
                 shape (n,), or one number for all, by name. For other parameters, let each candidate
                 begin with an episode that has been reset with its own.
+            data: What candidates read in the place of the task's data: by name the times in
+                seconds, on the clock of the data, and the values. They are read as those of the
+                file are, and repeat after the same period. By default candidates know what will
+                come.
+            offsets: What is added to outputs and monitored variables of the FMU for all that
+                hooks read, in the FMU's units, by name. The FMU itself does not notice.
+            seed: The noise and the random set points of all candidates are those of an episode
+                with this seed. By default they go on with those of the snapshot.
 
         Raises:
-            ConfigError: If the snapshot, the actions or the parameters do not fit.
+            ConfigError: If the snapshot, the actions or what candidates assume do not fit.
             SimulationError: If an episode of the snapshot has ended, an FMU cannot be restored, or,
                 with ``on_fault="raise"``, a step fails.
         """
         require_open(self, "rollout")
         candidates = Candidates.of(self.single_action_space, self.num_envs, actions, horizon)
-        candidates.parameters = tunable_values(self.inside.prototype, parameters, candidates.count)
+        prototype, count = self.inside.prototype, candidates.count
+        candidates.parameters = tunable_values(prototype, parameters, count)
+        candidates.tables = tables_of(prototype, data)
+        candidates.offsets = offsets_of(prototype, offsets)
+        candidates.variables = keys_of(prototype, seed)
         present = self.save_state() if self.inside.episodes.is_ready else None
         start = self.inside.episodes.start_of_rollout(snapshot, present, candidates.count)
         with self.inside.episodes.returning_to(present):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,13 @@ from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot, scope_of
 from fmugym.vector.engines.base import Engine
-from fmugym.vector.rollouts import Candidates, Rollout, joined_rollouts, roll_out_by_steps
+from fmugym.vector.rollouts import (
+    Candidates,
+    Rollout,
+    joined_rollouts,
+    roll_out_by_steps,
+    tables_of,
+)
 
 __all__ = ["Episodes"]
 
@@ -102,6 +109,14 @@ class Episodes:
                 self.place(present, self._everywhere)
                 self.is_ready = True
 
+    def assuming(self, data: Any) -> AbstractContextManager[None]:
+        """Let hooks read other data inside of a ``with`` block; see ``FMUVectorEnv.rollout``.
+
+        Raises:
+            ConfigError: If there is no such data, or the rows make no function of time.
+        """
+        return self._engine.assuming(tables_of(self._prototype, data), None)
+
     def start_of_rollout(
         self, snapshot: Snapshot | None, present: Snapshot | None, count: int
     ) -> Snapshot:
@@ -126,7 +141,8 @@ class Episodes:
 
     def roll_out(self, start: Snapshot, candidates: Candidates) -> Rollout:
         """Let the environments play all candidates, as many at a time as there are environments."""
-        parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
+        with self._engine.assuming(candidates.tables, candidates.offsets):
+            parts = [self._roll_out(start, places, candidates) for places in candidates.rounds]
         return joined_rollouts(parts, candidates.count)
 
     def _roll_out(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> Rollout:
@@ -145,9 +161,14 @@ class Episodes:
 
     def _begin(self, start: Snapshot, places: IndexArray, candidates: Candidates) -> None:
         """Bring all environments to the places where candidates begin."""
-        self.place(start, places if len(start) > 1 else np.zeros_like(places))
+        sources = places if len(start) > 1 else np.zeros_like(places)
+        self.restore(start.bundle, sources, self._everywhere)
+        columns = candidates.seen_in(self.columns_of(start))
+        self._engine.place(columns, sources, self._everywhere)
         values = {name: column[places] for name, column in candidates.parameters.items()}
         if values:
             variables = tuple(map(self._prototype.fmu.variable, values))
             self._pool.write(variables, np.stack(list(values.values())))
             self._engine.show_parameters(values)
+        for name, value in candidates.variables.items():
+            self._engine.set_variable(name, value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -10,20 +10,41 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable, checked_value, unlisted
-from fmugym.checks import check_mapping
+from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
+from fmugym.task.snapshot import Columns
 from fmugym.vector.actions import checked_actions, is_array_space
 from fmugym.vector.engines.base import Engine, StepResult
 from fmugym.vector.infos import copy_rows
 
-__all__ = ["Candidates", "Rollout", "joined_rollouts", "roll_out_by_steps", "tunable_values"]
+__all__ = [
+    "Candidates",
+    "Rollout",
+    "costs_in",
+    "joined_rollouts",
+    "keys_of",
+    "offsets_of",
+    "roll_out_by_steps",
+    "tables_of",
+    "tunable_values",
+]
 
 
-class Rollout(NamedTuple):
+class _Steps(NamedTuple):
+    observations: Any
+    rewards: FloatArray
+    terminated: MaskArray
+    truncated: MaskArray
+    lengths: npt.NDArray[np.int64]
+
+
+class Rollout(_Steps):
     """What n candidates have led to in up to ``horizon`` steps.
+
+    It is a tuple of the first five attributes.
 
     After the end of a candidate's episode its last observation is repeated, its rewards are 0, and
     the flags are False.
@@ -34,17 +55,20 @@ class Rollout(NamedTuple):
         terminated: Whether the step has ended the episode, shape (n, horizon).
         truncated: Whether the step has cut it short, shape (n, horizon).
         lengths: The steps that each candidate has done, shape (n,).
+        costs: The numbers that infos tell as ``"costs"``, by name, each of shape (n, horizon); 0
+            after the end.
     """
 
-    observations: Any
-    rewards: FloatArray
-    terminated: MaskArray
-    truncated: MaskArray
-    lengths: npt.NDArray[np.int64]
+    costs: Mapping[str, FloatArray] = MappingProxyType({})
 
     @classmethod
     def of(
-        cls, observations: Any, rewards: FloatArray, terminated: MaskArray, truncated: MaskArray
+        cls,
+        observations: Any,
+        rewards: FloatArray,
+        terminated: MaskArray,
+        truncated: MaskArray,
+        costs: Mapping[str, FloatArray],
     ) -> Rollout:
         """Make it of arrays with steps on the first axis."""
         ends = terminated | truncated
@@ -52,7 +76,34 @@ class Rollout(NamedTuple):
         first = ends.argmax(axis=0) + 1 if horizon else np.zeros(rewards.shape[1], np.int64)
         lengths = np.where(ends.any(axis=0), first, horizon)
         turned = _mapped(lambda arrays: np.swapaxes(arrays[0], 0, 1), [observations])
-        return cls(turned, rewards.T, terminated.T, truncated.T, lengths)
+        runs = np.arange(horizon)[:, np.newaxis] < lengths
+        found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
+        found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
+        return found
+
+
+def costs_in(infos: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, FloatArray]:
+    """The costs that infos of environments tell, by name.
+
+    Args:
+        infos: Those of a step, or of all steps of a rollout.
+        shape: That of the rewards. What a class tells as ``"costs"`` in another shape, or as no
+            numbers, is its own affair.
+    """
+    told = infos.get("costs")
+    return {
+        name: paid
+        for name, paid in (told.items() if isinstance(told, dict) else ())
+        if not str(name).startswith("_")  # which says whose costs are told
+        and isinstance(paid, np.ndarray)
+        and paid.shape == shape
+        and paid.dtype.kind in "biuf"
+    }
+
+
+def _names(costs: Iterable[Mapping[str, FloatArray]]) -> list[str]:
+    """The names of costs, some of which a step with a fault may not tell."""
+    return list(dict.fromkeys(name for told in costs for name in told))
 
 
 def _mapped(function: Callable[[list[Any]], Any], trees: Sequence[Any]) -> Any:
@@ -69,10 +120,15 @@ def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
     """Put rollouts together, and keep the first candidates."""
     if len(parts) == 1 and len(parts[0].rewards) == count:
         return parts[0]
-    return Rollout._make(
+    joined = Rollout._make(
         _mapped(lambda arrays: np.concatenate(arrays)[:count], part)
         for part in zip(*parts, strict=True)
     )
+    joined.costs = {
+        name: np.concatenate([one.costs.get(name, 0.0 * one.rewards) for one in parts])[:count]
+        for name in _names(one.costs for one in parts)
+    }
+    return joined
 
 
 class Candidates:
@@ -91,6 +147,15 @@ class Candidates:
 
     parameters: Mapping[str, FloatArray] = MappingProxyType({})
     """What the tunable parameters of each candidate are, arrays of shape (n,) by name."""
+
+    variables: Mapping[str, float] = MappingProxyType({})
+    """What episode variables of all candidates are at the beginning, by name."""
+
+    tables: Mapping[str, FloatArray] = MappingProxyType({})
+    """What candidates look up in the place of data, by name."""
+
+    offsets: FloatArray | None = None
+    """What is added to the outputs of all candidates, shape (k,)."""
 
     def __init__(self, count: int, horizon: int, num_envs: int, given: Any) -> None:
         self.count, self.horizon, self._given = count, horizon, given
@@ -111,6 +176,16 @@ class Candidates:
         if horizon not in (None, array.shape[1]):
             raise ConfigError(f"the actions have {array.shape[1]} steps, but horizon = {horizon}")
         return cls(len(array), array.shape[1], num_envs, array)
+
+    def seen_in(self, columns: Columns) -> Columns:
+        """What hooks read where candidates begin: outputs with their offsets."""
+        if self.offsets is None:
+            return columns
+        shifted = {}
+        for name in ("values", "previous_state"):
+            rows = np.asarray(columns[name], np.float64)
+            shifted[name] = rows + self.offsets[: rows.shape[1]]
+        return {**columns, **shifted}
 
     def actions(self, places: npt.NDArray[np.int64]) -> npt.NDArray[Any] | None:
         """The actions of a round, shape (horizon, N, ...); None for a policy."""
@@ -159,6 +234,65 @@ def tunable_values(env: FMUEnv, parameters: Any, count: int) -> dict[str, npt.ND
             "candidates need values of all elements"
         )
     return {variable.name: values for variable, values in found.items()}
+
+
+def tables_of(env: FMUEnv, data: Any) -> dict[str, FloatArray]:
+    """Check what candidates assume in the place of data.
+
+    Args:
+        env: Its task has the data.
+        data: Times and values by name; None for none.
+
+    Raises:
+        ConfigError: If there is no such data, or the rows make no function of time.
+    """
+    given = {} if data is None else check_mapping("'data'", data)
+    lookups = {} if env.inside.future is None else env.inside.future.lookups
+    for name in given:
+        if name not in lookups:
+            raise ConfigError(unknown_name("data that hooks read", name, lookups))
+    return {name: lookups[name].table_of(name, rows) for name, rows in given.items()}
+
+
+def offsets_of(env: FMUEnv, offsets: Any) -> FloatArray | None:
+    """Check what is added to outputs.
+
+    Args:
+        env: The FMU's outputs are its own.
+        offsets: Numbers by the names of outputs and monitored variables, in the FMU's units; None
+            for none.
+
+    Returns:
+        Numbers of shape (k,); None for none.
+
+    Raises:
+        ConfigError: If an output is unknown, or an offset no finite number.
+    """
+    given = {} if offsets is None else check_mapping("'offsets'", offsets)
+    names = list(env.out)
+    for name, value in given.items():
+        if name not in names:
+            raise ConfigError(unknown_name("output in offsets", name, names))
+        check_number(f"the offset of {name!r}", value)
+    return np.array([given.get(name, 0.0) for name in names]) if given else None
+
+
+def keys_of(env: FMUEnv, seed: Any) -> dict[str, float]:
+    """Draw what the random numbers of later steps follow from.
+
+    Args:
+        env: The prototype.
+        seed: That of all candidates, which nobody's luck then tells apart; None if they go on with
+            the random numbers of their snapshot.
+
+    Raises:
+        ConfigError: If it is no seed.
+    """
+    first, future = check_seed(seed), env.inside.future
+    if first is None or future is None:
+        return {}
+    stream = np.random.default_rng(first)
+    return {name: env.config.episode_variables[name].sample(stream) for name in future.keys}
 
 
 def _require_tunable(variable: Variable) -> None:
@@ -239,11 +373,13 @@ def roll_out_by_steps(
         over |= result.terminated | result.truncated
         observations = result.observations
         results.append(result)
+    costs = [costs_in(result.infos, result.rewards.shape) for result in results]
     return Rollout.of(
         _mapped(np.stack, [result.observations for result in results]),
         np.stack([result.rewards for result in results]),
         np.stack([result.terminated for result in results]),
         np.stack([result.truncated for result in results]),
+        {name: np.stack([one.get(name, over * 0.0) for one in costs]) for name in _names(costs)},
     )
 
 

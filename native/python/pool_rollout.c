@@ -3,9 +3,12 @@
 
 #include "playing.h"
 
+enum { OFFSETS = TURN_BUFFERS, ROLLOUT_ARGUMENTS };
+
 typedef struct {
     PyTurn turn;
     size_t horizon;
+    Py_buffer offsets;
 } PyRollout;
 
 static void do_rollout(PyPool *self, bool alone, void *context) {
@@ -44,6 +47,13 @@ static bool take_rolled_observations(PyPool *self, const Playing *playing, PyObj
     return true;
 }
 
+/* None at all stand for no offsets. */
+static bool take_offsets(PyPool *self, PyObject *array, PyRollout *r) {
+    const size_t size = self->pool.settings.outputs->count * sizeof(double);
+
+    return PyObject_Length(array) == 0 || take_bytes(array, &r->offsets, PyBUF_SIMPLE, size);
+}
+
 static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *args,
                          PyRollout *r) {
     const Py_ssize_t n = (Py_ssize_t)self->pool.settings.count;
@@ -61,7 +71,8 @@ static bool take_rollout(PyPool *self, const Playing *playing, PyObject *const *
            take_matrix(args[TERMINATED], &b[TERMINATED], WRITTEN, "terminated", ITEM_BOOLEAN,
                        horizon, n) &&
            take_matrix(args[TRUNCATED], &b[TRUNCATED], WRITTEN, "truncated", ITEM_BOOLEAN, horizon,
-                       n);
+                       n) &&
+           take_offsets(self, args[OFFSETS], r);
 }
 
 static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args) {
@@ -72,6 +83,7 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
     clear_turn(playing, &r.turn);
     if (take_rollout(self, playing, args, &r)) {
         settle_turn(self, playing, &r.turn);
+        r.turn.turn.offsets = r.offsets.buf;
         done = perform(self, NEVER_SHORT, do_rollout, &r) && !is_outside(&r.turn) &&
                report_messages(self);
     }
@@ -80,13 +92,14 @@ static PyObject *roll_out(PyPool *self, PyObject *capsule, PyObject *const *args
         done = false;
     }
     release_turn(playing, &r.turn);
+    release_buffer(&r.offsets);
     return done ? PyLong_FromSize_t(r.turn.troubled) : NULL;
 }
 
 PyObject *py_rollout(PyObject *object, PyObject *const *args, Py_ssize_t nargs) {
     PyPool *self = (PyPool *)object;
 
-    if (!has_arguments(nargs, TURN_BUFFERS) || !is_prepared(self)) {
+    if (!has_arguments(nargs, ROLLOUT_ARGUMENTS) || !is_prepared(self)) {
         return NULL;
     }
     PyObject *playing = Py_NewRef(self->playing);

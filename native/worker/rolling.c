@@ -218,6 +218,25 @@ static Answer roll_out(Worker *w, Rolling *r, Rollout *o, Writer *writer) {
     return ANSWER_RESULT;
 }
 
+/* Also adds them to the outputs where the rollout begins. Returns NULL if there are none. */
+static const double *read_offsets(Worker *w, Reader *reader) {
+    const Settings *s = &w->opening.settings;
+    size_t number;
+    const double *offsets = read_array(reader, sizeof *offsets, &number);
+
+    if (number == 0) {
+        return NULL;
+    }
+    if (number != s->outputs->count) {
+        reader_refuse(reader, "the offsets of a rollout differ in number");
+        return NULL;
+    }
+    for (size_t i = 0; i < number * s->count; i++) {
+        w->output_values[i] += offsets[i / s->count];
+    }
+    return offsets;
+}
+
 Answer answer_roll_out(Worker *w, Reader *reader, Writer *writer) {
     if (read_flag(reader)) {
         prepare(w, reader);
@@ -232,6 +251,7 @@ Answer answer_roll_out(Worker *w, Reader *reader, Writer *writer) {
     if (actions.size != o.horizon * w->opening.settings.count * a->elements * a->size) {
         reader_refuse(reader, "the actions of a rollout differ in number");
     }
+    o.turn.offsets = read_offsets(w, reader);
     read_values(w, reader, r);
     if (reader->fault != NULL) {
         return answer_refusal(writer, reader->fault);

@@ -275,7 +275,7 @@ class ProcessPool(AskingPool):
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
         from fmugym.pool.process.rollouts import OUTSIDE, read_rolled
 
-        actions, seen, *judged = arrays
+        actions, seen, *judged, offsets = arrays
         play = self._play = self._play or self._describe_play()
         own = (*seen, *judged) if isinstance(seen, tuple) else (seen, *judged)
 
@@ -284,7 +284,7 @@ class ProcessPool(AskingPool):
             supervisor.begin_progress(play.counts[block])
             supervisor.tell(
                 Request.ROLL_OUT,
-                play.request(block, actions, is_known=is_known),
+                play.request(block, actions, offsets, is_known=is_known),
                 lambda reader: read_rolled(reader, block, own),
             )
 

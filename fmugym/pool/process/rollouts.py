@@ -50,17 +50,21 @@ class PlayOfWorkers:
         sizes = [row.itemsize for row in self._others]
         self._play = Writer().array(sizes, np.int64).block(form).form()
 
-    def request(self, block: slice, actions: npt.NDArray[Any], *, is_known: bool) -> bytes:
+    def request(
+        self, block: slice, actions: npt.NDArray[Any], offsets: FloatArray, *, is_known: bool
+    ) -> bytes:
         """The content of a request.
 
         Args:
             block: The indices of the worker's instances.
             actions: Of all instances, steps first.
+            offsets: What is added to the outputs; empty for nothing.
             is_known: Whether the worker knows what was prepared.
         """
         writer = Writer().integers(not is_known)
         writer.forms(b"" if is_known else self._play).integers(len(actions))
         writer.block(np.ascontiguousarray(actions[:, block]).tobytes())
+        writer.array(offsets, np.float64)
         for row in (*self._kept, *self._others):
             writer.block(row[block].tobytes())
         for array in (self._actions["current"], self._actions["previous"]):

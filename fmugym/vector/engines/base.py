@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.pool.base import FloatArray, MaskArray
+from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
+from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Columns
 
@@ -36,6 +37,7 @@ class Engine(ABC):
         ended: Whether the last step ended the episode, shape (N,); always the same array.
         any_ended: Whether the last step ended any episode.
         has_moved: Whether the last step or reset got as far as the FMUs.
+        offsets: What is added to each output after each step, shape (k,); None for nothing.
         starts_at_ends: Whether the caller wants the next episode to start in the step that ends one
             (the mode ``SAME_STEP``). An engine may leave that to ``reset``.
     """
@@ -46,7 +48,20 @@ class Engine(ABC):
         self.ended = np.zeros(num_envs, np.bool_)
         self.any_ended = False
         self.has_moved = False
+        self.offsets: FloatArray | None = None
         self.starts_at_ends = False
+
+    def add_offsets(self, pool: Pool, idle: MaskArray | None = None) -> None:
+        """Add the offsets to the outputs of the instances that have stepped.
+
+        Args:
+            pool: Has the outputs.
+            idle: Which instances have not stepped, shape (N,); None if all have.
+        """
+        if self.offsets is not None:
+            failed = (pool.statuses > WARNING_CODE) & (pool.statuses != TERMINATED_CODE)
+            left_out = failed if idle is None else failed | idle
+            pool.outputs += np.where(left_out, 0.0, self.offsets[:, np.newaxis])
 
     def note_ends(self, terminated: MaskArray, truncated: MaskArray) -> None:
         """Note which episodes a step has ended."""
@@ -181,6 +196,21 @@ class Engine(ABC):
         """Let environments go on from columns; environment ``indices[i]`` from ``sources[i]``."""
 
     @abstractmethod
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> AbstractContextManager[None]:
+        """Let hooks read other data and outputs inside of a ``with`` block.
+
+        Args:
+            tables: Those of series, by name.
+            offsets: What is added to each output after each step, shape (k,); None for nothing.
+        """
+
+    @abstractmethod
+    def set_variable(self, name: str, value: float) -> None:
+        """Give an episode variable of all environments a value."""
+
+    @abstractmethod
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
         """Let hooks read other values of parameters, arrays of shape (N,), in these episodes."""
 
@@ -191,9 +221,9 @@ class Engine(ABC):
             actions: Shape (horizon, N, ...), checked, of the type of the action space.
 
         Returns:
-            Observations, rewards, terminated and truncated, each with the steps on the first axis;
-            see ``Rollout`` for what follows an end. None if the engine cannot do it, or if a step
-            has failed.
+            Observations, rewards, terminated, truncated, and costs by name, each with the steps on
+            the first axis; see ``Rollout`` for what follows an end. None if the engine cannot do
+            it, or if a step has failed.
         """
         return None
 

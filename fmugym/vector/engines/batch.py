@@ -27,6 +27,7 @@ from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.construction import plan_of, plan_of_reset
 from fmugym.task.episode import EpisodePlan
+from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
 from fmugym.task.snapshot import Columns
@@ -44,6 +45,7 @@ from fmugym.vector.hooks import results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
+from fmugym.vector.rollouts import costs_in
 from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams, no_draws
 from fmugym.vector.views import batched, column, some, take
@@ -487,6 +489,26 @@ class BatchEngine(Engine):
         )
         return not own or not columns.keys() <= set(plan.parameter_names)
 
+    @contextmanager
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> Iterator[None]:
+        """See ``Engine.assuming``."""
+        own, self.offsets = self._task, offsets
+        try:
+            with assumed([self.env.inside.future], tables) as others:
+                if others:
+                    self._prepare(own.with_tables(others))
+                yield
+        finally:
+            self.offsets = None
+            if tables:
+                self._prepare(own)
+
+    def set_variable(self, name: str, value: float) -> None:
+        """See ``Engine.set_variable``."""
+        self._row(name)[:] = value
+
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
         """See ``Engine.show_parameters``."""
         for name, numbers in values.items():
@@ -522,6 +544,7 @@ class BatchEngine(Engine):
             actions = self._checked_before(actions, resetting)
         at_ends = self.starts_at_ends and self._starts_at_ends
         step = self._play.step if resetting is None and not at_ends else self._play.start_and_step
+        step = step if self.offsets is None else None
         self.has_moved = True  # unless the call refuses its arguments
         played: Played
         try:
@@ -545,6 +568,7 @@ class BatchEngine(Engine):
         play.before(checked)
         self._pool.step(None, resting)
         self._pool.statuses[resting] = 0  # a fault was told when it came
+        self.add_offsets(self._pool, resting)
         result: StepResult
         result, troubled, *_ = play.after(checked)
         if troubled or self._left_after:
@@ -568,12 +592,14 @@ class BatchEngine(Engine):
         if starting is None:
             play.before(actions)
             self._pool.step()
+            self.add_offsets(self._pool)
             return play.after(actions)
         indices = starting.nonzero()[0]
         drawn = self._streams.draw(plan, indices)
         play.before(actions)
         self._begin(starting, indices, plan, drawn)
         self._pool.step(None, starting)
+        self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
         result.infos.update(self._told(plan, drawn, starting))
         return result, troubled, any_ended, starting
@@ -610,9 +636,11 @@ class BatchEngine(Engine):
         seen = self._arrays_of_steps(horizon)
         self.has_moved = True
         arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
-        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged):
+        offsets = np.empty(0) if self.offsets is None else self.offsets
+        if self._pool.roll_out(np.ascontiguousarray(actions), arrays, *judged, offsets):
             return None
-        return seen if self._divided is None else self._divided(seen)[0], *judged
+        observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
+        return observations, *judged, costs_in(infos, judged[0].shape)
 
     def _arrays_of_steps(self, horizon: int) -> Any:
         """Make the arrays of many steps, with a first axis for the steps."""

@@ -22,6 +22,7 @@ from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
 from fmugym.task.actions import take_action
 from fmugym.task.construction import plan_of, prepare_hooks
+from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
@@ -138,6 +139,10 @@ class PerEnvEngine(Engine):
             if self._together:
                 self._take_actions(items, [*compress(range(len(items)), map(not_, idles))])
                 self._pool.step(None, idle, self._pool.observations)
+                if self.offsets is not None:
+                    self.add_offsets(self._pool, idle)
+                    observed = self._pool.observations
+                    observed[:] = self._pool.outputs[: observed.shape[1]].T
             self.has_moved = True
             result = self._result(self._results(items, idles, starts=resting is None))
         except BaseException:
@@ -260,6 +265,27 @@ class PerEnvEngine(Engine):
             place_columns(self._envs[index], columns, source)
             self.ended[index] = columns["ended"][source]
         self.any_ended = bool(self.ended.any())
+
+    @contextmanager
+    def assuming(
+        self, tables: Mapping[str, FloatArray], offsets: FloatArray | None
+    ) -> Iterator[None]:
+        """See ``Engine.assuming``."""
+        if offsets is not None and not self._together:
+            raise ConfigError(
+                f"{type(self._envs[0]).__name__} has a step of its own, which offsets do not reach"
+            )
+        self.offsets = offsets
+        try:
+            with assumed((env.inside.future for env in self._envs), tables):
+                yield
+        finally:
+            self.offsets = None
+
+    def set_variable(self, name: str, value: float) -> None:
+        """See ``Engine.set_variable``."""
+        for env in self._envs:
+            env.variables[name] = value
 
     def show_parameters(self, values: Mapping[str, FloatArray]) -> None:
         """See ``Engine.show_parameters``."""

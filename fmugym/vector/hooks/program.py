@@ -8,8 +8,8 @@ last bit. Functions such as sines and powers are those of the C library.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -190,6 +190,10 @@ class Program:
         if kind in OPERATIONS:
             return bool((self.code[:, 0] == OPERATIONS.index(kind)).any())
         return any(row[0] == kind for row in self.rows)
+
+    def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> Program:
+        """The same program with other tables, by the bytes of those whose place they take."""
+        return replace(self, tables=tuple(tables.get(own.tobytes(), own) for own in self.tables))
 
     def with_rows(
         self, find: Callable[[Row], npt.NDArray[Any]]

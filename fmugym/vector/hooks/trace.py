@@ -10,7 +10,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -108,6 +108,11 @@ class TracedTask:
         judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
         left = {hook: reason for hook in ORDER if not idle.get(hook, False)}
         return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), left)
+
+    def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TracedTask:
+        """The same task with other tables, by the bytes of those whose place they take."""
+        inputs, judgement = (one.with_tables(tables) for one in (self.inputs, self.judgement))
+        return replace(self, inputs=inputs, judgement=judgement)
 
     @property
     def is_compiled(self) -> bool:

@@ -1,0 +1,613 @@
+"""Model predictive control: the next action of the best plan that copies of the FMU have found."""
+
+from __future__ import annotations
+
+import copy
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from time import perf_counter
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from fmugym.baselines.base import Controller, FloatArray, attribute_of
+from fmugym.checks import (
+    LARGEST_COUNT,
+    check_flag,
+    check_integer,
+    check_number,
+    check_seed,
+    duration,
+)
+from fmugym.distributions import is_distribution
+from fmugym.env import FMUEnv
+from fmugym.errors import ConfigError, shown
+from fmugym.task.future import Future
+from fmugym.task.snapshot import Snapshot
+from fmugym.vector import FMUVectorEnv
+
+__all__ = ["MPC"]
+
+_DAY: Final = 86400.0
+_PULSES: Final = 2
+"""By so many pulses a candidate differs."""
+
+_DECADES: Final = 1.5
+"""Over so many powers of ten the heights of pulses are spread."""
+
+_COPIES: Final = 9
+"""So many copies run beside each environment."""
+
+_LASTING: Final = 0.98
+"""The part of the past errors of a copy that counts after a step."""
+
+_SAMPLES: Final = 1001
+"""The copies have quantiles of so many samples of what is drawn."""
+
+_PENALTY: Final = 1e9
+"""How much more a unit of a cost beyond its limit counts than one of the reward."""
+
+_FORECAST: Final = re.compile(r"(.+)\[\+(.+) s\]")
+
+
+class MPC(Controller):
+    """Model predictive control with copies of the FMU as the model.
+
+    In each step, candidates for the actions until the horizon play on copies of the environment,
+    and the first action of the best one is taken. The reward is that of the task, and plans that
+    keep the limits of costs come first. The search begins with the best of the plan of the step
+    before and what simple controllers would do. Candidates are the best plan until then and two
+    pulses, whose heights and lengths are random numbers of all magnitudes. Most pulses begin early,
+    since the next action cannot be mended later.
+
+    The controller sees what an agent sees. Nine copies get the same actions as the environment.
+    They differ in the parameters that the task draws, and the one whose observations fit best is
+    the model. Copies read data as they were observed, and ahead as they were forecast last. Beyond
+    a forecast, the value of a day before is repeated; data that are not observed have their mean in
+    the training period. Differences between what is observed and what a copy gives, filtered,
+    become offsets of the outputs. The controller is told the episode variables, such as the clock,
+    but no noise.
+
+    Args:
+        horizon: How far plans go: seconds, or a text such as ``"24h"``.
+        candidates: How many candidates play in a decision.
+        rounds: How often the search goes on from the best one in a decision.
+        warm: A controller whose actions are a candidate, too, bound to nothing else. By default
+            those that the task file declares; ranges in them have their middle.
+        correction: By which part the offsets follow the differences in a step, from 0 to 1.
+        budget: How long a decision may take, in seconds of real time, if the FMU cannot save its
+            state; None for any time.
+        states: For plants that a copy would not stay close to, such as unstable ones: by the name
+            of an observation the parameter of the FMU in which an episode begins with this state,
+            in the same unit, as a dict or as ``"theta:theta_0,theta_dot:theta_dot_0"``. Each
+            decision then begins in the state that was observed, corrected by ``correction``. It
+            needs all states, and a task without data.
+        perfect: Whether the true state and the true future are known. Nobody can beat this but by
+            a better search; it shows how much there is to gain.
+        seed: Of the candidates. The same arguments give the same actions.
+        model: A function that makes the environment to plan with, which has the observations and
+            actions of the controlled one. By default that is copied, which a plant cannot be.
+    """
+
+    def __init__(
+        self,
+        horizon: Any,
+        candidates: int = 256,
+        rounds: int = 4,
+        warm: Controller | None = None,
+        correction: float = 0.3,
+        budget: float | None = 1.0,
+        states: Mapping[str, str] | str | None = None,
+        perfect: bool = False,
+        seed: int = 0,
+        model: Callable[[], Any] | None = None,
+    ) -> None:
+        self.horizon = check_number("horizon", duration("horizon", horizon), positive=True)
+        self.rounds = check_integer("rounds", rounds, 1, LARGEST_COUNT)
+        self.candidates = check_integer("candidates", candidates, self.rounds, LARGEST_COUNT)
+        self.warm = warm
+        self.correction = check_number("correction", correction, 0.0, 1.0)
+        self.budget = None if budget is None else check_number("budget", budget, positive=True)
+        self.perfect = check_flag("perfect", perfect)
+        self.states = _pairs(states)
+        self.seed = check_seed(seed) or 0
+        if model is not None and not callable(model):
+            raise ConfigError(f"model must be a function, got {shown(model)}")
+        self.model = model
+        self._envs: list[FMUVectorEnv] = []
+
+    def bind(self, env: Any, names: Any = None) -> MPC:
+        """See ``Controller.bind``.
+
+        Raises:
+            ConfigError: Also if the environment cannot be saved, its actions have no limits or are
+                no numbers, or the horizon is shorter than a step or longer than the data.
+        """
+        self._env: Any = env.unwrapped
+        return super().bind(env, names)
+
+    def close(self) -> None:
+        """Free the copies."""
+        while self._envs:
+            self._envs.pop().close()
+
+    def _prepare(self) -> None:
+        self.close()
+        self._low, self._high = _limits(self.space)
+        steps = round(self.horizon / self.time_step)
+        if steps < 1:
+            raise ConfigError(
+                f"the horizon of {self.horizon:g} s is shorter than the step of "
+                f"{self.time_step:g} s"
+            )
+        self._plan_shape = steps, self._low.size
+        make = self._model_of()
+        for count in (_COPIES, self.candidates // self.rounds):
+            self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
+        self._prototype = self._envs[0].inside.prototype
+        self._cost_limits = getattr(self._prototype, "cost_limits", {})
+        future = self._prototype.inside.future or Future({}, (), float)
+        self._places = [self._place_of(name) for name in self.states]
+        self._require_fit(future)
+        self._foresight = _Foresight(self.names, future, self.time_step, steps)
+        self._warm = self._bound_warm()
+        self._inverse: FloatArray | None = None
+
+    def _model_of(self) -> Callable[[], Any]:
+        """What makes copies."""
+        if self.model is not None:
+            return self.model
+        with _single(self._env, 0) as env:
+            if env.inside.pool.save_method is None:
+                raise ConfigError(
+                    "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
+                    "'model', a function that makes the environment to plan with"
+                )
+            return partial(copy.copy, env)
+
+    def _require_fit(self, future: Future) -> None:
+        """Refuse a model of another task, a horizon beyond the data, and states beside data."""
+        copied = self._envs[0]
+        names = attribute_of(copied, "observation_names") or self.names
+        space = copied.single_action_space
+        if (names, space) != (self.names, self.space):
+            raise ConfigError(
+                f"the model observes {', '.join(names)} and takes actions of {space}, expected "
+                f"{', '.join(self.names)} and {self.space}"
+            )
+        for name, lookup in future.lookups.items():
+            if self.horizon > lookup.period:
+                raise ConfigError(
+                    f"the horizon of {self.horizon:g} s is longer than the data {name!r}, which "
+                    f"repeat after {lookup.period:g} s; take horizon={lookup.period:g} or less"
+                )
+        if self.states and future.lookups:
+            raise ConfigError(
+                "MPC takes 'states' for tasks without data only, but there is "
+                f"{min(future.lookups)!r}"
+            )
+
+    def _place_of(self, name: str) -> int:
+        self._check_signal("states", name)
+        return self.names.index(name)
+
+    def _bound_warm(self) -> list[Controller]:
+        """The simple controllers, bound to the copies."""
+        declared = self._prototype.inside.controllers
+        found = [] if self.warm is None else [self.warm]
+        if self.warm is None and declared is not None:
+            found = declared()
+        return [one.bind(self._envs[0], self.names) for one in found]
+
+    def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
+        if mask.all():
+            self._episodes: list[_Episode | None] = [None] * self.count
+        for index in np.flatnonzero(mask).tolist():
+            self._episodes[index] = None
+
+    def _decide(self, rows: FloatArray) -> FloatArray:
+        decided = [self._decide_one(index, row) for index, row in enumerate(rows)]
+        return np.array(decided)
+
+    def _decide_one(self, index: int, row: FloatArray) -> FloatArray:
+        begin = perf_counter()
+        with _single(self._env, index) as env:
+            future = env.inside.future
+            now = 0.0 if future is None else float(future.clock(env))
+            episode = self._episodes[index]
+            if episode is None:
+                episode = self._episodes[index] = self._begun(env)
+            else:
+                self._follow(episode, row, now)
+        self._foresight.note(episode.told, row, episode.steps)
+        start, data, assumed = self._start_of(index, episode, row, now)
+        with ExitStack() as stack:
+            for envs in self._envs:
+                stack.enter_context(envs.inside.episodes.assuming(data))
+            best = self._search(episode, start, assumed, row)
+        episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
+        for name, paid in best.costs.items():
+            episode.costs[name] = episode.costs.get(name, 0.0) + paid
+        episode.action = self._actions(episode.plan[np.newaxis])[0, 0]
+        self._require_time(start, perf_counter() - begin)
+        return np.asarray(episode.action, np.float64)
+
+    def _require_time(self, start: Snapshot, took: float) -> None:
+        if start.method != "state" and self.budget is not None and took > self.budget:
+            raise ConfigError(
+                f"a decision took {took:.3g} s of at most {self.budget:g} s: the FMU cannot save "
+                "its state, so that each candidate plays the episode again. Take fewer candidates, "
+                "or a larger budget"
+            )
+
+    # The copies that run beside the environment.
+
+    def _begun(self, env: FMUEnv) -> _Episode:
+        """Begin an episode of the copies; the first one has the nominal parameters."""
+        copied, episode = self._envs[0], _Episode()
+        values = _quantiles(self._prototype, self.seed)
+        if self._prototype.config.draws_start_time:
+            values["start_time"] = np.full(_COPIES, env.time - env.step_count * self.time_step)
+        for place in range(_COPIES if values else 1):
+            mask = np.arange(_COPIES) == place if place else np.ones(_COPIES, np.bool_)
+            options: dict[str, Any] = {"reset_mask": mask}
+            given = {name: float(each[place]) for name, each in values.items()}
+            options |= {"model_parameters": given} if given else {}
+            observations, _ = copied.reset(seed=self.seed, options=options)
+        keys = () if env.inside.future is None else env.inside.future.keys
+        for name, value in env.variables.items():
+            if np.ndim(value) == 0 and name not in keys and name in self._prototype.variables:
+                copied.inside.engine.set_variable(name, float(value))
+        episode.seen = np.asarray(observations, np.float64)
+        episode.errors = np.zeros(episode.seen.shape)
+        episode.snapshot = copied.save_state()
+        episode.plan = np.full(self._plan_shape, 0.5)
+        episode.rng = np.random.default_rng(self.seed)
+        episode.warm = copy.deepcopy(self._warm)
+        if self._inverse is None:
+            self._inverse = self._find_inverse(episode.snapshot[0])
+        episode.offsets = np.zeros((_COPIES, len(self._inverse)))
+        return episode
+
+    def _follow(self, episode: _Episode, row: FloatArray, now: float) -> None:
+        """Let the copies do the step that the environment has done, with what was observed."""
+        if episode.have_ended:
+            return
+        copied = self._envs[0]
+        data = self._foresight.observed(episode.row, row, now)
+        with copied.inside.episodes.assuming(data):
+            copied.restore_state(episode.snapshot)
+            actions = np.repeat(episode.action[np.newaxis], _COPIES, axis=0)
+            observations, _, terminated, truncated, _ = copied.step(actions)
+            goes_on = np.flatnonzero(~(terminated | truncated))
+            episode.have_ended = not len(goes_on)
+            if episode.have_ended:
+                return
+            sources = np.where(terminated | truncated, goes_on[0], np.arange(_COPIES))
+            episode.snapshot = copied.save_state()[sources]
+        episode.seen = np.asarray(observations, np.float64)[sources]
+        off = (row - episode.seen) * self._foresight.is_present
+        episode.errors = _LASTING * episode.errors[sources] + off**2
+        episode.offsets = episode.offsets[sources]
+
+    def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
+        """How offsets of the outputs follow from differences of observations."""
+        copied = self._envs[0]
+        action = self._actions(np.full((1, *self._plan_shape), 0.5))
+        seen = partial(copied.rollout, snapshot, action[:, :1])
+        plain = seen().observations[0, 0].astype(np.float64)
+        columns = []
+        for name in copied.inside.prototype.out:
+            change = seen(offsets={name: 1.0}).observations[0, 0] - plain
+            columns.append(np.where(self._foresight.is_present, change, 0.0))
+        slopes = np.array(columns).T
+        return np.linalg.pinv(np.where(np.abs(slopes) < 1e-4, 0.0, slopes), rcond=1e-6)
+
+    def _start_of(
+        self, index: int, episode: _Episode, row: FloatArray, now: float
+    ) -> tuple[Snapshot, dict[str, Any], dict[str, Any]]:
+        """Where candidates begin, the data that they assume, and more arguments of rollouts."""
+        if self.perfect:
+            is_vector = hasattr(self._env, "num_envs")
+            return self._env.save_state(*([[index]] if is_vector else [])), {}, {}
+        if self.states:
+            return self._moved(episode, row), {}, {"seed": self.seed}
+        assert self._inverse is not None
+        wanted = (row - episode.seen) @ self._inverse.T
+        episode.offsets += self.correction * (wanted - episode.offsets)
+        offsets = episode.offsets[episode.best].tolist()
+        names = list(self._prototype.out)
+        assumed = {"offsets": dict(zip(names, offsets, strict=True)), "seed": self.seed}
+        data = self._foresight.ahead(episode.told, episode.steps, now)
+        return episode.snapshot[episode.best], data, assumed
+
+    def _moved(self, episode: _Episode, row: FloatArray) -> Snapshot:
+        """Let the copies go on in the state that was observed."""
+        expected = episode.seen[:, self._places].mean(axis=0)  # their sensors are noisy, too
+        values = expected + self.correction * (row[self._places] - expected)
+        values = row[self._places] if not episode.steps else values
+        starts = dict(zip(self.states.values(), values.tolist(), strict=True))
+        nominal = {n: float(v[0]) for n, v in _quantiles(self._prototype, self.seed).items()}
+        copied = self._envs[0]
+        seed = self.seed + episode.steps
+        copied.reset(seed=seed, options={"model_parameters": nominal | starts})
+        episode.snapshot, episode.have_ended = copied.save_state(), False
+        return episode.snapshot[0]
+
+    # The search for a plan.
+
+    def _actions(self, plans: FloatArray) -> Any:
+        """The actions of plans of shape (n, steps, m), shape (n, steps, ...)."""
+        values = self._low + plans * (self._high - self._low)
+        if isinstance(self.space, spaces.Discrete):
+            return np.rint(values[..., 0]).astype(self.space.dtype)
+        return values.reshape(*values.shape[:2], *self.space.shape or ()).astype(self.space.dtype)
+
+    def _search(
+        self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
+    ) -> _Plan:
+        """The best plan of all that play."""
+        beside, many = self._envs
+        play = partial(self._best_of, start, assumed, self._allowed(episode))
+        best = play(beside, self._first_plans(episode, start, assumed, row))
+        for _ in range(self.rounds):
+            changed = best.numbers + self._changes(episode.rng, many.num_envs)
+            found = play(many, np.clip(changed, 0.0, 1.0))
+            best = found if found.value > best.value else best
+        return best
+
+    def _changes(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Pulses of single numbers of the action, shape (n, steps, m)."""
+        steps, width = self._plan_shape
+        changes = np.zeros((count, steps, width))
+        for _ in range(_PULSES):
+            lengths = np.exp(rng.uniform(0.0, np.log(max(2.0, steps / 2)), count)).astype(int)
+            begins = (steps + lengths - 1) * rng.uniform(size=count) ** 2
+            since = np.arange(steps)[:, np.newaxis] - np.floor(begins) + lengths - 1
+            heights = rng.uniform(-1.0, 1.0, count) * 10.0 ** -rng.uniform(0.0, _DECADES, count)
+            pulses = heights * ((since >= 0) & (since < lengths))
+            changes[np.arange(count), :, rng.integers(width, size=count)] += pulses.T
+        return changes
+
+    def _best_of(
+        self,
+        start: Snapshot,
+        assumed: Mapping[str, Any],
+        limits: Mapping[str, float],
+        envs: FMUVectorEnv,
+        plans: FloatArray,
+    ) -> _Plan:
+        """The best of some plans; whatever goes beyond the limit of a cost counts far more."""
+        found = envs.rollout(start, self._actions(plans), **assumed)
+        values: FloatArray = found.rewards.sum(axis=1)
+        for name, limit in limits.items():
+            if name in found.costs:
+                excess = np.maximum(found.costs[name].sum(axis=1) - limit, 0.0)
+                values = values - _PENALTY * excess
+        place = int(values.argmax())
+        costs = {name: float(paid[place, 0]) for name, paid in found.costs.items()}
+        return _Plan(float(values[place]), plans[place], costs)
+
+    def _allowed(self, episode: _Episode) -> dict[str, float]:
+        """What costs may add up to until the horizon, from what the episode has left of them."""
+        steps, limit = self._plan_shape[0], self._prototype.inside.step_limit
+        left = steps if limit == sys.maxsize else max(1, limit - episode.steps)
+        return {
+            name: max(0.0, most - episode.costs.get(name, 0.0)) * min(1.0, steps / left)
+            for name, most in self._cost_limits.items()
+        }
+
+    def _first_plans(
+        self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
+    ) -> FloatArray:
+        """The plan of the step before, and those of the simple controllers."""
+        shifted = np.append(episode.plan[1:], episode.plan[-1:], axis=0)
+        if not episode.warm:
+            return shifted[np.newaxis]
+        ahead, actions = copy.deepcopy(episode.warm), list[Any]()
+        for controller in episode.warm:
+            controller.act(np.tile(row, (_COPIES, 1)))
+
+        def policy(observations: Any) -> Any:
+            chosen = np.array([one.act(observations) for one in ahead])
+            turn = np.arange(_COPIES) % len(ahead)
+            actions.append(chosen[turn, np.arange(_COPIES)])
+            return actions[-1]
+
+        self._envs[0].rollout(start, policy, horizon=self._plan_shape[0], **assumed)
+        chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], _COPIES, -1)
+        plans = (chosen - self._low) / (self._high - self._low)
+        return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
+
+
+class _Plan(NamedTuple):
+    """A plan that has played.
+
+    Attributes:
+        value: The return.
+        numbers: The actions until the horizon, from 0 to 1, shape (steps, m).
+        costs: Those of the first step by name.
+    """
+
+    value: float
+    numbers: FloatArray
+    costs: Mapping[str, float]
+
+
+class _Episode:
+    """What is known of the episode of one environment.
+
+    Attributes:
+        snapshot: Where the copies are.
+        seen: What they observe, shape (9, k).
+        errors: The sums of squared differences from what was observed, shape (9, k).
+        offsets: What is added to the outputs of each, shape (9, o).
+        have_ended: Whether their episodes have ended; the last snapshot stays.
+        plan: The latest plan, from 0 to 1, shape (steps, m).
+        action: The latest action, as the copies take it.
+        row: The latest observation.
+        steps: How many there were before.
+        told: The latest forecast of data for each step, by name.
+        rng: Draws candidates.
+        costs: What the costs of past steps add up to, by name, as the plans have foreseen them.
+        warm: The simple controllers, as if they had seen the same.
+    """
+
+    snapshot: Snapshot
+    seen: FloatArray
+    errors: FloatArray
+    offsets: FloatArray
+    plan: FloatArray
+    action: Any
+    row: FloatArray
+    warm: list[Controller]
+    rng: np.random.Generator
+
+    def __init__(self) -> None:
+        self.told: dict[str, dict[int, float]] = {}
+        self.costs: dict[str, float] = {}
+        self.have_ended = False
+        self.steps = 0
+
+    @property
+    def best(self) -> int:
+        """The copy that fits best; each observation counts by what copies differ in it."""
+        totals = self.errors.sum(axis=0)
+        parts = self.errors / np.where(totals > 0.0, totals, 1.0)
+        return int(parts.sum(axis=1).argmin())
+
+
+class _Foresight:
+    """Tells from observations what data will be.
+
+    Args:
+        names: Those of the observation's elements.
+        future: Has the data.
+        time_step: The length of a step in s.
+        steps: Those until the horizon.
+
+    Attributes:
+        is_present: Which elements are present values, shape (k,).
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        future: Future,
+        time_step: float,
+        steps: int,
+    ) -> None:
+        self._lookups, self._time_step, self._steps = future.lookups, time_step, steps
+        self.is_present = np.array(["[" not in name for name in names])
+        self._known: dict[str, list[tuple[int, int]]] = {name: [] for name in future.lookups}
+        self._means = {n: one.mean(future.held_out) for n, one in future.lookups.items()}
+        for place, name in enumerate(names):
+            match = _FORECAST.fullmatch(name)
+            of, ahead = (match[1], float(match[2])) if match else (name, 0.0)
+            if of in self._known:
+                self._known[of].append((round(ahead / time_step), place))
+                self._known[of].sort()
+
+    def note(self, told: dict[str, dict[int, float]], row: FloatArray, step: int) -> None:
+        """Keep what is observed and forecast.
+
+        Args:
+            told: The latest value of each step by name.
+            row: The observation.
+            step: Its number.
+        """
+        for name, known in self._known.items():
+            values = told.setdefault(name, {})
+            values |= {step + ahead: float(row[place]) for ahead, place in known}
+
+    def ahead(
+        self, told: Mapping[str, Mapping[int, float]], step: int, now: float
+    ) -> dict[str, Any]:
+        """Times and values from now on, by name.
+
+        Args:
+            told: The latest value of each step by name.
+            step: The number of the present one.
+            now: The time of the data.
+        """
+        return {name: self._course(name, told[name], step, now) for name in self._lookups}
+
+    def _course(
+        self, name: str, told: Mapping[int, float], step: int, now: float
+    ) -> tuple[Any, Any]:
+        lookup, known = self._lookups[name], self._known[name]
+        if not known:
+            return [now], [self._means[name]]
+        count = min(self._steps + 2, int(np.ceil(lookup.period / self._time_step)))
+        aheads, places = np.array([ahead for ahead, _ in known]), np.arange(count)
+        values = np.array([told[step + ahead] for ahead in aheads.tolist()])
+        if lookup.is_stepped:
+            course = values[np.maximum(np.searchsorted(aheads, places, side="right") - 1, 0)]
+        else:
+            course = np.interp(places, aheads, values)
+        day = round(_DAY / self._time_step)
+        for place in range(count):
+            if step + place in told:
+                course[place] = told[step + place]
+            elif place > aheads[-1]:
+                before = course[place - day] if place >= day else course[place]
+                course[place] = told.get(step + place - day, before)
+        return now + places * self._time_step, course
+
+    def observed(self, before: FloatArray, row: FloatArray, now: float) -> dict[str, Any]:
+        """Times and values of the step that has just ended, by name."""
+        found = {}
+        for name in self._lookups:
+            places = [place for ahead, place in self._known[name] if ahead == 0]
+            values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
+            found[name] = [now - self._time_step, now], values
+        return found
+
+
+def _limits(space: spaces.Space[Any]) -> tuple[FloatArray, FloatArray]:
+    """The lowest and the highest numbers of an action."""
+    if isinstance(space, spaces.Discrete):
+        first = float(space.start)
+        return np.array([first]), np.array([first + float(space.n) - 1])
+    if not isinstance(space, spaces.Box):
+        raise ConfigError(f"MPC needs actions of numbers or one choice, but they are of {space}")
+    low, high = (np.asarray(side, np.float64).ravel() for side in (space.low, space.high))
+    if not np.isfinite([low, high]).all():
+        raise ConfigError("MPC needs actions with limits: give their variables 'min' and 'max'")
+    return low, high
+
+
+@contextmanager
+def _single(env: Any, index: int) -> Iterator[FMUEnv]:
+    """An environment, or one of many."""
+    if not hasattr(env, "num_envs"):
+        yield env
+        return
+    with env.inside.engine.single(index) as one:
+        yield one
+
+
+def _quantiles(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
+    """Values of the parameters that are drawn, by name, one for each copy; medians come first."""
+    rng, found = np.random.default_rng(seed), {}
+    others = np.delete(np.arange(_COPIES), _COPIES // 2)
+    for name, value in env.config.model_parameters.items():
+        if is_distribution(value):
+            drawn = [value.sample(rng) for _ in range(_SAMPLES)]
+            each = np.quantile(drawn, (np.arange(_COPIES) + 0.5) / _COPIES)
+            found[name] = each[[_COPIES // 2, *rng.permutation(others)]]
+    return found
+
+
+def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:
+    if not isinstance(states, str):
+        return dict(states or {})
+    pairs = [part.split(":") for part in states.split(",")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise ConfigError(f"states must be as in 'theta:theta_0,w:w_0', got {shown(states)}")
+    return dict(pairs)

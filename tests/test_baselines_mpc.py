@@ -1,0 +1,481 @@
+"""Model predictive control: plans, what they assume of the future, and where they begin."""
+
+import json
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+from PIL import Image
+
+import fmugym
+from fmugym import ConfigError
+from fmugym.baselines import MPC, PID, controller_of
+from fmugym.baselines.mpc import _Foresight
+from fmugym.envs import CartPoleEnv
+from fmugym.episodes.simulation import policy_of, simulate
+from fmugym.task.future import Future, Lookup
+from fmugym.tools.cli import main
+
+HOUR, DT = 3600.0, 600.0
+CALM = np.zeros(24)
+
+
+def wheel(wind=CALM, forecast="2h", observed=True, limits=(-1, 1), **changes):
+    """A wheel without friction, whose speed shall be 1: reaching it takes four steps."""
+    seen = ["q_dot", "wind"] if observed else ["q_dot"]
+    ahead = {"forecast": {"of": ["wind"], "horizon": forecast, "step": "1h"}} if forecast else {}
+    return {
+        "fmu": {"bundled": "Pendulum"},
+        "time_step": DT,
+        "episode_length": "10h",
+        "clock": 2 * HOUR,
+        "parameters": {
+            **dict.fromkeys(("g", "b", "c"), 0.0),
+            **dict.fromkeys(("m", "l"), 1.0),
+            "body": "point_mass",
+            "max_step": DT,
+            "tau_max": 1.0,
+            "theta_dot_max": 1e6,
+        },
+        "variables": {"push": dict(zip(("min", "max"), limits, strict=True)) if limits else {}},
+        "data": {"wind": {"values": np.array(wind).tolist(), "step": HOUR}},
+        "inputs": {"tau": "0.25 / 600 * push + wind"},
+        "agent": {"actions": ["push"], "observations": seen, **ahead},
+        "reward": "-(q_dot - 1)**2",
+    } | changes
+
+
+def play(env, controller, steps, seed=0):
+    """The actions and the rewards of an episode."""
+    controller.bind(env)
+    observation, info = env.reset(seed=seed)
+    actions, rewards = [], []
+    for _ in range(steps):
+        actions.append(np.array(controller.act(observation, info)))
+        observation, reward, terminated, truncated, info = env.step(actions[-1])
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return np.array(actions), np.array(rewards)
+
+
+def lookup(period, times, values):
+    """That of a series of its own."""
+    return Lookup(
+        {"wind": np.array([*times, *values, 0.0, values[-1]])}, "wind", 0.0, period, False
+    )
+
+
+def mpc(horizon="1h 40min", **arguments):
+    return MPC(horizon, **{"candidates": 128} | arguments)
+
+
+@pytest.fixture
+def opened():
+    envs = []
+
+    def make(task, **changes):
+        envs.append(fmugym.load(task) if isinstance(task, dict) else task(**changes))
+        return envs[-1].unwrapped
+
+    yield make
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def bound():
+    controllers = []
+
+    def make(*arguments, **options):
+        controllers.append(mpc(*arguments, **options))
+        return controllers[-1]
+
+    yield make
+    for controller in controllers:
+        controller.close()
+
+
+class TestPlans:
+    def test_are_nearly_the_best(self, opened, bound):
+        """The best is full push for four steps, and none afterwards."""
+        best = [-((1 - 0.25 * step) ** 2) for step in (1, 2, 3, 4)]
+        for arguments in ({}, {"perfect": True}):
+            actions, rewards = play(opened(wheel()), bound(**arguments), 12)
+            assert rewards[:4] == pytest.approx(best, abs=0.02)
+            assert np.abs(rewards[4:]).max() < 0.005
+            assert actions[:3] == pytest.approx(np.ones((3, 1)), abs=0.05)
+
+    def test_are_the_same_again(self, opened, bound):
+        first, second, other = (
+            play(opened(wheel()), bound(seed=seed), 6)[0].tolist() for seed in (1, 1, 2)
+        )
+        assert first == second != other
+
+    def test_differ_by_two_pulses(self, opened, bound):
+        """Most of them begin in the first half, with heights of all magnitudes."""
+        controller = bound("10h")
+        controller.bind(opened(wheel()))
+        changes = controller._changes(np.random.default_rng(0), 1000)[:, :, 0]
+        jumps = np.diff(changes, axis=1, prepend=0.0, append=0.0) != 0
+        assert jumps.any(axis=1).all()
+        assert jumps.sum(axis=1).max() == 4
+        assert 600 < (jumps[:, :30].sum(axis=1) > 1).sum() < 1000
+        heights = np.abs(changes).max(axis=1)
+        assert np.quantile(heights, [0.1, 0.9]) == pytest.approx([0.05, 0.6], rel=0.5)
+
+    def test_go_on_with_that_of_the_step_before(self, opened, bound):
+        """A search that finds nothing keeps what it had, step by step."""
+        controller = bound(candidates=8, rounds=2)
+        env = opened(wheel())
+        play(env, controller, 1)
+        episode = controller._episodes[0]
+        before = episode.plan = np.linspace(1.0, 0.0, 10)[:, None]
+        first = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
+        assert first[0].ravel().tolist() == [*before[1:, 0], 0.0]
+
+    def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, opened, bound):
+        """A search of two candidates a round finds little itself."""
+        pid = {"of": "q_dot", "setpoint": 1.0, "kp": 2.0}
+        few = {"candidates": 16, "rounds": 2}
+        _, alone = play(opened(wheel()), PID(**pid), 10)
+        _, rewards = play(opened(wheel()), bound(warm=PID(**pid), **few), 10)
+        assert rewards.sum() > alone.sum() - 0.01
+
+    def test_begin_with_what_the_task_file_declares(self, opened, bound):
+        """Ranges have their middle; other plans are none."""
+        given = {
+            "pi": "pid of=q_dot setpoint=1 kp=1..4",
+            "off": "hysteresis of=q_dot setpoint=1 band=0.1",
+            "ahead": "mpc horizon=1h",
+            "still": 0.0,
+        }
+        controller = bound()
+        env = opened(wheel(controllers=given))
+        play(env, controller, 2)
+        episode = controller._episodes[0]
+        pid, thermostat = episode.warm
+        assert pid.kp == pytest.approx(2.5)
+        assert thermostat.band == pytest.approx(0.1)
+        plans = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
+        assert plans.shape == (3, 10, 1)
+        expected = PID("q_dot", 1.0, kp=2.5)
+        copies = opened(wheel())
+        actions, _ = play(copies, expected, 11)
+        assert 2 * plans[1, :, 0] - 1 == pytest.approx(actions[1:, 0], abs=0.01)
+
+    def test_of_several_environments_are_those_of_single_ones(self, opened, bound):
+        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
+        envs = fmugym.FMUVectorEnv(partial(fmugym.load, task), 2, autoreset_mode="Disabled")
+        controller = bound().bind(envs)
+        observations, infos = envs.reset(seed=3)
+        rows = []
+        for _ in range(4):
+            rows.append(controller.act(observations, infos))
+            observations, *_, infos = envs.step(rows[-1])
+        envs.close()
+        for index in range(2):
+            alone, _ = play(opened(task), bound(), 4, seed=3 + index)
+            assert np.array(rows)[:, index].tolist() == alone.tolist()
+
+    def test_balance_a_cart_pole(self, opened, bound):
+        _, rewards = play(opened(CartPoleEnv), bound("0.4s", perfect=True), 60)
+        assert len(rewards) == 60
+
+
+class TestCosts:
+    @pytest.mark.parametrize(("limit", "length"), [(2.0, "10h"), (1.0, None)])
+    def test_stay_within_their_limits(self, opened, bound, limit, length):
+        """Four full pushes would be best."""
+        costs = {"effort": {"expr": "abs(push)", "limit": limit}}
+        env = opened(wheel(costs=costs, episode_length=length))
+        actions, _ = play(env, bound("3h 20min"), 20)
+        spent = np.abs(actions).sum()
+        assert 0.03 * limit < spent <= limit
+        free, _ = play(opened(wheel()), bound("3h 20min"), 20)
+        assert np.abs(free).sum() > 3.9
+
+
+class TestFuture:
+    def test_is_not_known_beyond_the_forecast(self, opened, bound):
+        later = CALM.copy()
+        later[8:] = 1e-3
+        same = [play(opened(wheel(wind)), bound("4h"), 12)[0].tolist() for wind in (CALM, later)]
+        assert same[0] == same[1]
+        known = [
+            play(opened(wheel(wind)), bound("8h", perfect=True), 4)[0].tolist()
+            for wind in (CALM, later)
+        ]
+        assert known[0] != known[1]
+
+    def test_is_known_as_far_as_the_forecast_goes(self, opened, bound):
+        """Wind comes in half an hour; who knows brakes before it."""
+        gust = CALM.copy()
+        gust[3] = 1.5e-3
+        rewards = {
+            forecast: play(opened(wheel(gust, forecast)), bound(), 18)[1].sum()
+            for forecast in ("2h", None)
+        }
+        assert rewards["2h"] > rewards[None] + 0.05
+
+    def test_of_a_forecast(self):
+        future = Future({"wind": lookup(365 * 86400.0, [0.0, 1.0], [0.0, 0.0])}, (), float)
+        names = ("x", "wind", "wind[+10800 s]", "wind[+7200 s]")
+        foresight = _Foresight(names, future, HOUR, 30)
+        now, told = np.array([0.0, 5.0, 8.0, 6.0]), {}
+        foresight.note(told, now, 0)
+        times, values = foresight.ahead(told, 0, 1e6)["wind"]
+        assert (times - 1e6).tolist() == [HOUR * k for k in range(32)]
+        assert values[:4].tolist() == [5.0, 5.5, 6.0, 8.0]
+        assert values[4:24].tolist() == [8.0] * 20  # nothing is known of the day before
+        assert values[24:].tolist() == [5.0, 5.5, 6.0] + [8.0] * 5
+        for hour in range(23):
+            foresight.note(told, np.array([0.0, 100.0 + hour, 200.0 + hour, 300.0 + hour]), hour)
+        foresight.note(told, now, 23)
+        times, values = foresight.ahead(told, 23, 1e6)["wind"]
+        assert values[:4].tolist() == [5.0, 322.0, 6.0, 8.0]  # the second was forecast an hour ago
+        assert values[4:24].tolist() == [103.0 + k for k in range(20)]  # of a day before
+        assert values[24:28].tolist() == [5.0, 322.0, 6.0, 8.0]
+        assert foresight.is_present.tolist() == [True, True, False, False]
+
+    def test_of_data_that_are_not_observed_is_their_mean(self):
+        rows = [0.0, 1.0, 3.0, 4.0], [0.0, 2.0, 2.0, 0.0]
+        future = Future({"wind": lookup(4.0, *rows)}, (), float)
+        foresight = _Foresight(("x",), future, 1.0, 3)
+        told = {}
+        foresight.note(told, np.zeros(1), 0)
+        assert foresight.ahead(told, 0, 9.0) == {"wind": ([9.0], [1.5])}
+        assert foresight.observed(np.zeros(1), np.zeros(1), 9.0)["wind"] == ([8.0, 9.0], [1.5, 1.5])
+
+    @pytest.mark.parametrize("interpolation", ["linear", "previous"])
+    def test_mean_leaves_scenarios_out(self, opened, interpolation):
+        """Values of 1 from 10 to 12 January and on 30 December, which are held out; else 3."""
+        days = np.full(365, 3.0)
+        days[[9, 10, 11, 363]] = 1.0
+        rows = {"values": days.repeat(24).tolist(), "step": HOUR, "interpolation": interpolation}
+        scenarios = {
+            "frost": {"start": "01-09", "length": "4d"},
+            "turn": {"start": "12-29", "length": "2d"},
+        }
+        task = wheel(observed=False, forecast=None, data={"wind": rows}, scenarios=scenarios)
+        for scenario in (None, "frost"):
+            env = opened(partial(fmugym.load, task, scenario=scenario))
+            future = env.inside.future
+            assert future.lookups["wind"].mean() < 2.99
+            foresight = _Foresight(("q_dot",), future, DT, 3)
+            _, values = foresight.ahead({"wind": {}}, 0, 0.0)["wind"]
+            assert values == pytest.approx([3.0], abs=1e-12)
+
+    @pytest.mark.parametrize("scenario", [None, "autumn"])
+    def test_mean_is_that_of_the_season(self, opened, scenario):
+        """Values of 1 from November to March, with a week that begins on 1 March; else 5."""
+        days = np.full(365, 5.0)
+        days[304:], days[:66] = 1.0, 1.0
+        task = wheel(
+            observed=False,
+            forecast=None,
+            episode_length="7d",
+            clock={"from": "11-01", "to": "03-01"},
+            data={"wind": {"values": days.repeat(24).tolist(), "step": HOUR}},
+            scenarios={"autumn": {"start": "09-01", "length": "2d"}},
+        )
+        future = opened(partial(fmugym.load, task, scenario=scenario)).inside.future
+        assert future.lookups["wind"].mean(future.held_out) == pytest.approx(1.0, abs=0.01)
+
+    def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
+        daily = lookup(86400.0, [0.0, 43200.0, 86400.0], [1.0, 5.0, 1.0])
+        assert daily.mean([(0.0, 1e6)]) == 3.0
+
+
+class TestModel:
+    def test_is_corrected_by_offsets(self, opened, bound):
+        """The wheel begins by 0.24 faster than the copies, and so it stays."""
+        env = opened(wheel(parameters=wheel()["parameters"] | {"q_dot_0": 0.24}))
+        errors = {}
+        for correction in (0.0, 0.5):
+            controller = bound(correction=correction, model=partial(fmugym.load, wheel()))
+            _, rewards = play(env, controller, 25)
+            errors[correction] = np.sqrt(-rewards[12:].mean())
+        assert errors[0.0] == pytest.approx(0.24, abs=0.03)
+        assert errors[0.5] < 0.08
+
+    def test_begins_in_the_nominal_state(self, opened, bound):
+        """Speeds are drawn around 0.5; that of the first copy begins there, others beside it."""
+        task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0.4, 0.6)})
+        controller = bound()
+        play(opened(task), controller, 1)
+        speeds = controller._episodes[0].seen[:, 0]
+        assert speeds[0] == pytest.approx(0.5, abs=0.01)
+        assert sorted(speeds) == pytest.approx(0.4 + 0.2 * (np.arange(9) + 0.5) / 9, abs=0.01)
+
+    def test_is_the_copy_that_fits_best(self, opened, bound):
+        """The wheel is lighter than the median; a thrust moves it further."""
+        own = wheel()["parameters"] | {"m": fmugym.Uniform(0.5, 1.5)}
+        env, controller = opened(wheel(parameters=own)), bound(seed=1)
+        seed = next(s for s in range(99) if env.reset(seed=s)[1]["drawn"]["m"] < 0.6)
+        play(env, controller, 4, seed)
+        episode = controller._episodes[0]
+        expected = np.abs(episode.seen[:, 0] - env.state[0]).argmin()
+        assert episode.best == expected != 0
+
+    def test_may_be_another_environment(self, opened, bound):
+        """That of the planner is twice as heavy: it pushes too hard."""
+        heavy = wheel(parameters=wheel()["parameters"] | {"m": 2.0})
+        controller = bound(model=partial(fmugym.load, heavy), correction=0.0)
+        play(opened(wheel()), controller, 2)
+        assert controller._episodes[0].seen[0, 0] == pytest.approx(0.125, abs=0.02)
+
+    def test_may_begin_in_the_observed_state(self, opened, bound):
+        """A pendulum swings up that is too heavy to be lifted; its sensors are noisy."""
+        task = {
+            "fmu": {"bundled": "Pendulum"},
+            "time_step": 0.05,
+            "episode_length": "10s",
+            "parameters": {
+                "theta_0": {"distribution": "uniform", "low": 2.9, "high": 3.1},
+                "m": 1.0,
+                "l": 1.0,
+                "g": 10.0,
+                "b": 0.05,
+                "body": "uniform_rod",
+                "tau_max": 2.0,
+                "solver": "rk4",
+                "max_step": 0.025,
+            },
+            "variables": {
+                "theta": {"noise": 0.02},
+                "theta_dot": {"noise": 0.05},
+                "tau": {"min": -2, "max": 2},
+            },
+            "agent": {"actions": ["tau"], "observations": ["theta", "theta_dot"]},
+            "reward": "-(4 * (1 - cos(theta)) + 0.1 * theta_dot**2)",
+        }
+        states = "theta:theta_0,theta_dot:theta_dot_0"
+        controller = bound("1.5s", candidates=512, states=states)
+        _, rewards = play(opened(task), controller, 200, seed=2)
+        assert rewards[:10].max() < -7.0
+        assert rewards[-60:].min() > -4 * (1 - np.cos(np.radians(15))) - 0.1  # upright
+
+
+class TestText:
+    def test_names_the_arguments(self):
+        controller = controller_of(
+            "mpc horizon=24h candidates=64 perfect=true warm='pid of=q_dot setpoint=1 kp=2'"
+        )
+        assert (controller.horizon, controller.candidates, controller.perfect) == (86400, 64, True)
+        assert isinstance(controller.warm, PID)
+
+    def test_stands_in_task_files(self, opened):
+        text = "mpc horizon=1h candidates=32"
+        env = opened(wheel(controllers={"ahead": text}))
+        summary = simulate(env, policy_of(env, "ahead"), 0, 6)
+        assert summary.total_reward > -2.0
+
+
+class TestRefusals:
+    @pytest.mark.parametrize(
+        ("arguments", "reason"),
+        [
+            ({"horizon": "soon"}, "horizon must be"),
+            ({"horizon": 0}, "horizon"),
+            ({"rounds": 2.5}, "rounds must be an integer"),
+            ({"candidates": 3}, "candidates"),
+            ({"correction": 2.0}, "correction"),
+            ({"perfect": "maybe"}, "perfect must be True or False"),
+            ({"budget": 0}, "budget"),
+            ({"states": "theta"}, "states must be as in"),
+            ({"model": "house.toml"}, "model must be a function"),
+        ],
+    )
+    def test_of_arguments(self, arguments, reason):
+        with pytest.raises(ConfigError, match=reason):
+            MPC(**{"horizon": "1h"} | arguments)
+
+    @pytest.mark.parametrize(
+        ("task", "arguments", "reason"),
+        [
+            (wheel(limits=None), {}, "'min' and 'max'"),
+            (wheel(), {"horizon": 60.0}, "shorter than the step"),
+            (wheel(), {"horizon": "25h"}, "'wind', which repeat after 86400 s; take horizon=86400"),
+            (wheel(), {"states": {"q_dt": "q_dot_0"}}, "'q_dot'"),
+            (wheel(), {"states": {"q_dot": "q_dot_0"}}, "without data"),
+            (wheel(), {"model": CartPoleEnv}, "the model observes x, x_dot"),
+        ],
+    )
+    def test_of_tasks(self, opened, bound, task, arguments, reason):
+        with pytest.raises(ConfigError, match=reason):
+            bound(**arguments).bind(opened(task))
+
+    def test_of_actions_that_are_several_choices(self, opened, bound):
+        class Several(CartPoleEnv):
+            def _get_action_space(self):
+                return gymnasium.spaces.MultiDiscrete([2, 2])
+
+            def _get_inputs(self):
+                return 10.0 * self.action[0]
+
+        with pytest.raises(ConfigError, match="numbers or one choice"):
+            bound().bind(opened(Several))
+
+    def test_of_plants(self, opened, bound):
+        plant = opened(partial(CartPoleEnv, backend="fmpy"))
+        with pytest.raises(ConfigError, match="a backend stands in for this one: give 'model'"):
+            bound().bind(plant)
+        _, rewards = play(plant, bound("0.4s", model=CartPoleEnv), 15)
+        assert len(rewards) == 15
+
+    def test_of_slow_replays(self, opened, bound):
+        env = opened(partial(CartPoleEnv, fmi_version="1.0"))
+        controller = bound("0.4s", budget=1e-6).bind(env)
+        observation, info = env.reset(seed=0)
+        with pytest.raises(ConfigError, match="cannot save its state"):
+            controller.act(observation, info)
+
+
+class TestCommandLine:
+    @pytest.fixture
+    def path(self, tmp_path):
+        path = tmp_path / "wheel.toml"
+        fmugym.Task.of(wheel(controllers={"ahead": "mpc horizon=1h candidates=64"})).write(path)
+        return str(path)
+
+    def test_compares_it_with_others(self, path, tmp_path, capsys):
+        perfect = "mpc horizon=1h candidates=64 perfect=true"
+        names = ["pid of=q_dot setpoint=1 kp=1", "ahead", perfect]
+        asked = [word for name in names for word in ("--controller", name)]
+        plot = tmp_path / "scores.png"
+        options = ["--steps", "8", "--episodes", "2", "--plot", str(plot), "--json"]
+        assert main(["evaluate", path, *asked, *options]) == 0
+        scores = json.loads(capsys.readouterr().out)["scores"]
+        found = {score["name"]: score["mean_reward"] for score in scores}
+        assert found[names[0]] < found["ahead"]
+        assert found[perfect] == pytest.approx(found["ahead"], abs=0.02)
+        with Image.open(plot) as image:
+            assert image.size[1] > 300
+
+    def test_training_compares_it_where_there_is_time(self, tmp_path, capsys):
+        given = {
+            "pi": "pid of=q_dot setpoint=1 kp=0.1..4",
+            "ahead": "mpc horizon=1h candidates=64",
+            "slow": "mpc horizon=10h candidates=20000",
+        }
+        path = tmp_path / "wheel.toml"
+        fmugym.Task.of(wheel(controllers=given)).write(path)
+        options = ["--output", str(tmp_path / "agent"), "--rounds", "9", "--envs", "8"]
+        assert main(["train", str(path), *options, "--episodes", "2", "--json"]) == 0
+        told = capsys.readouterr()
+        found = json.loads(told.out)
+        test, baseline = found["test"], found["baseline"]
+        assert test["ahead"]["total_reward"] > test[baseline]["total_reward"] - 0.01
+        assert "slow" not in test
+        assert "left out: slow, whose test would take about" in told.err
+
+    def test_its_numbers_are_not_tuned(self, path, capsys):
+        assert main(["tune", path, "mpc horizon=3600..7200"]) == 1
+        assert "'mpc' cannot be tuned; known are: hysteresis, pid" in capsys.readouterr().err
+
+    def test_it_does_not_act_in_a_warm_up(self, opened):
+        table = {"period": "1h", "controller": "mpc horizon=1h"}
+        with pytest.raises(ConfigError, match="none of in a warm-up"):
+            opened(wheel(warm_up=table))
