@@ -97,6 +97,7 @@ POSITIONAL = {
     **dict.fromkeys(("validate", "simulate", "evaluate", "bench"), ("task.toml",)),
     "train": ("task.toml", "--output", "agent"),
     "tune": ("task.toml", "pid of=q setpoint=1 kp=0.1..1"),
+    "fit": ("task.toml", "--log", "log.csv"),
     "export": ("agent", "--task", "task.toml", "--output", "agent.c"),
     "demo": (),
 }
@@ -167,6 +168,9 @@ COMMANDS = {
     ("bench", "task.toml", "--seconds", "-1"): ("--seconds", "-1"),
     ("tune", "task.toml", "pid of=q setpoint=1 kp=1"): ("range", "kp=0.05..5"),
     ("tune", "task.toml", "pid of=q kp=1..a"): ("'1..a'", "range"),
+    ("fit", "task.toml", "--log", "log.csv", "--plot", "a.pgn"): ("'a.pgn'", ".png"),
+    ("fit", "task.toml", "--log", "log.csv", "--output", "a.tml"): ("'a.tml'", ".toml"),
+    ("fit", "task.toml", "--log", "no.csv", "--parameter", "l"): ("'no.csv'", "cannot be read"),
     ("export", "nowhere", "--task", "task.toml", "--output", "a.cc"): ("'a.cc'", ".onnx"),
     ("export", "x", "--task", "task.toml", "--output", "a.c", "--fmi", "4.0"): ("--fmi", "'4.0'"),
     ("demo", "--seed", "-1"): ("seed", "-1"),

@@ -17,7 +17,7 @@ typedef struct {
     Logger logger;
 } Callbacks;
 
-enum { NUMBERS = 8, HARMLESS_STEPS = 15, HARMLESS_RESETS = 2 };
+enum { NUMBERS = 512, HARMLESS_STEPS = 15, HARMLESS_RESETS = 2 };
 
 typedef struct {
     double values[2];
@@ -82,6 +82,7 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
     Mortal *me = calloc(1, sizeof *me);
     snprintf(me->token, sizeof me->token, "%s", token);
     me->numbers = calloc(NUMBERS, sizeof *me->numbers);
+    me->beside = calloc(NUMBERS, sizeof *me->beside);
     shared = shared == NULL ? malloc(NUMBERS) : shared;
     return me;
 }
@@ -92,6 +93,7 @@ void fmi2FreeInstance(Mortal *me) {
         free(shared);
     }
     free(me->numbers);
+    free(me->beside);
     free(me);
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import duration
+from fmugym.episodes.output_files import require_picture
 from fmugym.errors import ConfigError, shown
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
@@ -92,6 +93,8 @@ def _fit(arguments: argparse.Namespace) -> None:
     make_env, output = maker_of(arguments.task, None, arguments.master), arguments.output
     if output is not None:
         require_new_task(output)
+    if arguments.plot is not None:
+        require_picture(arguments.plot)
     if not arguments.parameter:
         raise ConfigError(f"name what to fit with --parameter: {_possible(make_env)}")
     wash_in = arguments.wash_in
