@@ -94,7 +94,7 @@ def command(*arguments: str, facts: tuple[str, ...]) -> Mistake:
 
 POSITIONAL = {
     **dict.fromkeys(("info", "new"), ("model.fmu",)),
-    **dict.fromkeys(("validate", "simulate", "evaluate", "bench"), ("task.toml",)),
+    **dict.fromkeys(("validate", "simulate", "evaluate", "serve", "bench"), ("task.toml",)),
     "train": ("task.toml", "--output", "agent"),
     "tune": ("task.toml", "pid of=q setpoint=1 kp=0.1..1"),
     "fit": ("task.toml", "--log", "log.csv"),

@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from typing import Final
 
+from fmugym.signals import ordinary
+
 __all__ = ["Background"]
 
 _PATIENCE: Final = 0.1
@@ -46,7 +48,7 @@ class Background:
         self._is_ready.set()
         try:
             await self._make()
-        except Exception as error:
+        except ordinary(Exception) as error:
             self.error = error
 
     def _cancel(self) -> None:

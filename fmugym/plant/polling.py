@@ -94,7 +94,7 @@ class Poller:
         while True:
             try:
                 await self._converse()
-            except TimeoutError:
+            except ordinary(TimeoutError):
                 self._note(f"it does not answer within {self._timeout:g} s")
             except ordinary(Exception) as error:  # whatever a library makes of a broken line
                 is_own = isinstance(error, LostError)

@@ -23,6 +23,7 @@ from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
     Commands,
     add_command,
+    add_json,
     add_players,
     check_numbers,
     only_player,
@@ -138,6 +139,7 @@ def add_serve(commands: Commands) -> None:
     command.add_argument("--seed", type=int, default=0, metavar="N", help="default 0")
     command.add_argument("--steps", type=int, metavar="N", help="how many; default no end")
     _add_speed(command)
+    add_json(command)
 
 
 def _serve(arguments: argparse.Namespace) -> None:
@@ -146,7 +148,10 @@ def _serve(arguments: argparse.Namespace) -> None:
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
     task, player = _task_of(arguments), only_player(arguments)
     with Server(task, player, clock=_clock(arguments), **options) as server:
-        say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
+        if arguments.json:
+            say_json({"task": arguments.task, "address": server.address})
+        else:
+            say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
         sys.stdout.flush()  # a program may wait for the address
         while not server.wait(0.2):
             pass
