@@ -23,6 +23,7 @@ typedef struct {
     double values[2];
     char token[32];
     double *numbers; /* a block of memory of its own */
+    double *beside;  /* most likely the next block, so that what is beyond the first one is ours */
     int steps, resets;
 } Mortal;
 
