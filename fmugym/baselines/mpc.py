@@ -6,7 +6,7 @@ import copy
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from functools import partial
 from time import perf_counter
 from typing import Any, Final, NamedTuple
@@ -41,7 +41,7 @@ _DECADES: Final = 1.5
 """Over so many powers of ten the heights of pulses are spread."""
 
 _COPIES: Final = 9
-"""So many copies run beside each environment."""
+"""So many different copies run beside each environment."""
 
 _LASTING: Final = 0.98
 """The part of the past errors of a copy that counts after a step."""
@@ -119,7 +119,7 @@ class MPC(Controller):
         if model is not None and not callable(model):
             raise ConfigError(f"model must be a function, got {shown(model)}")
         self.model = model
-        self._envs: list[FMUVectorEnv] = []
+        self._copies: FMUVectorEnv | None = None
 
     def bind(self, env: Any, names: Any = None) -> MPC:
         """See ``Controller.bind``.
@@ -133,8 +133,9 @@ class MPC(Controller):
 
     def close(self) -> None:
         """Free the copies."""
-        while self._envs:
-            self._envs.pop().close()
+        if self._copies is not None:
+            self._copies.close()
+            self._copies = None
 
     def _prepare(self) -> None:
         self.close()
@@ -147,9 +148,9 @@ class MPC(Controller):
             )
         self._plan_shape = steps, self._low.size
         make = self._model_of()
-        for count in (_COPIES, self.candidates // self.rounds):
-            self._envs.append(FMUVectorEnv(make, count, autoreset_mode="Disabled"))
-        self._prototype = self._envs[0].inside.prototype
+        self._many = max(_COPIES, self.candidates // self.rounds)
+        self._copies = FMUVectorEnv(make, self._many, autoreset_mode="Disabled")
+        self._prototype = self._copies.inside.prototype
         self._cost_limits = getattr(self._prototype, "cost_limits", {})
         future = self._prototype.inside.future or Future({}, (), float)
         self._places = [self._place_of(name) for name in self.states]
@@ -157,6 +158,12 @@ class MPC(Controller):
         self._foresight = _Foresight(self.names, future, self.time_step, steps)
         self._warm = self._bound_warm()
         self._inverse: FloatArray | None = None
+
+    @property
+    def _copied(self) -> FMUVectorEnv:
+        """The copies; the first nine run beside an environment, and all try plans."""
+        assert self._copies is not None
+        return self._copies
 
     def _model_of(self) -> Callable[[], Any]:
         """What makes copies."""
@@ -172,7 +179,7 @@ class MPC(Controller):
 
     def _require_fit(self, future: Future) -> None:
         """Refuse a model of another task, a horizon beyond the data, and states beside data."""
-        copied = self._envs[0]
+        copied = self._copied
         names = attribute_of(copied, "observation_names") or self.names
         space = copied.single_action_space
         if (names, space) != (self.names, self.space):
@@ -202,7 +209,7 @@ class MPC(Controller):
         found = [] if self.warm is None else [self.warm]
         if self.warm is None and declared is not None:
             found = declared()
-        return [one.bind(self._envs[0], self.names) for one in found]
+        return [one.bind(self._copied, self.names) for one in found]
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if mask.all():
@@ -226,9 +233,7 @@ class MPC(Controller):
                 self._follow(episode, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
-        with ExitStack() as stack:
-            for envs in self._envs:
-                stack.enter_context(envs.inside.episodes.assuming(data))
+        with self._copied.inside.episodes.assuming(data):
             best = self._search(episode, start, assumed, row)
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
@@ -238,7 +243,7 @@ class MPC(Controller):
         return np.asarray(episode.action, np.float64)
 
     def _require_time(self, start: Snapshot, took: float) -> None:
-        if start.method != "state" and self.budget is not None and took > self.budget:
+        if start.method == "replay" and self.budget is not None and took > self.budget:
             raise ConfigError(
                 f"a decision took {took:.3g} s of at most {self.budget:g} s: the FMU cannot save "
                 "its state, so that each candidate plays the episode again. Take fewer candidates, "
@@ -249,12 +254,12 @@ class MPC(Controller):
 
     def _begun(self, env: FMUEnv) -> _Episode:
         """Begin an episode of the copies; the first one has the nominal parameters."""
-        copied, episode = self._envs[0], _Episode()
+        copied, episode = self._copied, _Episode()
         values = _quantiles(self._prototype, self.seed)
         if self._prototype.config.draws_start_time:
             values["start_time"] = np.full(_COPIES, env.time - env.step_count * self.time_step)
         for place in range(_COPIES if values else 1):
-            mask = np.arange(_COPIES) == place if place else np.ones(_COPIES, np.bool_)
+            mask = np.arange(self._many) == place if place else np.ones(self._many, np.bool_)
             options: dict[str, Any] = {"reset_mask": mask}
             given = {name: float(each[place]) for name, each in values.items()}
             options |= {"model_parameters": given} if given else {}
@@ -271,24 +276,24 @@ class MPC(Controller):
         episode.warm = copy.deepcopy(self._warm)
         if self._inverse is None:
             self._inverse = self._find_inverse(episode.snapshot[0])
-        episode.offsets = np.zeros((_COPIES, len(self._inverse)))
+        episode.offsets = np.zeros((self._many, len(self._inverse)))
         return episode
 
     def _follow(self, episode: _Episode, row: FloatArray, now: float) -> None:
         """Let the copies do the step that the environment has done, with what was observed."""
         if episode.have_ended:
             return
-        copied = self._envs[0]
+        copied = self._copied
         data = self._foresight.observed(episode.row, row, now)
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
-            actions = np.repeat(episode.action[np.newaxis], _COPIES, axis=0)
+            actions = np.repeat(episode.action[np.newaxis], self._many, axis=0)
             observations, _, terminated, truncated, _ = copied.step(actions)
             goes_on = np.flatnonzero(~(terminated | truncated))
             episode.have_ended = not len(goes_on)
             if episode.have_ended:
                 return
-            sources = np.where(terminated | truncated, goes_on[0], np.arange(_COPIES))
+            sources = np.where(terminated | truncated, goes_on[0], np.arange(self._many))
             episode.snapshot = copied.save_state()[sources]
         episode.seen = np.asarray(observations, np.float64)[sources]
         off = (row - episode.seen) * self._foresight.is_present
@@ -297,7 +302,7 @@ class MPC(Controller):
 
     def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
         """How offsets of the outputs follow from differences of observations."""
-        copied = self._envs[0]
+        copied = self._copied
         action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
         plain = seen().observations[0, 0].astype(np.float64)
@@ -333,7 +338,7 @@ class MPC(Controller):
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
         nominal = {n: float(v[0]) for n, v in _quantiles(self._prototype, self.seed).items()}
-        copied = self._envs[0]
+        copied = self._copied
         seed = self.seed + episode.steps
         copied.reset(seed=seed, options={"model_parameters": nominal | starts})
         episode.snapshot, episode.have_ended = copied.save_state(), False
@@ -352,12 +357,13 @@ class MPC(Controller):
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
     ) -> _Plan:
         """The best plan of all that play."""
-        beside, many = self._envs
         play = partial(self._best_of, start, assumed, self._allowed(episode))
-        best = play(beside, self._first_plans(episode, start, assumed, row))
-        for _ in range(self.rounds):
-            changed = best.numbers + self._changes(episode.rng, many.num_envs)
-            found = play(many, np.clip(changed, 0.0, 1.0))
+        plans = self._first_plans(episode, start, assumed, row)
+        changes = self._changes(episode.rng, self._many - len(plans))
+        best = play(np.concatenate([plans, np.clip(plans[0] + changes, 0.0, 1.0)]))
+        for _ in range(self.rounds - 1):
+            changed = best.numbers + self._changes(episode.rng, self._many)
+            found = play(np.clip(changed, 0.0, 1.0))
             best = found if found.value > best.value else best
         return best
 
@@ -379,11 +385,10 @@ class MPC(Controller):
         start: Snapshot,
         assumed: Mapping[str, Any],
         limits: Mapping[str, float],
-        envs: FMUVectorEnv,
         plans: FloatArray,
     ) -> _Plan:
         """The best of some plans; whatever goes beyond the limit of a cost counts far more."""
-        found = envs.rollout(start, self._actions(plans), **assumed)
+        found = self._copied.rollout(start, self._actions(plans), **assumed)
         values: FloatArray = found.rewards.sum(axis=1)
         for name, limit in limits.items():
             if name in found.costs:
@@ -411,16 +416,16 @@ class MPC(Controller):
             return shifted[np.newaxis]
         ahead, actions = copy.deepcopy(episode.warm), list[Any]()
         for controller in episode.warm:
-            controller.act(np.tile(row, (_COPIES, 1)))
+            controller.act(np.tile(row, (self._many, 1)))
 
         def policy(observations: Any) -> Any:
             chosen = np.array([one.act(observations) for one in ahead])
-            turn = np.arange(_COPIES) % len(ahead)
-            actions.append(chosen[turn, np.arange(_COPIES)])
+            turn = np.arange(self._many) % len(ahead)
+            actions.append(chosen[turn, np.arange(self._many)])
             return actions[-1]
 
-        self._envs[0].rollout(start, policy, horizon=self._plan_shape[0], **assumed)
-        chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], _COPIES, -1)
+        self._copied.rollout(start, policy, horizon=self._plan_shape[0], **assumed)
+        chosen = np.array(actions, np.float64).reshape(*self._plan_shape[:1], self._many, -1)
         plans = (chosen - self._low) / (self._high - self._low)
         return np.concatenate([shifted[np.newaxis], plans.swapaxes(0, 1)[: len(ahead)]])
 
@@ -444,9 +449,9 @@ class _Episode:
 
     Attributes:
         snapshot: Where the copies are.
-        seen: What they observe, shape (9, k).
-        errors: The sums of squared differences from what was observed, shape (9, k).
-        offsets: What is added to the outputs of each, shape (9, o).
+        seen: What they observe, shape (n, k).
+        errors: The sums of squared differences from what was observed, shape (n, k).
+        offsets: What is added to the outputs of each, shape (n, o).
         have_ended: Whether their episodes have ended; the last snapshot stays.
         plan: The latest plan, from 0 to 1, shape (steps, m).
         action: The latest action, as the copies take it.
