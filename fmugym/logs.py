@@ -285,6 +285,11 @@ class _Player:
             while self._plant.left > 0:
                 self._recorder.reset(seed=seed + len(episodes))
                 episodes.append(self._episode(times, rows))
+        if not episodes:
+            raise ConfigError(
+                f"the log has no time step of {self._time_step:g} s in which "
+                f"{', '.join(one.name for one in self._needed)} were all measured"
+            )
         return episodes
 
     def _episode(self, times: FloatArray, rows: Sequence[Mapping[str, float]]) -> Recording:
