@@ -250,9 +250,16 @@ EXHAUSTIVE_TESTS = (
 """Slow tests that are left to ``.ci/full``, by the beginning of their node ids."""
 
 
+TESTS_IN_WINE = (
+    "test_process_ends.py::TestKilled::test_of_an_fmu_in_wine",
+    "test_process_ends.py::test_an_interrupt_while_wine_starts",
+)
+
+
 def is_in_wine(node_id):
     """Whether a test needs Wine, whose folder and worker program take half a minute to make."""
-    return "::TestInWine" in node_id or "wine" in node_id.partition("[")[2]
+    is_named = node_id.startswith(TESTS_IN_WINE) or "::TestInWine" in node_id
+    return is_named or "wine" in node_id.partition("[")[2]
 
 
 def is_slow(node_id, number):
