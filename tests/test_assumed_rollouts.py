@@ -17,24 +17,28 @@ HOUR, DT, STEPS, N = 3600.0, 600.0, 20, 3
 TIMES = np.arange(24) * HOUR
 OWN = np.linspace(0.0, 0.023, 24)
 OTHER = 0.01 + 0.005 * np.sin(np.arange(24.0))
+WHEEL = {
+    "fmu": {"bundled": "Pendulum"},
+    "time_step": DT,
+    "clock": 2 * HOUR,
+    "parameters": {
+        **dict.fromkeys(("g", "b", "c"), 0.0),
+        **dict.fromkeys(("m", "l"), 1.0),
+        "body": "point_mass",
+        "max_step": DT,
+        "tau_max": 1.0,
+        "theta_dot_max": 1e6,
+    },
+}
+"""A wheel without friction: 1 N m makes it 1 rad/s faster in each second."""
 
 
 def spinning(first=OWN, second=OWN, interpolation="linear", **sensor):
-    """A wheel without friction: 1 N m makes it 1 rad/s faster in each second."""
+    """The wheel in a wind, beside prices."""
     rows = {"step": HOUR, "interpolation": interpolation}
     return {
-        "fmu": {"bundled": "Pendulum"},
-        "time_step": DT,
+        **WHEEL,
         "episode_length": "6h",
-        "clock": 2 * HOUR,
-        "parameters": {
-            **dict.fromkeys(("g", "b", "c"), 0.0),
-            **dict.fromkeys(("m", "l"), 1.0),
-            "body": "point_mass",
-            "max_step": DT,
-            "tau_max": 1.0,
-            "theta_dot_max": 1e6,
-        },
         "variables": {"q_dot": sensor, "push": {"min": -1, "max": 1}},
         "data": {
             "wind": {"values": np.array(first).tolist()} | rows,

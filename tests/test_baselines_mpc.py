@@ -7,6 +7,7 @@ import gymnasium
 import numpy as np
 import pytest
 from PIL import Image
+from test_assumed_rollouts import DT, HOUR, WHEEL
 
 import fmugym
 from fmugym import ConfigError
@@ -17,7 +18,6 @@ from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.task.future import Future, Lookup
 from fmugym.tools.cli import main
 
-HOUR, DT = 3600.0, 600.0
 CALM = np.zeros(24)
 
 
@@ -26,18 +26,8 @@ def wheel(wind=CALM, forecast="2h", observed=True, limits=(-1, 1), **changes):
     seen = ["q_dot", "wind"] if observed else ["q_dot"]
     ahead = {"forecast": {"of": ["wind"], "horizon": forecast, "step": "1h"}} if forecast else {}
     return {
-        "fmu": {"bundled": "Pendulum"},
-        "time_step": DT,
+        **WHEEL,
         "episode_length": "10h",
-        "clock": 2 * HOUR,
-        "parameters": {
-            **dict.fromkeys(("g", "b", "c"), 0.0),
-            **dict.fromkeys(("m", "l"), 1.0),
-            "body": "point_mass",
-            "max_step": DT,
-            "tau_max": 1.0,
-            "theta_dot_max": 1e6,
-        },
         "variables": {"push": dict(zip(("min", "max"), limits, strict=True)) if limits else {}},
         "data": {"wind": {"values": np.array(wind).tolist(), "step": HOUR}},
         "inputs": {"tau": "0.25 / 600 * push + wind"},

@@ -128,20 +128,19 @@ def test_bad_quality(clock, monkeypatch):
     assert not np.isnan(env.series["T_floor"]).any()
 
 
-def test_a_tag_that_does_not_exist(server, clock):
-    tags = dict(house("opcua").document["plant"]["tags"]) | {"T_floor": "ns=2;s=House.T_flor"}
+@pytest.mark.parametrize(
+    ("node", "message"),
+    [
+        ("ns=2;s=House.T_flor", r"T_flor: BadNodeIdUnknown.*mean ns=2;s=House.T_floor\?"),
+        ("i=2255", r"T_floor: node i=2255: expected a number, got"),
+    ],
+    ids=["a tag that does not exist", "a wrong type"],
+)
+def test_tags_that_are_refused(server, clock, node, message):
+    tags = dict(house("opcua").document["plant"]["tags"]) | {"T_floor": node}
     with (
         watched(clock, server.address, house("opcua", tags=tags)) as env,
-        pytest.raises(ConfigError, match=r"T_flor: BadNodeIdUnknown.*mean ns=2;s=House.T_floor\?"),
-    ):
-        env.reset()
-
-
-def test_a_wrong_type(server, clock):
-    tags = dict(house("opcua").document["plant"]["tags"]) | {"T_floor": "i=2255"}
-    with (
-        watched(clock, server.address, house("opcua", tags=tags)) as env,
-        pytest.raises(ConfigError, match=r"T_floor: node i=2255: expected a number, got"),
+        pytest.raises(ConfigError, match=message),
     ):
         env.reset()
 
@@ -216,4 +215,4 @@ class TestEncryption:
 
     def test_task_files_have_no_secrets(self):
         with pytest.raises(ConfigError, match=r"'password' is no key of \[plant\]: .*credentials"):
-            house("opcua", password="x").root  # noqa: B018
+            house("opcua", password="x").root  # noqa: B018  (it is read when it is asked for)

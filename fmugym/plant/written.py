@@ -50,6 +50,7 @@ class Written:
         self._tags = [one for alias, one in written.items() if alias in plant.tags]
         self.actions = Actions(env, self, math.inf)
         self._own = env._get_inputs
+        # the hook of this one environment, whatever its class
         env._get_inputs = self._get_inputs  # type: ignore[method-assign]
         self.names = [alias for _, alias, _ in self._tags]
 
