@@ -147,7 +147,7 @@ class _Plant:
         }
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:
-        """The episodes of a log, in the units of the FMU."""
+        """The episodes of a log, in the units of the FMU; what was not measured parts them."""
         spec, columns = self.env.inside.spec, Columns(self.env, log, self._columns)
         for variable in spec.inputs:
             columns.require(variable)
@@ -155,11 +155,14 @@ class _Plant:
         if not measured:
             first = next((v.name for v in spec.outputs), "")
             raise unknown_name("column of the log", first, log.columns)
-        for number, part in enumerate(log.parts()):
-            if len(part.times) < 2:
-                raise ConfigError(
-                    f"episode {number} of the log is shorter than a step: it has only one row"
-                )
+        needed = columns.of(*spec.inputs, *measured)
+        parts = [part for part in log.parts(needed) if len(part.times) > 1]
+        if not parts:
+            raise ConfigError(
+                f"the log has no two rows of an episode, one after the other, in which "
+                f"{', '.join(needed)} were all measured"
+            )
+        for part in parts:
             yield Trajectory(
                 part.times,
                 {v.name: columns.values(v, part) for v in measured},

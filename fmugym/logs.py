@@ -359,7 +359,9 @@ class Columns:
     def range_of(self, variable: Variable) -> float:
         """How far apart the values of a variable are; 1 if they are all the same."""
         column, factor, _ = self._from[variable.name]
-        return float(np.ptp(self._columns[column]) * abs(factor)) or 1.0
+        values = self._columns[column]
+        known = values[~np.isnan(values)]
+        return float(np.ptp(known) * abs(factor) if known.size else 0.0) or 1.0
 
     def held(self, variable: Variable, part: PlantLog) -> FloatArray:
         """The values of an input that hold from each row on, as ``values``.

@@ -120,16 +120,31 @@ class TestPendulum:
         first, second = json.loads(out)["start_values"]
         assert first == pytest.approx(second)
 
+    def test_an_episode_ends_where_nothing_was_measured(self, cli, task, tmp_path):
+        def with_a_gap(rows):
+            return np.where(np.arange(len(rows))[:, None] == 20, [1.0, np.nan, 1.0] * rows, rows)
+
+        found = []
+        for number, edit in enumerate((None, with_a_gap)):
+            log = write_log(tmp_path / f"{number}.csv", edit=edit)
+            code, out, _ = cli("fit", task, "--log", log, *NAMES, *START, "--json")
+            assert code == 0
+            found.append(json.loads(out))
+        assert [len(one["start_values"]) for one in found] == [1, 2]
+        for name in ("l", "b"):
+            low, high = found[1]["parameters"][name]["interval"]
+            assert low < TRUE[name] < high
+
     @pytest.mark.parametrize(
         ("heading", "edit", "more", "match"),
         [
             ("time,angle [deg],tua", None, (), "unknown column of the log 'tau'.*'tua'"),
             ("time,ange [deg],tau", None, (), "unknown column of the log 'q'"),
             ("time,angle [kg],tau", None, (), "column 'angle' of the log.*kg"),
-            (None, lambda rows: rows[:1], (), "episode 0 of the log is shorter than a step"),
+            (None, lambda rows: rows[:1], (), "no two rows.*angle"),
             (None, lambda rows: rows[:3], (), "2 measured values are too few for 3 values"),
-            (None, lambda rows: np.where(rows == rows[7, 1], np.nan, rows), (), "log at 0.14 s.*"),
-            (None, lambda rows: rows[::-1], (), "one row"),
+            (None, lambda rows: np.where(rows == rows[7, 1], np.inf, rows), (), "log at 0.14 s.*"),
+            (None, lambda rows: rows[::-1], (), "no two rows.*angle"),
             (None, None, ("--parameter", "ll"), "unknown variable.*'ll'.*'l'"),
             (None, None, ("--parameter", "q"), "'q' cannot be set.*continuous output"),
             (None, None, ("--parameter", "solver"), "only Reals"),

@@ -158,6 +158,7 @@ class TestMistakes:
             ("time,x,f\n0,1,2\n1,1,2", ["'x_dot'"]),
             ("time,x,x_dot\n0,1,2\n1,1,2", ["'f'"]),
             ("time,x,x_dot,f\n0,0,0,11\n1,0,0,0", ["f = 11", "10", "tolerance"]),
+            ("time,x,x_dot,f\n0,0,0,11\n1,0,0,0\n2,0,0,", ["f = 11", "10", "tolerance"]),
             ("time,x [degC],x_dot,f\n0,1,2,3\n1,1,2,3", ["degC"]),
             ("time,x,x_dot,f\n0,0,0,1\n0.02,nan,0,1", ["0.02 s", "x", "f"]),
         ],
