@@ -11,6 +11,7 @@ import numpy as np
 from fmugym.archive.units import conversion_between
 from fmugym.declared import TaskEnv
 from fmugym.errors import unknown_name
+from fmugym.logs import declared_as
 from fmugym.plant.feed import Feed
 from fmugym.plant.tags import Plant, in_fmu
 from fmugym.plant.written import Written
@@ -113,8 +114,7 @@ class Predictions:
         env = self._copies[0].env
         if name not in self._read:
             raise entry.error(unknown_name("measured variable", name, self._read))
-        aliases = env.task.document.get("variables", {})
-        given = aliases.get(entry.value, {}).get("name", entry.value)
+        given, _ = declared_as(env, entry.value)
         with entry.placing():
             parameter = env.fmu.description.variable(given)
         variable, conversion = in_fmu(env)[name]

@@ -12,6 +12,7 @@ from fmugym.archive.variable import Variable
 from fmugym.declared import TaskEnv
 from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, unknown_name
+from fmugym.logs import declared_as
 
 __all__ = ["DATA", "Plant", "Tag", "in_fmu", "read_plant"]
 
@@ -88,15 +89,14 @@ def in_fmu(env: TaskEnv) -> dict[str, tuple[Variable, Conversion]]:
 
     Each comes with the conversion from the FMU's unit to that of the task.
     """
-    declared, spec = env.task.document.get("variables", {}), env.inside.spec
+    spec, units = env.inside.spec, env.fmu.description.units
     known = {variable.name: variable for variable in (*spec.inputs, *spec.outputs)}
     found = {}
-    for alias in dict.fromkeys([*declared, *known]):
-        given = declared.get(alias, {})
-        variable = known.get(given.get("name", alias))
+    for alias in dict.fromkeys([*env.task.document.get("variables", {}), *known]):
+        name, unit = declared_as(env, alias)
+        variable = known.get(name)
         if variable is not None:
-            units = env.fmu.description.units
-            found[alias] = variable, conversion_between(variable.unit, given.get("unit"), units)
+            found[alias] = variable, conversion_between(variable.unit, unit, units)
     return found
 
 
