@@ -172,9 +172,8 @@ class _Plant:
     def require_steps(self, trajectories: Sequence[Trajectory]) -> None:
         """Refuse rows that are no steps apart, if a measured value is that of a whole step."""
         spec, step = self.env.inside.spec, median_interval(trajectories)
-        known = dict(zip((v.name for v in spec.outputs), spec.samplings, strict=False))
-        whole = [(n, known.get(n, "last")) for n in trajectories[0].outputs]
-        sampled = [f"{how} of {name}" for name, how in whole if how != "last"]
+        whole = [v for v in spec.outputs if v.sampling != "last"]
+        sampled = [f"{v.sampling} of {v.name}" for v in whole if v.name in trajectories[0].outputs]
         for one in trajectories if sampled else ():
             steps = np.diff(one.time) / step
             off = np.abs(steps - np.round(steps)) > _OFF

@@ -23,6 +23,7 @@ from unittest import mock
 
 import numpy as np
 from fuzz_driver import Case, main, require
+from pool_tools import sampled
 from program_tools import code, constants, uniform_draws
 
 from fmugym import FMU, Connection, FMUSystem, SimulationError, _native, bundled_fmu
@@ -122,14 +123,13 @@ def opened():
 
 
 def spec_of(rng, inputs, outputs):
-    samplings = ("mean", "last") if rng.random() < 0.5 else ()
+    samplings = ("mean", "last") if rng.random() < 0.5 else None
     return PoolSpec(
         tuple(inputs),
-        tuple(outputs),
+        sampled(tuple(outputs), samplings),
         0.05,
         num_observed=rng.randint(0, 2),
         substeps=rng.randint(1, 3),
-        samplings=samplings,
         stop_time=rng.choice((None, 10.0)),
     )
 

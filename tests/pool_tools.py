@@ -1,6 +1,7 @@
 """Pools: opened by the names of variables, reset with values by name, and stepped."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,7 +17,24 @@ KINDS = {
 """The arguments by which ``make_pool`` makes each kind."""
 
 
-def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, private=False, **spec):
+def sampled(variables, samplings):
+    """Variables with these samplings; as they are for None."""
+    if samplings is None:
+        return variables
+    return tuple(replace(v, sampling=how) for v, how in zip(variables, samplings, strict=True))
+
+
+def open_pool(
+    fmu,
+    inputs=(),
+    outputs=(),
+    time_step=0.1,
+    n=1,
+    options=None,
+    private=False,
+    samplings=None,
+    **spec,
+):
     """Open a pool, in this process or with options of ``make_pool``.
 
     Args:
@@ -26,9 +44,11 @@ def open_pool(fmu, inputs=(), outputs=(), time_step=0.1, n=1, options=None, priv
         n: How many instances.
         options: Of ``make_pool``; None for a pool in this process.
         private: Whether each instance of a pool in this process has a library of its own.
+        samplings: One for each output; None for the last values of all.
         spec: Others of a ``PoolSpec``.
     """
     given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
+    read = sampled(read, samplings)
     spec = PoolSpec(given, read, time_step, **spec)
     if options is None:
         pool = local_pool(fmu, spec, n, LOG, private_libraries=private)

@@ -70,7 +70,7 @@ class TestFilledInFromTheFMU:
 
     def test_bounds_go_before_those_of_the_fmu(self, probe):
         interface = resolved(probe(2), bounds={"a": (-3, 4)})
-        assert interface.bounds(interface.inputs[0]) == (-3, 4)
+        assert interface.inputs[0].range == (-3, 4)
 
 
 class TestValuesForVariables:

@@ -290,7 +290,7 @@ def test_the_document_has_this_table():
 def test_inputs_stay_within_their_limits(make_fmu):
     """An FMU may fail beyond them, and such a failure is no sign of shared globals."""
     fmu = fmugym.FMU(make_fmu("well behaved"))
-    spec = PoolSpec((fmu.variable("u"),), (), STEP, input_limits=((-0.5, 0.25),))
+    spec = PoolSpec((replace(fmu.variable("u"), bounds=(-0.5, 0.25)),), (), STEP)
     rows = inputs_of_two(spec, 50, 1.0)
     assert np.min(rows) < -0.4
     assert 0.24 < np.max(rows) <= 0.25

@@ -536,3 +536,34 @@ class TestReport:
         assert "largest" in text
         assert "at most 3" in text
         assert "truncated" in text
+
+
+class Bounded(fmugym.FMUEnv):
+    """A class of a user, whose config says more of variables than the FMU does."""
+
+    def __init__(self):
+        config = {
+            "model_input_names": "f",
+            "model_output_names": "x",
+            "monitor_names": "theta",
+            "model_parameters": {"phi_0": 0.1},
+            "bounds": {"f": (-2, 2.5), "x": (-3, 3), "phi_0": (-0.5, 0.5)},
+            "samplings": {"theta": "mean"},
+            "start_time": [1.0],
+            "time_step": 0.02,
+        }
+        super().__init__(fmugym.bundled_fmu("CartPole"), config)
+
+    def _is_done(self):
+        return abs(self.state[0]) > 2
+
+
+def test_columns_of_a_class_have_the_bounds_of_its_config():
+    env = RecordSeries(Bounded(), ["f", "x", "theta", "phi_0", "start_time"])
+    played(env, 0, 3)
+    series = env.series
+    limits = {one.name: (one.low, one.high) for one in series.columns}
+    assert [limits[name] for name in ("f", "x", "phi_0")] == [(-2, 2.5), (-3, 3), (-0.5, 0.5)]
+    assert limits["theta"] == (-np.inf, np.inf)
+    assert series["start_time"].tolist() == [1.0] * 4
+    env.close()

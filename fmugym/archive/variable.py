@@ -94,6 +94,8 @@ UNKNOWN: Final = Interval(math.nan)
 class Variable:
     """One variable of the model description, in the terms of the FMI standard.
 
+    A task adds bounds and a sampling to what it uses.
+
     Attributes:
         type: The standard's own name: ``Real``, ``Float64``, ``Int32``, ...
         start: The start value as the XML has it.
@@ -113,6 +115,10 @@ class Variable:
         ticking: Of a clock: one of ``CLOCK_KINDS``; "" for other variables.
         interval, shift: Of a clock: the time between its ticks and that before the first one.
         by_fractions: Of a clock: whether the FMU takes and tells these times as fractions.
+        bounds: The limits that a task gives in the place of minimum and maximum; None if it gives
+            none.
+        sampling: What a step of a task gives of the values after each substep, one of
+            ``fmugym.pool.spec.SAMPLINGS``.
     """
 
     name: str
@@ -138,6 +144,8 @@ class Variable:
     interval: Interval = UNKNOWN
     shift: Interval = UNKNOWN
     by_fractions: bool = False
+    bounds: tuple[float, float] | None = None
+    sampling: str = "last"
 
     @property
     def kind(self) -> str:
@@ -195,6 +203,11 @@ class Variable:
         """Of a clock: its kind as ``enum ClockKind`` of ``native/clock.h``."""
         is_output = self.ticking == "triggered" and self.causality != "input"
         return len(CLOCK_KINDS) if is_output else CLOCK_KINDS.index(self.ticking)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The bounds of the task, or else minimum and maximum."""
+        return (self.minimum, self.maximum) if self.bounds is None else self.bounds
 
     @property
     def limits(self) -> tuple[float, float]:

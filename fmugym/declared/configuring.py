@@ -81,12 +81,13 @@ def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[
 
 def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
     """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
-    records = [declared.records[name] for name in (*naming.outputs, *naming.monitors)]
-    return {r.fmu_name: r.sample for r in records if r.sample != "last"}
+    names = (*naming.outputs, *naming.monitors)
+    found = [declared.records[name].fmu_variable for name in names]
+    return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
 def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
     """The limits that the task gives of what it writes, observes and lets episodes start with."""
     names = (*declared.written, *naming.outputs, *declared.parameters)
-    ranges = {r.fmu_name: r.own_range for r in (declared.records[name] for name in names)}
-    return {name: limits for name, limits in ranges.items() if limits is not None}
+    found = [declared.records[name].fmu_variable for name in names]
+    return {one.name: one.bounds for one in found if one.bounds is not None}

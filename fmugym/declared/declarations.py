@@ -287,7 +287,7 @@ class Declarations:
         entry = self.root.child("fitted")
         if entry.value is None:
             return parameters
-        aliases = {record.fmu_name: alias for alias, (record, _) in parameters.items()}
+        aliases = {record.fmu_variable.name: alias for alias, (record, _) in parameters.items()}
         fitted: dict[str, tuple[Record, Any]] = {}
         for name, column in read_fitted(entry).items():
             record = self.records.find(entry, aliases.get(name, name), "variable")

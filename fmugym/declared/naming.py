@@ -117,15 +117,16 @@ class Naming:
             ConfigError: If they are sampled in different ways: a step gives one value of each.
         """
         records, first = self._declared.records, dict[str, str]()
-        for name in names:
-            known = first.setdefault(records[name].fmu_name, name)
-            if records[known].sample != records[name].sample:
+        variables = {name: records[name].fmu_variable for name in names}
+        for name, variable in variables.items():
+            known = first.setdefault(variable.name, name)
+            if variables[known].sampling != variable.sampling:
                 raise records[name].entry.error(
-                    f"{known!r} and {name!r} are both {records[name].fmu_name!r} of the FMU, which "
-                    "has one 'sample' only"
+                    f"{known!r} and {name!r} are both {variable.name!r} of the FMU, which has one "
+                    "'sample' only"
                 )
         order = list(first.values())
-        return {name: order.index(first[records[name].fmu_name]) for name in names}
+        return {name: order.index(first[one.name]) for name, one in variables.items()}
 
     def _is_first(self, name: str) -> bool:
         """Whether no name before stands for the same variable of the FMU."""
@@ -326,7 +327,7 @@ class Naming:
         if name in declared.parameters:
             if record.variable is not None and record.variable.kind == "string":
                 raise record.entry.error(f"{name!r} is a String: expressions have numbers only")
-            return converted(record.conversion, self.read("parameters", record.fmu_name))
+            return converted(record.conversion, self.read("parameters", record.fmu_variable.name))
         value = self.read("inside.readings.values", self._places[name])
         return converted(record.conversion, value)
 
@@ -414,7 +415,7 @@ class Naming:
         if record.variable is None:
             return self.step_count * 0.0
         if record.alias in self._declared.parameters:
-            start = self.read("parameters", record.fmu_name)
+            start = self.read("parameters", record.fmu_variable.name)
         else:
             start = self.step_count * 0.0 + record.variable.start_number
         return converted(record.conversion, start)

@@ -166,10 +166,12 @@ class ResolvedTask:
             **(self._root.child("config").value or {}),
             "foreign": self._root.child("foreign").value or {},
             **times_of(declared, self._time_step),
-            "model_input_names": [records[name].fmu_name for name in declared.written],
-            "model_output_names": [records[name].fmu_name for name in self._naming.outputs],
-            "monitor_names": [records[name].fmu_name for name in self._naming.monitors],
-            "model_parameters": {r.fmu_name: value for r, value in declared.parameters.values()},
+            "model_input_names": records.names_in_fmu(declared.written),
+            "model_output_names": records.names_in_fmu(self._naming.outputs),
+            "monitor_names": records.names_in_fmu(self._naming.monitors),
+            "model_parameters": {
+                record.fmu_variable.name: value for record, value in declared.parameters.values()
+            },
             "episode_variables": self._variables(),
             "bounds": bounds_of(declared, self._naming),
             "samplings": samplings_of(declared, self._naming),

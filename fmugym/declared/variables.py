@@ -29,7 +29,7 @@ __all__ = [
     "start_value",
 ]
 
-_PLAIN: Final = ("levels", "sample", "delta", "min_on", "min_off")
+_PLAIN: Final = ("levels", "delta", "min_on", "min_off")
 """Keys of a variable that are attributes of its record as they are."""
 
 
@@ -40,13 +40,13 @@ class Record:
     Attributes:
         alias: Its name in the task.
         entry: Where it is declared or used first.
-        variable: The FMU's variable; None for an action that only expressions read.
+        variable: The FMU's variable, with the bounds and the sampling of the task; None for an
+            action that only expressions read.
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
         low, high: The limits in the unit of the task; infinite where there are none.
         nominal: The usual size of its values; None if neither the task nor the FMU says it.
         levels: The values that an action chooses from; empty for a continuous one.
-        sample: What a step gives of the values after each substep, one of ``SAMPLINGS``.
         delta: The largest change in a step, which is what the agent chooses; 0 if it chooses the
             value itself.
         device: The sensor of what the agent observes, or the actuator of an action.
@@ -61,7 +61,6 @@ class Record:
     low: float
     high: float
     levels: tuple[float, ...] = ()
-    sample: str = "last"
     nominal: float | None = None
     delta: float = 0.0
     min_on: float = 0.0
@@ -84,8 +83,8 @@ class Record:
         return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
 
     @property
-    def fmu_name(self) -> str:
-        """The name in the FMU.
+    def fmu_variable(self) -> Variable:
+        """The FMU's variable.
 
         Raises:
             ConfigError: If there is none.
@@ -95,16 +94,7 @@ class Record:
                 f"{self.alias!r} is no variable of the FMU; give the FMU's name of it: "
                 f'{self.alias} = {{ name = "..." }}'
             )
-        return self.variable.name
-
-    @property
-    def own_range(self) -> tuple[float, float] | None:
-        """The limits in the unit of the FMU; None if the task gives none of them."""
-        given = self.entry.value or {}
-        if "min" not in given and "max" not in given:
-            return None
-        low, high = sorted(map(self.conversion.inverse, (self.low, self.high)))
-        return low, high
+        return self.variable
 
     @property
     def is_bounded(self) -> bool:
@@ -133,6 +123,10 @@ class Records:
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
         return list(dict.fromkeys([*self._records, *self._description.variables]))
+
+    def names_in_fmu(self, aliases: Sequence[str]) -> list[str]:
+        """The FMU's names of variables."""
+        return [self[alias].fmu_variable.name for alias in aliases]
 
     def get(self, alias: str) -> Record | None:
         """The record of an alias or of a variable of the FMU; None if there is none."""
@@ -199,11 +193,11 @@ class Records:
         Raises:
             ConfigError: If it cannot.
         """
-        if record.sample != "last":
+        if (record.entry.value or {}).get("sample", "last") != "last":
             raise record.entry.error("'sample' is for variables that are read from the FMU")
         if record.variable is not None:
             with entry.placing():
-                input_variable(self._description, record.fmu_name)
+                input_variable(self._description, record.fmu_variable.name)
 
     def check_output(self, entry: Entry, name: str) -> None:
         """Check that a variable can be read after each step.
@@ -214,7 +208,7 @@ class Records:
         if self[name].delta or self[name].is_switched or self[name].levels:
             raise self[name].entry.error(f"{name!r} is observed, not an action: it has no such key")
         with entry.placing():
-            output_variable(self._description, self[name].fmu_name)
+            output_variable(self._description, self[name].fmu_variable.name)
 
     def _declared(self, entry: Entry) -> Record:
         name = entry.child("name")
@@ -235,9 +229,13 @@ class Records:
         limited = None if sample == "integral" else variable
         if "delta" in given and "levels" in given:
             raise entry.error("an action has either 'levels' or 'delta'")
+        low, high = _limits(entry, limited, conversion)
+        if variable is not None:
+            ends = sorted(map(conversion.inverse, (low, high)))
+            bounds = (ends[0], ends[1]) if given.keys() & {"min", "max"} else None
+            variable = replace(variable, bounds=bounds, sampling=sample)
         return Record(
-            *(alias, entry, variable, unit, conversion),
-            *_limits(entry, limited, conversion),
+            *(alias, entry, variable, unit, conversion, low, high),
             nominal=given.get("nominal", _own_nominal(limited, conversion)),
             device=read_device(entry),
             **{key: given[key] for key in _PLAIN if key in given},
@@ -298,7 +296,7 @@ def start_value(record: Record, entry: Entry) -> Any:
     """
     variable = _settable(record, entry)
     if variable.shape:
-        return _array_start(variable, entry, record.own_range)
+        return _array_start(variable, entry)
     value, is_text = entry.value, bool(variable.items) or variable.kind == "string"
     with entry.placing():
         if not (isinstance(value, str) and is_text):
@@ -306,7 +304,7 @@ def start_value(record: Record, entry: Entry) -> Any:
         value = _in_unit_of_fmu(record.conversion, value)
         if variable.kind == "string":
             return value
-        return within(variable, checked(variable, value), record.own_range)
+        return within(variable, checked(variable, value))
 
 
 def fitted_value(record: Record, entry: Entry, value: Any) -> Any:
@@ -317,23 +315,25 @@ def fitted_value(record: Record, entry: Entry, value: Any) -> Any:
     """
     variable = _settable(record, entry)
     with entry.placing():
-        return within(variable, checked(variable, value), record.own_range)
+        return within(variable, checked(variable, value))
 
 
 def _settable(record: Record, entry: Entry) -> Variable:
-    name, variable = record.fmu_name, record.variable
-    if variable is None or not variable.settable_at_start:
-        what = "" if variable is None else f": it is a {variable.variability} {variable.causality}"
-        raise entry.error(f"{name!r} cannot be set at the start of an episode{what}")
+    variable = record.fmu_variable
+    if not variable.settable_at_start:
+        raise entry.error(
+            f"{variable.name!r} cannot be set at the start of an episode: it is a "
+            f"{variable.variability} {variable.causality}"
+        )
     return variable
 
 
-def _array_start(variable: Variable, entry: Entry, limits: tuple[float, float] | None) -> Any:
+def _array_start(variable: Variable, entry: Entry) -> Any:
     """The value of an array: nested lists, or one value for all elements, in the FMU's unit."""
     with entry.placing():
         parts = spread(variable.name, variable.elements, entry.value)
         for element, part in zip(variable.elements, parts, strict=True):
-            within(element, checked(element, part), limits)
+            within(element, checked(element, part))
     return entry.value
 
 

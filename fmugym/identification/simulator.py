@@ -219,15 +219,13 @@ def median_interval(trajectories: Sequence[Trajectory]) -> float:
 
 def _as_in(given: PoolSpec, spec: PoolSpec) -> PoolSpec:
     """The inputs, outputs and steps of a spec; the rest as an environment has it."""
-    known = dict(zip((v.name for v in given.outputs), given.samplings, strict=False))
+    known = {variable.name: variable for variable in given.outputs}
     return replace(
         given,
         inputs=spec.inputs,
-        outputs=spec.outputs,
+        outputs=tuple(known.get(variable.name, variable) for variable in spec.outputs),
         time_step=spec.time_step,
         substeps=max(1, round(spec.time_step * given.substeps / given.time_step)),
-        samplings=tuple(known.get(v.name, "last") for v in spec.outputs),
-        input_limits=(),
         num_observed=0,
         warm_up_steps=0,
         records=False,

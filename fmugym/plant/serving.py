@@ -74,10 +74,9 @@ class _Twin:
     def _shapes(self) -> tuple[Any, Any]:
         """Which quantities are those of the step, and which move on straight lines."""
         variables, late, straight = in_fmu(self._env), [], []
-        samplings = self._env.config.samplings
         for one in self._quantities.all:
             variable, _ = variables.get(one.name, (None, None))
-            is_sampled = variable is not None and variable.name in samplings
+            is_sampled = variable is not None and variable.sampling != "last"
             late.append(one.kind in ("action", "input") or is_sampled)
             is_real = variable is None or variable.kind == "real"
             straight.append(one.kind in ("output", "data") and is_real and not one.holds)

@@ -233,7 +233,7 @@ def _reading(
     env: TaskEnv, feed: Feed, plant: Plant
 ) -> tuple[Callable[[], Mapping[str, float]], dict[str, str]]:
     """What reads all that the task reads, in the FMU's units, and how tags are sampled."""
-    outputs = {one.name for one in env.inside.spec.outputs}
+    outputs = {one.name: one for one in env.inside.spec.outputs}
     found = {
         variable.name: (alias, conversion)
         for alias, (variable, conversion) in in_fmu(env).items()
@@ -241,12 +241,11 @@ def _reading(
     }
     for name in sorted(outputs - found.keys()):
         raise lacking_tag(name)
-    how = env.config.samplings
 
     def read() -> dict[str, float]:
         return {n: own.inverse(feed.values[alias][0]) for n, (alias, own) in found.items()}
 
-    return read, {alias: how.get(name, "last") for name, (alias, _) in found.items()}
+    return read, {alias: outputs[name].sampling for name, (alias, _) in found.items()}
 
 
 def holding(policy: Policy, shadow: Shadow) -> Policy:

@@ -96,12 +96,11 @@ class PoolSpec:
 
     Attributes:
         inputs: The variables set before each step, in the order of the rows of ``step``'s argument.
-        outputs: The variables read after each step, in the order of the rows of its result.
+        outputs: The variables read after each step, in the order of the rows of its result. Between
+            steps an integral is 0, and other samplings are the values at that time.
         time_step: Simulated time of one step, in seconds.
         num_observed: How many of the outputs, from the first, make an observation.
         substeps: Number of communication steps in one step.
-        samplings: For each output, one of ``SAMPLINGS``; empty if all are ``"last"``. Between steps
-            an integral is 0, and the others are the values at that time.
         start_time: First communication point, in seconds, unless ``START_TIME`` is among the start
             variables.
         stop_time: Passed to the FMU unless it is None, in seconds.
@@ -115,7 +114,6 @@ class PoolSpec:
         reset_method: How instances start a new episode.
         component_resets: For each component of a system, how it starts a new episode; empty if all
             do by ``reset_method``.
-        input_limits: Lowest and highest value of each input; empty for those of the FMU.
         one_initialization: Whether only one instance in a process may be made, initialized, reset
             or freed at a time. Steps run in parallel all the same.
         max_instances: How many instances of the FMU this process may have at once; None for no
@@ -143,12 +141,10 @@ class PoolSpec:
     leak_limit: int | None = None
     reset_method: ResetMethod = ResetMethod.RESET
     component_resets: tuple[ResetMethod, ...] = ()
-    input_limits: tuple[tuple[float, float], ...] = ()
     one_initialization: bool = False
     max_instances: int | None = None
     licence_wait: float = 0.0
     blind_start: bool = False
-    samplings: tuple[str, ...] = ()
     records: bool = False
     solver: str = SOLVERS[0]
     max_step: float | None = None
@@ -162,6 +158,12 @@ class PoolSpec:
         """
         start = self.start_time if start_time is None else start_time
         return start + count * self.time_step / self.substeps
+
+    @property
+    def samplings(self) -> tuple[str, ...]:
+        """For each output, one of ``SAMPLINGS``; empty if all are ``"last"``."""
+        samplings = tuple(variable.sampling for variable in self.outputs)
+        return samplings if {*samplings} - {"last"} else ()
 
     @property
     def start_outputs(self) -> tuple[float, ...]:

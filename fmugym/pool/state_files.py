@@ -93,10 +93,11 @@ def essence(spec: PoolSpec) -> PoolSpec:
     """The part of a spec on which states depend."""
     return replace(
         spec,
+        inputs=tuple(replace(variable, bounds=None) for variable in spec.inputs),
+        outputs=tuple(replace(variable, bounds=None) for variable in spec.outputs),
         num_observed=0,
         fault_retries=0,
         leak_limit=None,
-        input_limits=(),
         one_initialization=False,
         max_instances=None,
         licence_wait=0.0,

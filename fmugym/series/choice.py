@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -140,10 +141,9 @@ def quantities_of(env: FMUEnv) -> Quantities:
 
 
 def _of_config(env: FMUEnv) -> Quantities:
-    find, interface = env.fmu.variable, env.inside.interface
-    strings = env.fmu.description.strings
-    inputs, outputs = interface.input_names, tuple(n for n in env.out if n not in strings)
-    places = [place for place, name in enumerate(env.out) if name not in strings]
+    interface, strings = env.inside.interface, env.fmu.description.strings
+    inputs, read_variables = interface.inputs, (*interface.outputs, *interface.monitors)
+    outputs = {p: v for p, v in enumerate(read_variables) if v.name not in strings}
     episode = [n for n, value in env.config.episode_variables.items() if np.ndim(value) == 0]
     parameters = tuple(name for name in interface.parameters if name not in strings)
 
@@ -151,15 +151,17 @@ def _of_config(env: FMUEnv) -> Quantities:
         drawn, variables = env.parameters, env.variables
         return (
             *(env.inputs[index] for index in range(len(inputs))),
-            *(env.inside.readings.values[index] for index in places),
+            *(env.inside.readings.values[index] for index in outputs),
             *(variables[name] for name in episode),
             *(drawn.get(name, np.nan) for name in parameters),
         )
 
-    kinds = {"action": inputs, "output": outputs}
-    found = [_of_variable(find(name), kind) for kind, names in kinds.items() for name in names]
+    found = [_of_variable(variable, "action") for variable in inputs]
+    found += [_of_variable(variable) for variable in outputs.values()]
     found += [Quantity(name, "memory") for name in episode]
-    found += [_of_variable(find(name), "parameter") for name in parameters]
+    for name in parameters:
+        variable = interface.parameter(name, interface.parameters[name])
+        found.append(replace(_of_variable(variable, "parameter"), name=name))
     return Quantities(found, read)
 
 
@@ -194,8 +196,7 @@ def _number(value: Any) -> Any:
 def _of_variable(variable: Variable, kind: str = "output") -> Quantity:
     if variable.kind == "string":
         return Quantity(variable.name, TEXT_KINDS[0])
-    limits = variable.minimum, variable.maximum
-    return Quantity(variable.name, kind, variable.unit or "", *limits)
+    return Quantity(variable.name, kind, variable.unit or "", *variable.range)
 
 
 def _others(env: FMUEnv, quantities: Sequence[Quantity]) -> Iterator[Variable]:

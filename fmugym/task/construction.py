@@ -233,7 +233,7 @@ def prepare_hooks(env: Constructed) -> None:
     # A subclass with its own step may take other actions.
     inside.elements = None if own.step else elements_of(env.action_space)
     interface, derived = inside.interface, not own.get_action_space
-    values = fmu_spaces.discrete_values(interface, interface.inputs) if derived else None
+    values = fmu_spaces.discrete_values(interface.inputs) if derived else None
     inside.action_values = values
     default = not own.get_observation
     make = fmu_spaces.default_observation if default else fmu_spaces.outputs_observation

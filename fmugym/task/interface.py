@@ -44,12 +44,12 @@ class Interface:
     """A config with its names looked up in one FMU.
 
     Attributes:
-        inputs, outputs, monitors: The variables.
+        inputs, outputs, monitors: The variables, with their bounds and samplings.
         parameters: The parameters and their values, texts or distributions by name, a start time
             that is drawn last.
         config: The config.
         description: That of the FMU.
-        limits: Minimum and maximum by name, where the config has bounds.
+        resolved: By name, the variables to which the config gives bounds or a sampling.
         texts: By name, those that Strings may get besides what ``parameters`` has.
     """
 
@@ -59,7 +59,7 @@ class Interface:
     parameters: Mapping[str, Any]
     config: EnvConfig
     description: ModelDescription
-    limits: Mapping[str, tuple[float, float]]
+    resolved: Mapping[str, Variable]
     texts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
@@ -90,7 +90,7 @@ class Interface:
         """
         if name == "start_time" and self.config.draws_start_time:
             return START_TIME
-        variable = self.description.variable(name)
+        variable = self.resolved.get(name) or self.description.variable(name)
         if variable.kind != "string":
             return variable
         return with_texts(variable, (*texts_in(variable, value), *self.texts.get(name, ())))
@@ -124,25 +124,7 @@ class Interface:
 
     def within(self, variable: Variable, value: Any) -> Any:
         """Check that a start value lies in its range; see ``fmugym.task.ranges``."""
-        return within(variable, value, self.limits.get(variable.name))
-
-    def bounds(self, variable: Variable) -> tuple[float, float]:
-        """The limits of a variable: the config's, or else the FMU's.
-
-        Raises:
-            ConfigError: If the FMU's limits contradict each other.
-        """
-        low, high = self._limits(variable)
-        if not low <= high:
-            raise ConfigError(
-                f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds', "
-                "or 'min' and 'max' in a task file"
-            )
-        return low, high
-
-    def _limits(self, variable: Variable) -> tuple[float, float]:
-        low, high = self.limits.get(variable.name, (variable.minimum, variable.maximum))
-        return float(low), float(high)
+        return within(self.resolved.get(variable.name, variable), value)
 
     def pool_spec(self) -> PoolSpec:
         """The pool's part of the config.
@@ -165,10 +147,8 @@ class Interface:
             warm_up_steps=self._warm_up_steps(),
             fault_retries=config.fault_retries,
             leak_limit=config.foreign.leak_limit,
-            input_limits=tuple(map(self._limits, self.inputs)),
             max_instances=config.foreign.max_instances,
             licence_wait=config.foreign.licence_wait,
-            samplings=self._samplings(),
             solver=config.solver,
             max_step=self._max_step(),
         )
@@ -178,20 +158,6 @@ class Interface:
         fixed = self.config.solver in FIXED_STEP_SOLVERS
         default = self.description.step_size if fixed else None
         return default if self.config.max_step is None else self.config.max_step
-
-    def _samplings(self) -> tuple[str, ...]:
-        """One for each output; none if a step gives the last value of all."""
-        read = self.outputs + self.monitors
-        given = _by_scalar(self.description, self.config.samplings, read, "output in 'samplings'")
-        for variable in read:
-            if variable.kind == "string" and given.get(variable.name, "last") != "last":
-                raise ConfigError(
-                    f"config key 'samplings': {variable.name!r} is a String, expected 'last', got "
-                    f"{given[variable.name]!r}"
-                )
-        if set(given.values()) <= {"last"}:
-            return ()
-        return tuple(given.get(v.name, "last") for v in read)
 
     def _warm_up_steps(self) -> int:
         duration, step = self.config.warm_up, self.time_step
@@ -228,32 +194,54 @@ def resolve(config: EnvConfig, description: ModelDescription) -> Interface:
     starts = {n: value for n, value in config.model_parameters.items() if n not in structural}
     given = start_values(description, starts)
     drawn = {"start_time": config.start_time} if config.draws_start_time else {}
-    inputs = _resolved(description, config.model_input_names, check_input)
-    outputs = _resolved(description, config.model_output_names, check_output)
+    inputs = _found(description, config.model_input_names, check_input)
+    outputs = _found(description, config.model_output_names, check_output)
     read = readable_named(description, config.model_output_names + config.monitor_names)
-    monitors = read[len(outputs) :]
-    limits = _limits(config, description, inputs + outputs)
     _check_inputs_are_whole(inputs, [variable for variable, _ in given])
     check_rest_is_known(inputs)
+    resolved = _resolved(config, description, inputs + outputs, read)
+
+    def own(variable: Variable) -> Variable:
+        return resolved.get(variable.name, variable)
+
     return Interface(
-        inputs=inputs,
-        outputs=outputs,
-        monitors=monitors,
-        parameters={v.name: within(v, own, limits.get(v.name)) for v, own in given} | drawn,
+        inputs=tuple(map(own, inputs)),
+        outputs=tuple(map(own, outputs)),
+        monitors=tuple(map(own, read[len(outputs) :])),
+        parameters={v.name: within(own(v), value) for v, value in given} | drawn,
         config=config,
         description=description,
-        limits=limits,
+        resolved=resolved,
     )
 
 
-def _limits(
-    config: EnvConfig, description: ModelDescription, bounded: Sequence[Variable]
-) -> dict[str, tuple[float, float]]:
-    """The config's limits of inputs, outputs and what can be given a start value."""
+def _resolved(
+    config: EnvConfig,
+    description: ModelDescription,
+    bounded: Sequence[Variable],
+    read: Sequence[Variable],
+) -> dict[str, Variable]:
+    """The variables to which the config gives bounds or a sampling.
+
+    Inputs, outputs and what can be given a start value have bounds; what is read is sampled.
+    """
     named = [v for name in config.bounds for v in _known_scalars(description, name)]
     allowed = [*bounded, *(variable for variable in named if variable.settable_at_start)]
     kind = "input, output or parameter in 'bounds'"
-    return _by_scalar(description, config.bounds, allowed, kind)
+    bounds = _by_scalar(description, config.bounds, allowed, kind)
+    samplings = _by_scalar(description, config.samplings, read, "output in 'samplings'")
+    found = {
+        v.name: replace(v, bounds=bounds.get(v.name), sampling=samplings.get(v.name, "last"))
+        for v in (*allowed, *read)
+        if v.name in bounds or v.name in samplings
+    }
+    for variable in found.values():
+        if variable.kind == "string" and variable.sampling != "last":
+            raise ConfigError(
+                f"config key 'samplings': {variable.name!r} is a String, expected 'last', got "
+                f"{variable.sampling!r}"
+            )
+    return found
 
 
 def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple[Variable, ...]:
@@ -263,10 +251,10 @@ def readable_named(description: ModelDescription, names: Sequence[str]) -> tuple
         ConfigError: If there is no variable of a name, one is named twice, or its value is neither
             a number nor a text.
     """
-    return _resolved(description, names, check_readable)
+    return _found(description, names, check_readable)
 
 
-def _resolved(
+def _found(
     description: ModelDescription,
     names: Sequence[str],
     check: Callable[[ModelDescription, Variable], None],

@@ -12,8 +12,6 @@ from fmugym.errors import ConfigError, shown
 
 __all__ = ["within"]
 
-_Range = tuple[float, float]
-
 _OF_FMU: Final = (
     "the FMU's min and max (another range: 'bounds', or 'min' and 'max' in a task file)"
 )
@@ -23,15 +21,14 @@ logger = logging.getLogger(__name__)
 _told: Final[set[str]] = set()
 
 
-def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
+def within(variable: Variable, value: Any) -> Any:
     """Check that a start value lies in its range, and truncate an unbounded distribution there.
 
     The log tells once in a process what is truncated.
 
     Args:
-        variable: A scalar or an element of an array.
+        variable: A scalar or an element of an array, with the bounds of the task.
         value: A checked number or text, or a distribution.
-        limits: Those of the config, which take the place of the FMU's; None if it gives none.
 
     Returns:
         The value, or a distribution that only draws values in the range.
@@ -42,12 +39,12 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
     """
     if variable.kind not in {"real", "integer"}:
         return value
-    low, high = _range_of(variable) if limits is None else limits
+    low, high = variable.bounds or _range_of_fmu(variable)
     ends = support_of(value) if is_distribution(value) else (value, value)
     if all(_lies_in(low, end, high) for end in ends):
         return value
     unit = "" if variable.unit in (None, "", "1") else f" {variable.unit}"
-    text = f"{low} and {high}{unit}, {_OF_FMU if limits is None else _GIVEN}"
+    text = f"{low} and {high}{unit}, {_GIVEN if variable.bounds else _OF_FMU}"
     if all(map(math.isfinite, ends)):
         found = shown(value) if ends[0] == ends[1] else f"{ends[0]} to {ends[1]} of {shown(value)}"
         raise _outside(variable, text, found)
@@ -59,7 +56,7 @@ def within(variable: Variable, value: Any, limits: _Range | None) -> Any:
     return own
 
 
-def _range_of(variable: Variable) -> _Range:
+def _range_of_fmu(variable: Variable) -> tuple[float, float]:
     """The FMU's limits; none if they exclude its own start value, which they then cannot mean."""
     low, high = variable.limits
     try:

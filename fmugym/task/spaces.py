@@ -47,21 +47,21 @@ def action_space(interface: Interface) -> spaces.Space[Any]:
             "name some, or override _get_action_space"
         )
     for variable in interface.inputs:
-        if variable.kind in {"real", "integer"} and not _bounded(interface, variable):
+        if variable.kind in {"real", "integer"} and not _bounded(variable):
             raise ConfigError(
                 f"input {variable.name!r} has no min and max in the FMU: give "
                 f"'bounds': {{{variable.name!r}: (low, high)}} in the config, or override "
                 "_get_action_space"
             )
-    return _space(interface, interface.inputs)
+    return _space(interface.inputs)
 
 
 def observation_space(interface: Interface) -> spaces.Space[Any]:
     """Make the observation space of an environment's outputs. Reals may be unbounded."""
-    return _space(interface, interface.outputs)
+    return _space(interface.outputs)
 
 
-def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequence[int] | None:
+def discrete_values(variables: Sequence[Variable]) -> Sequence[int] | None:
     """The values that the elements of a ``Discrete`` stand for.
 
     Returns:
@@ -72,8 +72,8 @@ def discrete_values(interface: Interface, variables: Sequence[Variable]) -> Sequ
     (variable,) = variables
     if variable.kind == "enumeration" and variable.items:
         return sorted(value for _, value in variable.items)
-    if variable.kind in {"integer", "enumeration"} and _countable(interface, variable):
-        return _integers(variable, *interface.bounds(variable))
+    if variable.kind in {"integer", "enumeration"} and _countable(variable):
+        return _integers(variable, *_range_of(variable))
     return None
 
 
@@ -86,33 +86,43 @@ def _integers(variable: Variable, low: float, high: float) -> range:
     return values
 
 
-def _space(interface: Interface, variables: tuple[Variable, ...]) -> spaces.Space[Any]:
-    values = discrete_values(interface, variables)
+def _space(variables: tuple[Variable, ...]) -> spaces.Space[Any]:
+    values = discrete_values(variables)
     if values is not None:
         return spaces.Discrete(len(values))
     if all(variable.kind == "boolean" for variable in variables):
         return spaces.MultiBinary(len(variables))
     with np.errstate(over="ignore"):  # beyond float32 there is no limit
-        limits = np.array([_box_limits(interface, v) for v in variables], dtype=np.float32)
+        limits = np.array([_box_limits(v) for v in variables], dtype=np.float32)
     return spaces.Box(limits[:, 0], limits[:, 1], dtype=np.float32)
 
 
-def _box_limits(interface: Interface, variable: Variable) -> tuple[float, float]:
+def _box_limits(variable: Variable) -> tuple[float, float]:
     if variable.kind == "boolean":
         return 0.0, 1.0
     if variable.items:
         values = [value for _, value in variable.items]
         return min(values), max(values)
-    return interface.bounds(variable)
+    return _range_of(variable)
 
 
-def _bounded(interface: Interface, variable: Variable) -> bool:
-    return all(map(math.isfinite, interface.bounds(variable)))
+def _range_of(variable: Variable) -> tuple[float, float]:
+    low, high = variable.range
+    if not low <= high:
+        raise ConfigError(
+            f"{variable.name!r} has min = {low} and max = {high} in the FMU; give it 'bounds', "
+            "or 'min' and 'max' in a task file"
+        )
+    return low, high
 
 
-def _countable(interface: Interface, variable: Variable) -> bool:
+def _bounded(variable: Variable) -> bool:
+    return all(map(math.isfinite, _range_of(variable)))
+
+
+def _countable(variable: Variable) -> bool:
     """Whether a ``Discrete`` can have an element for each integer within the limits."""
-    return all(abs(limit) <= LARGEST_EXACT_INTEGER for limit in interface.bounds(variable))
+    return all(abs(limit) <= LARGEST_EXACT_INTEGER for limit in _range_of(variable))
 
 
 def to_input_types(
@@ -219,7 +229,7 @@ def _discrete_observation(
             f"{len(interface.outputs)} outputs do not make an element of {space}; "
             "override _get_observation"
         )
-    values = discrete_values(interface, interface.outputs)
+    values = discrete_values(interface.outputs)
     if values is None or space.n != len(values):
         return lambda state: np.asarray(state[0]).astype(np.int64)[()]
     (variable,) = interface.outputs

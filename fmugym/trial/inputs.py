@@ -45,30 +45,21 @@ def moving_inputs(spec: PoolSpec, steps: int, amplitude: float, phase: float = 0
         Shape (steps, inputs).
     """
     rows = np.empty((steps, len(spec.inputs)))
-    for index, (variable, limits) in enumerate(_with_limits(spec)):
+    for index, variable in enumerate(spec.inputs):
         pace = 0.7 + 0.31 * index
         swing = amplitude * np.sin(pace * (np.arange(steps) + 1.0 + phase))
-        rows[:, index] = _moved(variable, limits, swing)
+        rows[:, index] = _moved(variable, swing)
     return rows
 
 
-_Limits = tuple[float, float]
-
-
-def _with_limits(spec: PoolSpec) -> list[tuple[Variable, _Limits]]:
-    limits = spec.input_limits or [(v.minimum, v.maximum) for v in spec.inputs]
-    return list(zip(spec.inputs, limits, strict=True))
-
-
-def _start(variable: Variable, limits: _Limits) -> float:
-    low, high = limits
-    start = variable.start_number
+def _start(variable: Variable) -> float:
+    (low, high), start = variable.range, variable.start_number
     return min(max(start, low), high) if low <= high else start
 
 
-def _moved(variable: Variable, limits: _Limits, swing: FloatArray) -> FloatArray:
+def _moved(variable: Variable, swing: FloatArray) -> FloatArray:
     """Values around the start value that swing up to the upper limit and down to the lower one."""
-    start = _start(variable, limits)
+    (low, high), start = variable.range, _start(variable)
     if variable.kind == "boolean":
         return np.where(swing > 0.3, 1.0 - start, start)
     if variable.items:
@@ -76,7 +67,7 @@ def _moved(variable: Variable, limits: _Limits, swing: FloatArray) -> FloatArray
         other = values[(np.arange(len(swing)) % len(values))]
         return np.where(swing > 0.3, other, start)
     room = _UNBOUNDED if variable.kind == "real" else 1.0
-    up = limits[1] - start if math.isfinite(limits[1]) else room
-    down = start - limits[0] if math.isfinite(limits[0]) else room
+    up = high - start if math.isfinite(high) else room
+    down = start - low if math.isfinite(low) else room
     values = start + np.where(swing > 0.0, swing * up, swing * down)
     return np.rint(values) if variable.kind == "integer" else values

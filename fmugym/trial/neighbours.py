@@ -93,11 +93,8 @@ def need_of_several(rehearsal: Rehearsal, alone: Verdict) -> Neighbours:
 
 def _without(spec: PoolSpec, noisy: tuple[str, ...]) -> PoolSpec:
     """Leave out the outputs that tell nothing about other instances, unless all are such."""
-    kept = [i for i, variable in enumerate(spec.outputs) if variable.name not in noisy]
-    if not kept:
-        return spec
-    samplings = tuple(spec.samplings[i] for i in kept) if spec.samplings else ()
-    return replace(spec, outputs=tuple(spec.outputs[i] for i in kept), samplings=samplings)
+    kept = tuple(variable for variable in spec.outputs if variable.name not in noisy)
+    return replace(spec, outputs=kept) if kept else spec
 
 
 def need_in_turn(
@@ -269,7 +266,9 @@ def _with_long_calls(spec: PoolSpec, step_seconds: float, call_seconds: float) -
         spec,
         time_step=spec.time_step * factor,
         substeps=spec.substeps * factor,
-        samplings=tuple("last" if v.kind == "string" else "mean" for v in spec.outputs),
+        outputs=tuple(
+            v if v.kind == "string" else replace(v, sampling="mean") for v in spec.outputs
+        ),
         warm_up_steps=0,
     )
 

@@ -187,7 +187,7 @@ def _unreadable(rehearsal: Rehearsal) -> Iterator[str]:
     """Find the first outputs that cannot be read after an initialization."""
     if not rehearsal.fails_in_reading:
         return
-    spec, left = replace(rehearsal.spec, outputs=(), samplings=()), _MOST_UNREADABLE
+    spec, left = replace(rehearsal.spec, outputs=()), _MOST_UNREADABLE
     with rehearsal.subject.pool("the search for outputs that cannot be read", spec) as pool:
         start(pool, rehearsal.starts, 0)
         for variable in rehearsal.spec.outputs:

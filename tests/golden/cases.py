@@ -25,6 +25,7 @@ import user_tasks
 import values_tools
 import zoo_tools
 from plants import PLANTS
+from pool_tools import sampled
 
 import fmugym
 from fmugym import FMU, FMUGymError
@@ -81,9 +82,10 @@ def play(pool, variables, inputs, seed=0):
     return np.array(rows)
 
 
-def played(fmu, inputs, outputs, starts, time_step, options, **spec):
+def played(fmu, inputs, outputs, starts, time_step, options, samplings=None, **spec):
     """Open a pool of two instances and play."""
     given, read = (tuple(map(fmu.variable, names)) for names in (inputs, outputs))
+    read = sampled(read, samplings)
     start = tuple(START_TIME if name is START_TIME else fmu.variable(name) for name in starts)
     with closing(local_pool(fmu, PoolSpec(given, read, time_step, **spec), 2, LOG, **options)) as p:
         return play(p, start, len(inputs))
