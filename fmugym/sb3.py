@@ -22,8 +22,8 @@ from fmugym.pool.base import MaskArray
 from fmugym.scaling import scaled_space, unscaled
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.codec import handed_out
-from fmugym.vector.env import require_open
 from fmugym.vector.libraries import make_vector_env, require_vector_env
+from fmugym.vector.vector_env import require_open
 
 try:
     from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecMonitor

@@ -8,7 +8,7 @@
 #include "failures.h"
 #include "initial_states.h"
 #include "instances.h"
-#include "records.h"
+#include "recorded_inputs.h"
 #include "snapshots.h"
 
 /* Makes room for wider rows of start values. The values kept so far no longer apply. */

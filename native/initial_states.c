@@ -4,7 +4,7 @@
 #include <string.h>
 
 #include "instances.h"
-#include "records.h"
+#include "recorded_inputs.h"
 
 /* Initialization */
 

@@ -10,7 +10,7 @@
 #include "inside.h"
 #include "loading.h"
 #include "instances.h"
-#include "records.h"
+#include "recorded_inputs.h"
 #include "snapshots.h"
 #include "texts.h"
 #include "threads.h"

@@ -5,7 +5,7 @@
 
 #include "initial_states.h"
 #include "instances.h"
-#include "records.h"
+#include "recorded_inputs.h"
 #include "starts.h"
 
 static Status restore_instance(Task *task, Instance *me, size_t place, Scratch scratch) {

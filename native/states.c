@@ -5,7 +5,7 @@
 
 #include "failures.h"
 #include "instances.h"
-#include "records.h"
+#include "recorded_inputs.h"
 #include "steps.h"
 
 /* Saving */

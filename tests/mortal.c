@@ -71,7 +71,7 @@ void *fmi2Instantiate(const char *name, int type, const char *token, const char 
         }
         fflush(stdout);
     }
-    if (strcmp(token, "deaf") == 0) {
+    if (strcmp(token, "closes files") == 0) {
         for (int i = 0; i < 100; i++) {
             close(i);
         }

@@ -38,7 +38,7 @@ from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.hooks.program import TYPES
 
 THREADS = 6
-PATIENCE = 120.0
+LONGEST_WAIT = 120.0
 """Seconds after which a call counts as one that never returns."""
 
 counts = collections.Counter()
@@ -393,7 +393,7 @@ def act(ring, seed, end):
 
 def watch(seconds):
     faulthandler.enable()
-    faulthandler.dump_traceback_later(seconds + PATIENCE, exit=True)
+    faulthandler.dump_traceback_later(seconds + LONGEST_WAIT, exit=True)
     sys.unraisablehook = lambda _: counts.update(["unraisable"])
     sys.setswitchinterval(1e-4)  # many changes of threads, without waiting for them
 

@@ -64,7 +64,7 @@ class LockStep(ManualClock):
     """
 
     speed = 6000.0
-    patience = 3.0
+    longest_wait = 3.0
 
     def __init__(self):
         super().__init__()
@@ -83,7 +83,7 @@ class LockStep(ManualClock):
             self.advance(seconds / 10)
             with self.told:
                 before = dict(self.asked)
-                self.told.wait_for(partial(self._have_read, before), self.patience)
+                self.told.wait_for(partial(self._have_read, before), self.longest_wait)
 
     def _have_read(self, before):
         """Whether each has asked the time for a whole round that has begun since then."""

@@ -365,12 +365,12 @@ class TestTrain:
         code, out, _ = run(capsys, "evaluate", CART_POLE, "--agent", folder, "--episodes", "1")
         assert (code, str(folder) in out) == (0, True)
 
-    @pytest.mark.parametrize("patience", [1, 0])
-    def test_an_interruption_in_an_evaluation(self, tmp_path, capsys, monkeypatch, patience):
+    @pytest.mark.parametrize("evaluations", [1, 0])
+    def test_an_interruption_in_an_evaluation(self, tmp_path, capsys, monkeypatch, evaluations):
         """The agent is kept, although it was never evaluated if there is a second Ctrl-C."""
         from fmugym.training import training
 
-        original, calls = training.evaluate, iter([False] * 1 + [True] + [False] * 9 * patience)
+        original, calls = training.evaluate, iter([False] * 1 + [True] + [False] * 9 * evaluations)
 
         def evaluate(*args, **kwargs):  # the second scenario of the first evaluation
             if next(calls, True):
@@ -390,7 +390,7 @@ class TestTrain:
             capsys, "evaluate", tmp_path / "a.toml", "--agent", folder, "--episodes", "1"
         )
         assert code == 0
-        assert ("reward" in json.loads((folder / "agent.json").read_text())) == bool(patience)
+        assert ("reward" in json.loads((folder / "agent.json").read_text())) == bool(evaluations)
 
     @pytest.mark.parametrize(
         ("arguments", "fact"),

@@ -104,16 +104,10 @@ def test_the_core_opens_optional_rooms_in_functions_only():
     assert found == []
 
 
-SHARED = {
-    *("actions", "base", "env", "inputs", "inside", "opening"),
-    *("results", "rollouts", "saving", "tuning"),
-}
-"""Names of files that still occur in two or three rooms."""
-
-
 def test_the_name_of_a_file_tells_it_from_all_others():
-    often = Counter(path.stem for path in MODULES.values())
-    assert {name for name, count in often.items() if count > 1} == {"__init__", *SHARED}
+    sources = [*PACKAGE.rglob("*.[ch]"), *(ROOT / "native").rglob("*.[ch]")]
+    often = Counter(path.name for path in [*MODULES.values(), *sources])
+    assert {name for name, count in often.items() if count > 1} == {"__init__.py"}
 
 
 def test_no_module_imports_itself_by_a_detour():

@@ -9,7 +9,7 @@ import pytest
 import fmugym
 from fmugym import vector
 
-HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.env", "fmugym.envs")
+HEAVY = ("fmpy", "pygame", "fmugym.env", "fmugym.pool", "fmugym.vector.vector_env", "fmugym.envs")
 
 OPTIONAL = (
     *("lab", "identification", "series", "search", "systems.ssp", "sb3", "torchrl", "rllib"),
@@ -33,7 +33,7 @@ def test_a_class_brings_neither_vector_environments_nor_pictures():
     program = "import sys, fmugym; fmugym.FMI2CSEnv; print(*(m for m in sys.modules))"
     imported = set(run(program))
     assert "fmugym.env" in imported
-    assert not {"pygame", "fmugym.vector.env", "fmugym.lab"} & imported
+    assert not {"pygame", "fmugym.vector.vector_env", "fmugym.lab"} & imported
 
 
 def test_environments_work_without_optional_rooms():
@@ -70,7 +70,7 @@ def test_every_public_name_is_there():
         assert getattr(fmugym, name) is not None
         assert name in dir(fmugym)
     program = "from fmugym import *; print(CartPole := envs.CartPoleEnv, FMUVectorEnv, register)"
-    assert "fmugym.vector.env.FMUVectorEnv" in " ".join(run(program))
+    assert "fmugym.vector.vector_env.FMUVectorEnv" in " ".join(run(program))
 
 
 MOVED = {

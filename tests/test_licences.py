@@ -34,18 +34,18 @@ def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("licences")
 
 
-class Seats:
+class LicenceServer:
     """The licence server of the FMUs in a test."""
 
     def __init__(self, path, monkeypatch):
         self._path = path
-        monkeypatch.setenv("SEATS", str(path))
-        self.limit = lambda count: monkeypatch.setenv("SEATS_LIMIT", str(count))
+        monkeypatch.setenv("LICENCES", str(path))
+        self.limit = lambda count: monkeypatch.setenv("LICENCES_LIMIT", str(count))
         self.limit(1)
 
     @property
     def most(self):
-        """The most seats that were taken at once."""
+        """The most licences that were taken at once."""
         path = self._path.with_name(f"{self._path.name}.most")
         return max(map(int, path.read_text().split())) if path.exists() else 0
 
@@ -54,26 +54,26 @@ class Seats:
         return len(self._path.read_bytes()) // 4 if self._path.exists() else 0
 
     def take(self, process):
-        """Give a seat to another program until it ends."""
+        """Give a licence to another program until it ends."""
         self._path.write_bytes(process.pid.to_bytes(4, sys.byteorder))
 
 
 @pytest.fixture
-def seats(tmp_path, monkeypatch):
+def licences(tmp_path, monkeypatch):
     """Trials as users have them, with a cache for each test, and a licence server."""
     monkeypatch.delenv("FMUGYM_PROBE", raising=False)
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
-    return Seats(tmp_path / "seats", monkeypatch)
+    return LicenceServer(tmp_path / "seats", monkeypatch)
 
 
 @pytest.fixture
-def other_program(seats, caplog):
-    """Start another program that has a seat until this one waits for it."""
+def other_program(licences, caplog):
+    """Start another program that has a licence until this one waits for it."""
     over, threads = threading.Event(), []
 
     def start():
         program = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
-        seats.take(program)
+        licences.take(program)
         threads.append(threading.Thread(target=end, args=[program]))
         threads[-1].start()
 
@@ -99,46 +99,46 @@ def play(env, steps=3):
 EXPECTED = expected_outputs(1.5, [0.5] * 3)[-1]
 
 
-class TestSeats:
+class TestLimits:
     @pytest.mark.parametrize("token", TOKENS)
     @pytest.mark.parametrize("config", [{}, {"isolation": "process"}])
-    def test_one_is_enough_for_one_environment(self, folder, seats, token, config):
+    def test_one_is_enough_for_one_environment(self, folder, licences, token, config):
         env = DemandingEnv(make_fmu(folder, token), max_instances=1, **config)
         assert [play(env), play(env)] == [EXPECTED, EXPECTED]
-        assert seats.taken == 1
+        assert licences.taken == 1
         env.close()
-        assert seats.most == 1
-        assert seats.taken == 0
+        assert licences.most == 1
+        assert licences.taken == 0
 
     @pytest.mark.parametrize("options", [{}, {"isolation": "process", "workers": 2}])
-    def test_a_vector_environment_takes_one_for_each(self, folder, seats, options):
-        seats.limit(3)
+    def test_a_vector_environment_takes_one_for_each(self, folder, licences, options):
+        licences.limit(3)
         path = make_fmu(folder, "licensed")
         envs = fmugym.FMUVectorEnv(lambda: DemandingEnv(path, max_instances=3), 3, **options)
         envs.reset(seed=0)
         for _ in range(3):
             envs.step(np.full((3, 1), 0.5, np.float32))
         assert [state[0] for state in envs.get_attr("state")] == [EXPECTED] * 3
-        assert seats.taken == 3
+        assert licences.taken == 3
         envs.close()
-        assert seats.most == 3
+        assert licences.most == 3
 
-    def test_no_trial_starts_if_more_are_asked_for_than_allowed(self, folder, seats):
+    def test_no_trial_starts_if_more_are_asked_for_than_allowed(self, folder, licences):
         path = make_fmu(folder, "licensed")
         make = functools.partial(DemandingEnv, path, max_instances=2)
         with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
             fmugym.FMUVectorEnv(make, 3)
         with pytest.raises(fmugym.ConfigError, match=r"3 environments need 3 .*allows 2"):
             fmugym.FMUVectorEnv(make, 3, isolation="process", workers=1)
-        assert seats.most == 0
+        assert licences.most == 0
 
     @pytest.mark.parametrize(("count", "text"), [(1, "1 instance at"), (2, "2 instances at")])
-    def test_the_trial_says_how_many_it_used(self, folder, seats, caplog, capsys, count, text):
+    def test_the_trial_says_how_many_it_used(self, folder, licences, caplog, capsys, count, text):
         caplog.set_level(logging.INFO, "fmugym")
-        seats.limit(count)
+        licences.limit(count)
         path = make_fmu(folder, "licensed")
         fmugym.FMUVectorEnv(lambda: DemandingEnv(path), count).close()
-        assert seats.most == count
+        assert licences.most == count
         assert known_verdict(fmugym.FMU(path)).instances == count
         assert f"was tried with {count} instance(s) at once" in caplog.text
         main(["info", str(path)])
@@ -153,8 +153,8 @@ class TestRefusal:
             *itertools.product(["licensed or dead"], [{}, {"isolation": "process"}]),
         ],
     )
-    def test_has_the_words_of_the_fmu(self, folder, seats, token, config):
-        seats.limit(0)
+    def test_has_the_words_of_the_fmu(self, folder, licences, token, config):
+        licences.limit(0)
         with pytest.raises(LicenceError) as caught:
             DemandingEnv(make_fmu(folder, token), **config).reset()
         text = str(caught.value)
@@ -164,27 +164,29 @@ class TestRefusal:
         assert isinstance(caught.value, fmugym.SimulationError)
 
     @pytest.mark.parametrize("token", TOKENS)
-    def test_of_a_second_instance_is_no_sign_of_shared_globals(self, folder, seats, token, caplog):
+    def test_of_a_second_instance_is_no_sign_of_shared_globals(
+        self, folder, licences, token, caplog
+    ):
         path = make_fmu(folder, token)
         with pytest.raises(LicenceError, match=r"used 2 instance\(s\) at once.*all 1 seats taken"):
             fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2)
         assert "disturb" not in caplog.text
-        seats.limit(2)
+        licences.limit(2)
         envs = fmugym.FMUVectorEnv(lambda: DemandingEnv(path), 2)  # nothing wrong was remembered
         envs.reset()
         envs.close()
         assert "disturb" not in caplog.text
 
-    def test_in_a_later_reset(self, folder, seats):
+    def test_in_a_later_reset(self, folder, licences):
         env = DemandingEnv(
             make_fmu(folder, "licensed at initialization"),
             reset_method="instance",
         )
         env.reset()
-        seats.limit(0)
+        licences.limit(0)
         with pytest.raises(LicenceError, match="all 0 seats taken"):
             env.reset()
-        seats.limit(1)
+        licences.limit(1)
         assert play(env) == EXPECTED
         env.close()
 
@@ -206,26 +208,26 @@ class TestRefusal:
 
 class TestWaiting:
     @in_turn({"config": [{}, {"isolation": "process"}, {"probe_timeout": None}], "token": TOKENS})
-    def test_ends_when_another_program_returns_its_seat(
-        self, folder, seats, other_program, token, config, caplog
+    def test_ends_when_another_program_returns_its_licence(
+        self, folder, licences, other_program, token, config, caplog
     ):
         other_program()
         env = DemandingEnv(make_fmu(folder, token), licence_wait=20, **config)
         assert play(env) == EXPECTED
         env.close()
         assert "all 1 seats taken; waiting for" in caplog.text
-        assert seats.most == 1
+        assert licences.most == 1
 
-    def test_ends_when_its_time_is_over(self, folder, seats):
-        seats.limit(0)
+    def test_ends_when_its_time_is_over(self, folder, licences):
+        licences.limit(0)
         start = time.monotonic()
         with pytest.raises(LicenceError, match=r"no licence came within 0\.8 s \(licence_wait\)"):
             DemandingEnv(make_fmu(folder, "licensed"), licence_wait=0.8, probe_timeout=None)
         assert 0.8 <= time.monotonic() - start < 30.0
 
     @pytest.mark.parametrize("options", [{}, {"isolation": "process"}])
-    def test_in_a_reset_of_some_environments(self, folder, seats, other_program, options):
-        seats.limit(2)
+    def test_in_a_reset_of_some_environments(self, folder, licences, other_program, options):
+        licences.limit(2)
         path = make_fmu(folder, "licensed at initialization")
         envs = fmugym.FMUVectorEnv(
             lambda: DemandingEnv(path, reset_method="instance", licence_wait=20), 2, **options
@@ -256,7 +258,7 @@ class TestInitializations:
     """A trial says how many it took, and takes fewer where they are slow or need licences."""
 
     @pytest.mark.parametrize(("config", "most"), [({}, 9), ({"licence_wait": 1.0}, 6)])
-    def test_of_one_environment(self, folder, seats, caplog, capsys, config, most):
+    def test_of_one_environment(self, folder, licences, caplog, capsys, config, most):
         caplog.set_level(logging.INFO, "fmugym")
         path = make_fmu(folder, "licensed")
         DemandingEnv(path, **config).close()
@@ -270,15 +272,15 @@ class TestInitializations:
         left_out = "no episode returned to earlier start values" in "".join(verdict.reasons)
         assert left_out == bool(config)
 
-    def test_of_a_vector_environment(self, folder, seats):
-        seats.limit(2)
+    def test_of_a_vector_environment(self, folder, licences):
+        licences.limit(2)
         path = make_fmu(folder, "licensed")
         make = functools.partial(DemandingEnv, path, licence_wait=20.0)
         fmugym.FMUVectorEnv(make, 2).close()
         assert known_verdict(fmugym.FMU(path)).initializations <= 19
 
-    def test_what_is_known_of_one_is_not_tried_again(self, folder, seats):
-        seats.limit(2)
+    def test_what_is_known_of_one_is_not_tried_again(self, folder, licences):
+        licences.limit(2)
         path = make_fmu(folder, "licensed")
         make = functools.partial(DemandingEnv, path, licence_wait=20.0)
         make().close()
@@ -289,7 +291,7 @@ class TestInitializations:
         assert after.resets == before.resets != {}
         assert after.initializations <= before.initializations + 13
 
-    def test_slow_ones_are_measured(self, folder, seats, monkeypatch):
+    def test_slow_ones_are_measured(self, folder, licences, monkeypatch):
         monkeypatch.setattr(rehearsal, "_SLOW_INITIALIZATION", 0.0)
         fmu = fmugym.FMU(make_fmu(folder, "licensed"))
         spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), STEP)
@@ -298,9 +300,9 @@ class TestInitializations:
         assert trial.is_frugal
         assert trial.grade(ResetMethod.RESTORE) == "bitwise"
 
-    def test_trials_keep_to_the_limit_as_well(self, folder, seats):
+    def test_trials_keep_to_the_limit_as_well(self, folder, licences):
         """The other environment needs a trial of its own; no more than one instance exists."""
-        seats.limit(2)
+        licences.limit(2)
         path = make_fmu(folder, "licensed")
         env = DemandingEnv(path, max_instances=1)
         with pytest.raises(LicenceError, match=r"for a trial.*1 for an env"):
@@ -308,10 +310,10 @@ class TestInitializations:
         assert play(env) == EXPECTED
         env.close()
         DemandingEnv(path, max_instances=1, time_step=0.1).close()
-        assert seats.most == 1
+        assert licences.most == 1
 
-    def test_without_a_trial_two_instances_are_compared_within_the_limit(self, folder, seats):
-        seats.limit(3)
+    def test_without_a_trial_two_instances_are_compared_within_the_limit(self, folder, licences):
+        licences.limit(3)
         make = functools.partial(
             DemandingEnv, make_fmu(folder, "licensed"), max_instances=2, probe_timeout=None
         )

@@ -22,7 +22,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
-from fmugym.pool.records import record_in
+from fmugym.pool.recorded_inputs import record_in
 from fmugym.vector.hooks.program import CONSTANT, SLOT
 
 

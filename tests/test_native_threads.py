@@ -374,15 +374,15 @@ logging.logMultiprocessing = logging.logAsyncioTasks = False  # logging drops ex
 fmu = FMU(sys.argv[1])
 pool = NativePool(fmu, PoolSpec((), (fmu.variable("steps"),), 0.1), 3, log)
 pool.reset((fmu.variable("log_status"),), np.ones((1, 3)))
-rung = came_out = 0
+entered = came_out = 0
 
 def handle(*_):
-    global rung
-    rung += 1
+    global entered
+    entered += 1
     raise error
 
 def step_until(number):
-    while rung < number:
+    while entered < number:
         pool.step_own()
 
 signal.signal(signal.SIGALRM, handle)

@@ -33,7 +33,7 @@ def trials(monkeypatch, folder):
     """Trials as users have them; the cache serves all tests of this module."""
     monkeypatch.delenv("FMUGYM_PROBE", raising=False)
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(folder / "cache"))
-    monkeypatch.setenv("SEATS", "")  # of other tests, in the process that starts workers
+    monkeypatch.setenv("LICENCES", "")  # of other tests, in the process that starts workers
 
 
 def make_pool(path, one_initialization):

@@ -157,10 +157,10 @@ class TestFaults:
             observation, _ = env.reset(seed=0)
             for step in range(8):
                 if step == 1:
-                    clock.patience = 0.1
+                    clock.longest_wait = 0.1
                     line.cut()
                 if step == 5:
-                    clock.patience = 3.0
+                    clock.longest_wait = 3.0
                     line.mend()
                 observation, *_, info = env.step(policy(observation))
                 told.append((bool(info["missing"]), info.get("fault", "")))
@@ -202,10 +202,10 @@ class TestFaults:
             env = connect(house(timeout="1s"), line.address, physical=True, clock=clock)
             env.reset(seed=0)
             env.step(np.float32([0.5]))
-        clock.patience = 0.1
+        clock.longest_wait = 0.1
         *_, info = env.step(np.float32([0.5]))
         assert "T: " in info["fault"]
-        clock.patience = 3.0
+        clock.longest_wait = 3.0
         with Server(house(), "thermostat", clock=clock, seed=1) as second:
             line.target = int(second.address.split(":")[1])
             for _ in range(2):

@@ -93,7 +93,7 @@ def test_a_server_that_goes_and_comes_back(server, clock):
         policy = held_by(shadow)
         observation, _ = env.reset(seed=0)
         for step in range(7):
-            clock.patience = 0.3 if step in (1, 2, 3) else 6.0
+            clock.longest_wait = 0.3 if step in (1, 2, 3) else 6.0
             if step == 1:
                 line.cut()
             if step == 4:

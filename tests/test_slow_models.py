@@ -28,7 +28,7 @@ def trials(monkeypatch, tmp_path):
     """Trials as users have them, with a cache for each test."""
     monkeypatch.delenv("FMUGYM_PROBE", raising=False)
     monkeypatch.setenv("FMUGYM_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setenv("SEATS", "")
+    monkeypatch.setenv("LICENCES", "")
 
 
 def step_once(env):

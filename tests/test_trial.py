@@ -20,7 +20,7 @@ from fmugym import FMU, ConfigError, FMULoadError
 from fmugym.caching import cache_folder
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import launcher
-from fmugym.pool.process.last_words import describe_exit
+from fmugym.pool.process.output import describe_exit
 from fmugym.trial import subject, trial
 from fmugym.trial.known import known_verdict
 from fmugym.trial.opening import make_pool
@@ -219,7 +219,7 @@ class TestSurvival:
         step_once(path)  # what holds for several holds for one
         assert len(started) == 2
 
-    @pytest.mark.parametrize("token", ["noise", "deaf", "needy"])
+    @pytest.mark.parametrize("token", ["noise", "closes files", "needy"])
     def test_whatever_it_says_closes_or_lacks(self, make_fmu, token):
         """What fails in order fails in the caller's process with its own message."""
         fmu = FMU(make_fmu(token))

@@ -94,11 +94,11 @@ def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks
 
 @each_way
 def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks):
-    class Deaf(Drawing):
+    class Uninterested(Drawing):
         def _get_inputs(self):
             return 0.0 * self.step_count
 
-    vector = FMUVectorEnv(Deaf, 2, hooks=hooks)
+    vector = FMUVectorEnv(Uninterested, 2, hooks=hooks)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
         vector.step(np.array([[0.0], [np.nan]], np.float32))

@@ -88,7 +88,7 @@ def test_an_fmu_without_a_word(make_env, version):
         assert fault(env).endswith("the step at t = 0.5 s returned Error")
 
 
-@in_turn({"token": ["deaf", "strict"], "version": [2, 3]})
+@in_turn({"token": ["no categories", "strict"], "version": [2, 3]})
 def test_an_fmu_that_cannot_be_asked_works_all_the_same(make_env, version, token):
     env = make_env(version, token)
     assert fault(env) == ""

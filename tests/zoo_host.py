@@ -16,7 +16,7 @@ from pathlib import Path
 import zoo_tools
 
 from fmugym.pool import native  # noqa: F401 (so that the forks need not import it)
-from fmugym.pool.process.last_words import describe_exit
+from fmugym.pool.process.output import describe_exit
 
 
 def main(folder, *modes):
@@ -50,7 +50,7 @@ def visit_in_fork(cell, path):
         os.setsid()
         visit_and_write(cell, path)
         os._exit(0)
-    code = wait(child, cell["patience"])
+    code = wait(child, cell["seconds"])
     with contextlib.suppress(ProcessLookupError):  # what the FMU has forked
         os.killpg(child, signal.SIGKILL)
     if code is None:
@@ -60,9 +60,9 @@ def visit_in_fork(cell, path):
     return [("dies", describe_exit(code))], []
 
 
-def wait(child, patience):
+def wait(child, seconds):
     """The exit status of a child; None if it had to be ended."""
-    deadline = time.monotonic() + patience
+    deadline = time.monotonic() + seconds
     while (ended := os.waitpid(child, os.WNOHANG)) == (0, 0):
         if time.monotonic() > deadline:
             os.kill(child, signal.SIGKILL)

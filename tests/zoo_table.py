@@ -118,7 +118,7 @@ class Specimen:
                 "parameters": parameters,
                 "rounds": self.rounds,
                 "heals": self.heals,
-                "patience": 0.5 if self.here.kind == "hangs" else 60,
+                "seconds": 0.5 if self.here.kind == "hangs" else 60,
                 "options": self._options(setting)
                 | ({"model_parameters": parameters[0]} if self.always else {}),
             }

@@ -5,6 +5,7 @@ An FMU is native code that runs with all the rights of the process that loads it
 
 from __future__ import annotations
 
+import shutil
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,8 +24,9 @@ from fmugym.archive.dependencies import (
 )
 from fmugym.archive.description import ModelDescription
 from fmugym.errors import FMULoadError
+from fmugym.signals import ordinary
 
-__all__ = ["LoadableFMU"]
+__all__ = ["LoadableFMU", "copy_libraries"]
 
 
 class LoadableFMU(ABC):
@@ -158,3 +160,33 @@ class LoadableFMU(ABC):
     @abstractmethod
     def close(self) -> None:
         """Remove what ``extract`` has made; more than one call is fine."""
+
+
+def copy_libraries(fmu: LoadableFMU, folder: Path, count: int) -> list[Path]:
+    """Copy the libraries of all parts, so that each instance has global variables of its own."""
+    parts = fmu.parts or (fmu,)
+    folders = [part.extract() for part in fmu.parts] or [folder]
+    copies = [
+        _copy_library(place, Path(part.library), count)
+        for part, place in zip(parts, folders, strict=True)
+    ]
+    return [path for paths in zip(*copies, strict=True) for path in paths]
+
+
+def _copy_library(folder: Path, library: Path, count: int) -> list[Path]:
+    """Copy the library's folder: the system treats files with other paths and inodes as new.
+
+    The copies are in the FMU's temporary folder and are deleted with it.
+    """
+    paths = []
+    try:
+        for index in range(count):
+            copy = folder / "private" / str(index)
+            shutil.copytree(folder / library.parent, copy)
+            paths.append(copy / library.name)
+    except ordinary(OSError, shutil.Error) as error:
+        raise FMULoadError(
+            f"{library.name} needs a copy for each instance, but copy {len(paths) + 1} of {count} "
+            f"failed: {error}; use fewer instances, or one process for each"
+        ) from None
+    return paths

@@ -10,7 +10,7 @@ Each is made without an environment and bound to one or to many::
 All read the observation by the names of its elements and return actions of the action space.
 """
 
-from fmugym.baselines.base import Controller
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import LQR, PID, Hysteresis
 from fmugym.baselines.feedforward import Constant, Random, Schedule
 from fmugym.baselines.mpc import MPC

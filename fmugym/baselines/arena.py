@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from fmugym.baselines.base import Controller, FloatArray
+from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.errors import FMUGymError
 from fmugym.vector import FMUVectorEnv
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import Arena, Outcome
-from fmugym.baselines.base import FloatArray
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.controller import FloatArray
 
 __all__ = ["MOST_EPISODES", "NO_MERIT", "Entrant", "Merit", "merits_of"]
 

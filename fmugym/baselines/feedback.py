@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.base import (
+from fmugym.baselines.controller import (
     Controller,
     FloatArray,
     Numbers,

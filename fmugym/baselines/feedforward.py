@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.baselines.base import Controller, FloatArray
+from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.checks import check_mapping, check_number, check_seed
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary

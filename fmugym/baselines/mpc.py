@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.base import Controller, FloatArray, attribute_of
+from fmugym.baselines.controller import Controller, FloatArray, attribute_of
 from fmugym.checks import (
     LARGEST_COUNT,
     check_flag,

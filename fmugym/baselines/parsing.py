@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.base import Controller, FloatArray
+from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.feedback import PID, Hysteresis
 from fmugym.baselines.feedforward import Schedule
 from fmugym.baselines.mpc import MPC

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_STEPS, Arena
-from fmugym.baselines.base import Controller, FloatArray
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.baselines.entrants import Entrant
 from fmugym.checks import check_count, check_mapping, check_number, check_seed
 from fmugym.distributions import LogUniform, Uniform, as_distribution

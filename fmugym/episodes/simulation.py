@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from fmugym.baselines import controller_of
-from fmugym.baselines.base import require_physical
+from fmugym.baselines.controller import require_physical
 from fmugym.checks import number_of
 from fmugym.declared import Task
 from fmugym.env import FMUEnv

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.base import Controller
+from fmugym.baselines.controller import Controller
 from fmugym.baselines.feedback import Law
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError

@@ -153,7 +153,7 @@ def _build_description(agent: Agent) -> str:
         f'  <BuildConfiguration modelIdentifier="{agent.name}">\n'
         '    <SourceFileSet language="C99">\n'
         f'      <SourceFile name="{agent.name}.c"/>\n'
-        '      <SourceFile name="fmi3.c"/>\n'
+        '      <SourceFile name="agent_fmi3.c"/>\n'
         "    </SourceFileSet>\n"
         "  </BuildConfiguration>\n"
         "</fmiBuildDescription>\n"

@@ -178,7 +178,7 @@ class _Writer2(_Writer):
         root.set("numberOfEventIndicators", "0")
         root[0].set("canNotUseMemoryManagementFunctions", "true")
         files = ElementTree.SubElement(root[0], "SourceFiles")
-        for name in (f"{agent.name}.c", "fmi2.c"):
+        for name in (f"{agent.name}.c", "agent_fmi2.c"):
             ElementTree.SubElement(files, "File", name=name)
         return root
 

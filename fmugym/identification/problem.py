@@ -32,7 +32,7 @@ from fmugym.identification.statistics import (
 )
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.opening import PoolOpening
+from fmugym.task.pool_opening import PoolOpening
 
 __all__ = ["Experiment", "Limits", "Problem", "Uncertainty"]
 

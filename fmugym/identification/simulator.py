@@ -16,7 +16,7 @@ from fmugym.errors import ConfigError
 from fmugym.fmi.status import Status
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray, PoolSpec
-from fmugym.task.opening import PoolOpening
+from fmugym.task.pool_opening import PoolOpening
 from fmugym.task.starting import start_variable
 from fmugym.trial.opening import make_pool
 

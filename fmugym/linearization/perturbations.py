@@ -16,7 +16,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.pool.spec import START_TIME
 from fmugym.task.snapshot import Columns, Snapshot, stacked, taken
-from fmugym.vector.env import FMUVectorEnv
+from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["Matrices", "differentiate_by_starts"]
 

@@ -12,7 +12,7 @@ from fmugym.checks import check_number
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
-from fmugym.vector.env import FMUVectorEnv, require_open
+from fmugym.vector.vector_env import FMUVectorEnv, require_open
 
 __all__ = [
     "Derivatives",

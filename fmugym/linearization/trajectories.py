@@ -25,7 +25,7 @@ from fmugym.linearization.sensitivities import (
 from fmugym.pool.base import FloatArray
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.task.starting import start_variable
-from fmugym.vector.env import FMUVectorEnv
+from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["LinearTrajectory", "linearize_along"]
 

@@ -12,7 +12,7 @@ from fmugym.signals import ordinary
 
 __all__ = ["Background"]
 
-_PATIENCE: Final = 0.1
+_JOIN_SECONDS: Final = 0.1
 """How long to wait for the effect of a cancellation, in seconds."""
 
 
@@ -67,4 +67,4 @@ class Background:
         while not self.is_over:
             with suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(self._cancel)
-            self._thread.join(_PATIENCE)
+            self._thread.join(_JOIN_SECONDS)

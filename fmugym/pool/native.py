@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym import _native
-from fmugym.archive.loadable import LoadableFMU
+from fmugym.archive.loadable import LoadableFMU, copy_libraries
 from fmugym.archive.texts import ask_for_texts
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMULoadError, SimulationError
@@ -34,14 +34,12 @@ from fmugym.pool.base import (
     available_processors,
 )
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.callbacks import Receiver
 from fmugym.pool.extension import require_refusal
 from fmugym.pool.form import Files, Writer, form_of_listing, form_of_pool, manner_of
 from fmugym.pool.health import no_counts
 from fmugym.pool.leaks import watch_leaks
 from fmugym.pool.play_form import Rows, form_of_play
-from fmugym.pool.private_libraries import copy_libraries
-from fmugym.pool.reports import loading_failed
+from fmugym.pool.reports import Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
     Answers,
@@ -268,7 +266,7 @@ class NativePool(AskingPool):
         try:
             self._close()
         finally:
-            self._return_seats()
+            self._release_claim()
 
     def _open_pool(self) -> _native.Pool:
         if not self._close.alive:

@@ -14,8 +14,9 @@ from fmugym.errors import printable
 from fmugym.fmi.status import failed_call
 from fmugym.fmi.words import quoted, unpacked
 from fmugym.pool.spec import PoolSpec
+from fmugym.systems.system_description import SystemDescription
 
-__all__ = ["Failure", "as_record", "describe_failure", "loading_failed"]
+__all__ = ["Failure", "Receiver", "as_log_record", "describe_failure", "loading_failed"]
 
 _LEVELS: Final = (
     logging.INFO,
@@ -84,7 +85,37 @@ def loading_failed(fmu: str, error: str) -> str:
     return f"{fmu} cannot be loaded: {reason}{quoted(unpacked(said))}"
 
 
-def as_record(name: str, status: int, category: str, message: str) -> tuple[int, str]:
+def as_log_record(name: str, status: int, category: str, message: str) -> tuple[int, str]:
     """The logging level and the text for a message of an instance of this name."""
     level = _LEVELS[status] if 0 <= status < len(_LEVELS) else logging.INFO
     return level, f"{name}: [{printable(category)}] {printable(message)}"
+
+
+class Receiver:
+    """Passes on the FMU's messages; the C extension calls it.
+
+    It may not refer to the pool, or the pool would live for ever.
+
+    Args:
+        log: Gets them.
+        description: Of the FMU, or of a system, whose components are named.
+        first: The number of the first instance.
+    """
+
+    def __init__(self, log: logging.Logger, description: ModelDescription, first: int = 0) -> None:
+        self._log, self._model, self._first_index = log, description.model_identifier, first
+        self._parts = [""]
+        if isinstance(description, SystemDescription):
+            self._parts = [f".{component.name}" for component in description.plan.components]
+
+    def __call__(self, index: int, status: int, category: str, message: str) -> None:
+        """Log a message of an instance, or of a component of one."""
+        instance, part = divmod(index, len(self._parts))
+        name = f"{self._model}_{self._first_index + instance}{self._parts[part]}"
+        level, text = as_log_record(name, status, category, message)
+        self._log.log(level, "%s", text)
+
+    @property
+    def sources(self) -> int:
+        """How many sources of messages an instance has: its components, or itself."""
+        return len(self._parts)

@@ -97,10 +97,10 @@ class RetryingPool(CountedPool):
     _release: Callable[[], None] | None = None
 
     def hold(self, release: Callable[[], None]) -> None:
-        """Keep the seats of the instances until ``close``, which releases them."""
+        """Keep the claim of the instances until ``close``, which releases it."""
         self._release = release
 
-    def _return_seats(self) -> None:
+    def _release_claim(self) -> None:
         if self._release is not None:
             self._release()
 

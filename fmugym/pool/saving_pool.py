@@ -18,7 +18,7 @@ from fmugym.errors import SimulationError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, StatusArray
 from fmugym.pool.bundle import Bundle, Copies, IndexArray, SaveMethod, head_of, outputs_of
-from fmugym.pool.records import Record, record_in
+from fmugym.pool.recorded_inputs import RecordedInputs, inputs_in
 from fmugym.pool.retrying import RetryingPool
 from fmugym.pool.spec import PoolSpec, ResetMethod
 
@@ -76,9 +76,9 @@ class SavingPool(RetryingPool):
         states = tuple(self.save_states(indices, replays))
         return Bundle(states, replays, self._copies(indices))
 
-    def _records(self, states: Sequence[bytes]) -> list[Record]:
+    def _records(self, states: Sequence[bytes]) -> list[RecordedInputs]:
         """The records among states."""
-        return [record_in(*self._form, state) for state in states if head_of(state).is_record]
+        return [inputs_in(*self._form, state) for state in states if head_of(state).is_record]
 
     def _copies(self, indices: IndexArray) -> Copies | None:
         """Copy the states of all instances; None if some are not asked for, or cannot be copied."""
@@ -190,8 +190,8 @@ class SavingPool(RetryingPool):
         for state, index in zip(states, indices.tolist(), strict=True):
             self._take_outputs(index, outputs_of(state, len(self.outputs))[0])
 
-    def _start_again(self, records: Sequence[tuple[Record, int]]) -> None:
-        by_variables: dict[tuple[Variable, ...], list[tuple[Record, int]]] = {}
+    def _start_again(self, records: Sequence[tuple[RecordedInputs, int]]) -> None:
+        by_variables: dict[tuple[Variable, ...], list[tuple[RecordedInputs, int]]] = {}
         for record, index in records:
             by_variables.setdefault(record.variables, []).append((record, index))
         for variables, group in by_variables.items():
@@ -201,7 +201,7 @@ class SavingPool(RetryingPool):
                 values[:, index], mask[index] = record.starts, True
             self.reset(variables, values, mask)
 
-    def _step_again(self, records: Sequence[tuple[Record, int]]) -> None:
+    def _step_again(self, records: Sequence[tuple[RecordedInputs, int]]) -> None:
         inputs, skip = self.inputs.copy(), np.ones(self.num_instances, np.bool_)
         for step in range(max((len(record.inputs) for record, _ in records), default=0)):
             skip[:] = True

@@ -12,7 +12,7 @@ import numpy as np
 
 from fmugym.baselines import controller_of
 from fmugym.baselines.arena import Arena, Outcome
-from fmugym.baselines.base import FloatArray
+from fmugym.baselines.controller import FloatArray
 from fmugym.errors import ConfigError, reason, shown
 from fmugym.search.policy import Form, Policy
 from fmugym.signals import ordinary

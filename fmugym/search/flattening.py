@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.base import FloatArray
+from fmugym.baselines.controller import FloatArray
 from fmugym.errors import ConfigError
 
 __all__ = ["choices_of", "require_numbers", "rows_of"]

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from fmugym.baselines.base import Controller, FloatArray, attribute_of, limited
+from fmugym.baselines.controller import Controller, FloatArray, attribute_of, limited
 from fmugym.errors import ConfigError
 from fmugym.search.flattening import choices_of, rows_of
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from fmugym.baselines import Controller
 from fmugym.baselines.arena import Arena
-from fmugym.baselines.base import FloatArray
 from fmugym.baselines.cma import CMA
+from fmugym.baselines.controller import FloatArray
 from fmugym.baselines.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
 from fmugym.baselines.parsing import Search as Tunable
 from fmugym.baselines.tuning import Axes
@@ -51,7 +51,7 @@ _LEAST: Final = 10
 _SHARE: Final = 10
 """A class of policies has at least so many rounds, and this part of all rounds."""
 
-_PATIENCE: Final = 15
+_ROUNDS_WITHOUT_GAIN: Final = 15
 _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
 when that was so in each of these starts."""
@@ -202,7 +202,7 @@ class Search:
     def _let_go(self, leaders: Sequence[Entrant]) -> None:
         """Give a leader that gains nothing more episodes, and let it go if that is no use."""
         for one in leaders:
-            if one.rounds - one.gained < _PATIENCE:
+            if one.rounds - one.gained < _ROUNDS_WITHOUT_GAIN:
                 continue
             if 1 < one.episodes < MOST_EPISODES:
                 one.episodes *= 2

@@ -29,12 +29,12 @@ from fmugym.task.actions import elements_of, no_action
 from fmugym.task.alone import alone
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.hooks import Hooks, misspelt_hooks
-from fmugym.task.inputs import InputWriter
+from fmugym.task.input_writer import InputWriter
 from fmugym.task.inside import Inside, OwnHooks
 from fmugym.task.interface import resolve
-from fmugym.task.opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.pictures import Pictured
 from fmugym.task.plain import plain_attributes
+from fmugym.task.pool_opening import PoolOpening, env_numbers, open_fmu, pools_are_deferred
 from fmugym.task.readings import READINGS, Readings
 from fmugym.task.results import finiteness_of
 from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues

@@ -14,9 +14,9 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.alone import Guard, make_guard
 from fmugym.task.episode import EpisodePlan
 from fmugym.task.future import Future
-from fmugym.task.inputs import InputWriter
+from fmugym.task.input_writer import InputWriter
 from fmugym.task.interface import Interface
-from fmugym.task.opening import PoolOpening
+from fmugym.task.pool_opening import PoolOpening
 from fmugym.task.readings import NoReadings, Readings
 from fmugym.task.warm_up import WarmUps
 

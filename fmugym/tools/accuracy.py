@@ -23,7 +23,7 @@ from fmugym.errors import FMUGymError
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.spec import PoolSpec
-from fmugym.task.opening import PoolOpening
+from fmugym.task.pool_opening import PoolOpening
 
 __all__ = ["TOLERANCE", "Course", "Replay", "error_of", "substeps_of"]
 

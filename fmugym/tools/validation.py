@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-from fmugym.baselines.base import FloatArray
+from fmugym.baselines.controller import FloatArray
 from fmugym.declared import Task
 from fmugym.distributions import draw, is_distribution
 from fmugym.env import FMUEnv

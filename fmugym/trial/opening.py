@@ -11,13 +11,13 @@ from fmugym.archive.fmu import FMU
 from fmugym.pool.backend.backend_choice import pool_of_backend
 from fmugym.pool.base import Pool
 from fmugym.pool.bundle import SaveMethod
+from fmugym.pool.instance_limit import claim_instances
 from fmugym.pool.licences import LicenceWait, licence_errors
 from fmugym.pool.local import local_pool
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.progress import progress
 from fmugym.pool.retrying import ResetRetry
 from fmugym.pool.saving_pool import SavingPool, offered_method
-from fmugym.pool.seats import take
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes
 from fmugym.trial.known import is_exempt, known_resuming
@@ -101,7 +101,7 @@ def _open(plan: Plan, log: logging.Logger) -> SavingPool:
     for level, text in plan.notes:
         log.log(level, "%s", text)
     fmu, count = plan.fmu, plan.num_instances
-    claim = take(fmu, plan.spec, count, "an environment")
+    claim = claim_instances(fmu, plan.spec, count, "an environment")
     try:
         with progress(log, f"{fmu.path.name}: the instantiation of {count} instance(s)"):
             pool = _pool(plan, log)

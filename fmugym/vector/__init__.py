@@ -6,8 +6,8 @@ from fmugym.lazy import lazily
 from fmugym.vector.entry_points import vectorized
 
 if TYPE_CHECKING:
-    from fmugym.vector.env import FMUVectorEnv
+    from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["FMUVectorEnv", "vectorized"]
 
-__getattr__ = lazily(__name__, {"FMUVectorEnv": "fmugym.vector.env"})
+__getattr__ = lazily(__name__, {"FMUVectorEnv": "fmugym.vector.vector_env"})

@@ -14,7 +14,7 @@ from fmugym.task.construction import plan_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
-from fmugym.vector.engines.base import Engine
+from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
 
 __all__ = ["Attributes"]

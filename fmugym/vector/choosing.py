@@ -10,8 +10,8 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError
 from fmugym.pool import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool
-from fmugym.vector.engines.base import Engine
 from fmugym.vector.engines.batch import BatchEngine
+from fmugym.vector.engines.engine import Engine
 from fmugym.vector.engines.per_env import PerEnvEngine
 from fmugym.vector.engines.programs import find_programs
 from fmugym.vector.hooks.check import CURE, find_difference

@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from fmugym.errors import ArgumentError
 
 if TYPE_CHECKING:
-    from fmugym.vector.env import FMUVectorEnv
+    from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["vector_entry_point", "vectorized"]
 
@@ -55,7 +55,7 @@ class VectorEntryPoint:
     ) -> FMUVectorEnv:
         """Make a vector environment; see ``FMUVectorEnv``."""
         from fmugym.vector.arguments import ARGUMENTS, POOL_OPTIONS  # registration shall be quick
-        from fmugym.vector.env import FMUVectorEnv
+        from fmugym.vector.vector_env import FMUVectorEnv
 
         pool_options = {name: kwargs.pop(name) for name in POOL_OPTIONS if name in kwargs}
         env_class = self._env_class

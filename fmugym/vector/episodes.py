@@ -15,7 +15,7 @@ from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import Bundle, IndexArray
 from fmugym.task.snapshot import Columns, Snapshot, checked_snapshot, scope_of
-from fmugym.vector.engines.base import Engine
+from fmugym.vector.engines.engine import Engine
 from fmugym.vector.rollouts import (
     Candidates,
     Rollout,

@@ -14,7 +14,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.signals import ordinary
 from fmugym.vector.entry_points import vectorized
-from fmugym.vector.env import FMUVectorEnv
+from fmugym.vector.vector_env import FMUVectorEnv
 
 __all__ = ["make_vector_env", "require_vector_env"]
 

@@ -12,7 +12,7 @@ from fmugym.errors import ConfigError
 from fmugym.pool import PoolSpec
 from fmugym.signals import Ignoring
 from fmugym.task.construction import require_construction
-from fmugym.task.opening import deferred_pools, env_numbers
+from fmugym.task.pool_opening import deferred_pools, env_numbers
 
 __all__ = ["EnvMaker", "make_with_pool"]
 

@@ -16,8 +16,8 @@ from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 from fmugym.task.snapshot import Columns
-from fmugym.vector.actions import checked_actions, is_array_space
-from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.action_arrays import checked_actions, is_array_space
+from fmugym.vector.engines.engine import Engine, StepResult
 from fmugym.vector.infos import copy_rows
 
 __all__ = [

@@ -24,7 +24,7 @@ from fmugym.task.saving import row_of, state_of
 
 if TYPE_CHECKING:
     from fmugym._native import Draws
-    from fmugym.vector.saving import Which
+    from fmugym.vector.vector_saving import Which
 
 __all__ = ["EpisodeStreams", "no_draws"]
 

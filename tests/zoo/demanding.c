@@ -3,8 +3,8 @@
    x' = gain u - x, y = x, by explicit Euler with internal steps of 1 ms.
    Reals: 0 "u" (input), 1 "y" (output), 2 "gain" (parameter).
 
-   The environment variable SEATS names a file that has the process of each licence in use, and
-   SEATS_LIMIT says how many there may be. SEATS.most gets the most that were in use at once. */
+   The environment variable LICENCES names a file that has the process of each licence in use, and
+   LICENCES_LIMIT says how many there may be. LICENCES.most gets the most that were in use at once. */
 
 #define _GNU_SOURCE
 #include "zoo.h"
@@ -20,7 +20,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { U, Y, GAIN, VALUES, MOST_SEATS = 64 };
+enum { U, Y, GAIN, VALUES, MOST_LICENCES = 64 };
 
 struct Animal {
     double values[VALUES];
@@ -28,50 +28,50 @@ struct Animal {
     char name[80];
     Logger logger;
     void *environment;
-    bool seated;
+    bool licensed;
 };
 
 static bool is_licensed(void) {
-    const char *seats = getenv("SEATS");
-    return seats != NULL && *seats != '\0';
+    const char *licences = getenv("LICENCES");
+    return licences != NULL && *licences != '\0';
 }
 
 static void note_most(int most) {
     char path[400];
-    snprintf(path, sizeof path, "%s.most", getenv("SEATS"));
+    snprintf(path, sizeof path, "%s.most", getenv("LICENCES"));
     FILE *file = fopen(path, "a");
     fprintf(file, "%d\n", most);
     fclose(file);
 }
 
-/* Reads the processes that have seats, without those that have ended. */
-static int read_seats(int file, pid_t *seats) {
-    const int all = (int)(pread(file, seats, MOST_SEATS * sizeof *seats, 0) / sizeof *seats);
+/* Reads the processes that have licences, without those that have ended. */
+static int read_licences(int file, pid_t *licences) {
+    const int all = (int)(pread(file, licences, MOST_LICENCES * sizeof *licences, 0) / sizeof *licences);
     int alive = 0;
 
     for (int i = 0; i < all; i++) {
-        if (kill(seats[i], 0) == 0 || errno != ESRCH) {
-            seats[alive++] = seats[i];
+        if (kill(licences[i], 0) == 0 || errno != ESRCH) {
+            licences[alive++] = licences[i];
         }
     }
     return alive;
 }
 
-/* Adds a seat of this process, or takes one away; returns whether that was possible. */
-static bool change_seats(bool taken) {
+/* Adds a licence of this process, or takes one away; returns whether that was possible. */
+static bool change_licences(bool taken) {
     static int most;
-    pid_t seats[MOST_SEATS + 1];
-    const int file = open(getenv("SEATS"), O_RDWR | O_CREAT, 0600);
+    pid_t licences[MOST_LICENCES + 1];
+    const int file = open(getenv("LICENCES"), O_RDWR | O_CREAT, 0600);
 
     flock(file, LOCK_EX);
-    int count = read_seats(file, seats);
-    const bool possible = !taken || count < atoi(getenv("SEATS_LIMIT"));
+    int count = read_licences(file, licences);
+    const bool possible = !taken || count < atoi(getenv("LICENCES_LIMIT"));
     if (taken && possible) {
-        seats[count++] = getpid();
+        licences[count++] = getpid();
     }
     for (int i = 0; i < count && !taken; i++) {
-        if (seats[i] == getpid()) {
-            seats[i] = seats[--count];
+        if (licences[i] == getpid()) {
+            licences[i] = licences[--count];
             break;
         }
     }
@@ -80,22 +80,22 @@ static bool change_seats(bool taken) {
         note_most(most);
     }
     ftruncate(file, 0);
-    pwrite(file, seats, count * sizeof *seats, 0);
+    pwrite(file, licences, count * sizeof *licences, 0);
     close(file);
     return possible;
 }
 
-static bool take_seat(Animal *me) {
-    if (!is_licensed() || me->seated) {
+static bool take_licence(Animal *me) {
+    if (!is_licensed() || me->licensed) {
         return true;
     }
-    me->seated = change_seats(true);
-    if (!me->seated) {
+    me->licensed = change_licences(true);
+    if (!me->licensed) {
         me->logger(me->environment, me->name, ERROR, "error",
                    "FLEXlm error -4: checkout of Demanding failed, all %s seats taken",
-                   getenv("SEATS_LIMIT"));
+                   getenv("LICENCES_LIMIT"));
     }
-    return me->seated;
+    return me->licensed;
 }
 
 static double buffer; /* of steps that are not safe in threads */
@@ -122,7 +122,7 @@ Animal *zoo_instantiate(const Birth *birth) {
     me->logger = birth->logger;
     me->environment = birth->environment;
     set_start(me);
-    if (!is(me, "licensed at initialization") && !take_seat(me)) {
+    if (!is(me, "licensed at initialization") && !take_licence(me)) {
         if (is(me, "licensed or dead")) {
             abort();
         }
@@ -133,14 +133,14 @@ Animal *zoo_instantiate(const Birth *birth) {
 }
 
 void zoo_free(Animal *me) {
-    if (me->seated) {
-        change_seats(false);
+    if (me->licensed) {
+        change_licences(false);
     }
     free(me);
 }
 
 int zoo_exit(Animal *me) {
-    if (!take_seat(me)) {
+    if (!take_licence(me)) {
         return ERROR;
     }
     if (strncmp(me->token, "slow", 4) == 0) {

@@ -3,7 +3,7 @@
    "refuse", "initialize", "set", "step", "discard", "get": the call that fails.
    "mute": it logs nothing, whatever it is asked. "loud": it logs without being asked.
    "chatty": it takes no notice of the categories, and logs each step when it is asked for any.
-   "deaf": it cannot bear to be asked, and all later calls fail. "strict": it knows no category.
+   "no categories": it fails when it is asked for categories, and all later calls fail. "strict": it knows no category.
    "prints", "unflushed": lines on its standard output before it fails, the last without an end.
    "crash", "hang": how the step fails. "control": the messages have control characters.
    "long": ten lines, and the cause is in the last but one.
@@ -110,8 +110,8 @@ int zoo_listen(Animal *me, bool on, size_t count, const char *const *categories)
             me->errors |= on && strcmp(categories[i], "logStatusError") == 0;
         }
     }
-    me->wrecked = is(me, "deaf");
-    return is(me, "deaf") || (is(me, "strict") && count > 0) ? ERROR : OK;
+    me->wrecked = is(me, "no categories");
+    return is(me, "no categories") || (is(me, "strict") && count > 0) ? ERROR : OK;
 }
 
 int zoo_reset(Animal *me) {

@@ -6,13 +6,13 @@ import logging
 from typing import Final
 
 from fmugym.archive.fmu import FMU
+from fmugym.archive.loadable import copy_libraries
 from fmugym.errors import ConfigError, FMULoadError, unknown_name
 from fmugym.pool.backend.backend_pool import BackendPool
 from fmugym.pool.backend.by_fmpy import FMPyInstance
 from fmugym.pool.base import Pool
 from fmugym.pool.extension import HOW_TO_BUILD, has_native_pool, warn_of_slow_path
 from fmugym.pool.licences import licence_errors
-from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.spec import PoolSpec
 from fmugym.pool.wishes import Wishes
 from fmugym.retired import warn_of_gone

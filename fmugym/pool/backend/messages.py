@@ -20,7 +20,7 @@ from fmpy.fmi2 import fmi2CallbackFunctions
 from fmpy.logging import addLoggerProxy
 
 from fmugym.fmi.words import Message, quoted
-from fmugym.pool.reports import as_record
+from fmugym.pool.reports import as_log_record
 
 __all__ = ["Messages", "fmi1_callbacks", "fmi2_callbacks"]
 
@@ -63,7 +63,7 @@ class Messages:
             status, category, text = self._noted.popleft()
             line = _readable(text)
             self._recent.append((status, line))
-            level, told = as_record(self.name, status, _readable(category), line)
+            level, told = as_log_record(self.name, status, _readable(category), line)
             self._log.log(level, "%s", told)
 
     def forget(self) -> None:

@@ -1,4 +1,4 @@
-"""What a worker prints: it goes to the parent's streams, and its last lines explain failures.
+"""How a worker ended, and what it prints: the parent's streams get it, and failures quote its end.
 
 The worker's standard output and error are pipes to the parent. The parent empties them while it
 waits for the worker, and before each request, so a step costs nothing. A worker that prints more
@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import sys
 from collections import deque
 from collections.abc import Sequence
 from typing import Any, Final
 
+from fmugym.errors import printable
 from fmugym.signals import Ignoring
 
-__all__ = ["Output"]
+__all__ = ["Output", "describe_exit", "lines_of_echo"]
 
 _LINES: Final = 10
 _LINE_LENGTH: Final = 300
@@ -132,3 +134,29 @@ def _write(stream: int, data: bytes) -> None:
     with Ignoring(OSError):  # this process may have closed it
         while view:
             view = view[os.write(stream, view) :]
+
+
+def describe_exit(return_code: int) -> str:
+    """Say how a process ended.
+
+    Args:
+        return_code: As ``subprocess`` and ``multiprocessing`` give it: minus the signal's number
+            on Unix, an NTSTATUS above 2**31 for a fault on Windows.
+
+    Returns:
+        ``"signal SIGSEGV"``, ``"exit status 3"`` or ``"Windows error 0xc0000005"``.
+    """
+    if return_code >= 2**31:
+        return f"Windows error {return_code:#x}"
+    if return_code >= 0:
+        return f"exit status {return_code}"
+    try:
+        return f"signal {signal.Signals(-return_code).name}"
+    except ValueError:
+        return f"signal {-return_code}"
+
+
+def lines_of_echo(memory: bytes) -> list[str]:
+    """The last messages in memory that the C extension has echoed them to."""
+    echo = memory.partition(b"\0")[0].decode(errors="replace")
+    return [printable(line) for line in echo.splitlines()[-_LINES:]]

@@ -47,7 +47,7 @@ from fmugym.pool.spec import ResetMethod
 from fmugym.signals import ordinary
 
 if TYPE_CHECKING:
-    from fmugym.pool.process.rollouts import PlayOfWorkers
+    from fmugym.pool.process.worker_rollouts import PlayOfWorkers
 
 __all__ = ["ProcessPool"]
 
@@ -273,7 +273,7 @@ class ProcessPool(AskingPool):
 
     def roll_out(self, *arrays: Any) -> int:
         """See ``NativePool.roll_out``; each worker does all steps of its block."""
-        from fmugym.pool.process.rollouts import OUTSIDE, read_rolled
+        from fmugym.pool.process.worker_rollouts import OUTSIDE, read_rolled
 
         actions, seen, *judged, offsets = arrays
         play = self._play = self._play or self._describe_play()
@@ -296,7 +296,7 @@ class ProcessPool(AskingPool):
         return int(np.count_nonzero(self._group.lost) + sum(troubled))
 
     def _describe_play(self) -> PlayOfWorkers:
-        from fmugym.pool.process.rollouts import PlayOfWorkers
+        from fmugym.pool.process.worker_rollouts import PlayOfWorkers
 
         return PlayOfWorkers(self._arrays, self._parts[1:])
 
@@ -411,7 +411,7 @@ class ProcessPool(AskingPool):
             try:
                 self._group.close()
             finally:
-                self._return_seats()
+                self._release_claim()
 
     @property
     def initializations(self) -> int:

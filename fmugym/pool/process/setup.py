@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU
+from fmugym.archive.loadable import copy_libraries
 from fmugym.errors import FMULoadError
 from fmugym.pool.base import PoolSpec
 from fmugym.pool.form import Files, Writer, form_of_pool
-from fmugym.pool.private_libraries import copy_libraries
 from fmugym.pool.process.launcher import Order
 from fmugym.pool.process.shared_memory import ECHO_SIZE, Memory
 from fmugym.pool.saving_pool import keeps_records

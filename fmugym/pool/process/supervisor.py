@@ -16,16 +16,14 @@ import numpy as np
 
 from fmugym.errors import FMULoadError, printable
 from fmugym.fmi.words import as_messages, quoted
-from fmugym.pool.callbacks import Receiver
 from fmugym.pool.form import Writer
 from fmugym.pool.process.channel import Channel, LateError
 from fmugym.pool.process.guard import LONGEST_START
-from fmugym.pool.process.last_words import describe_exit, lines_of_echo
 from fmugym.pool.process.launcher import Process, launch
-from fmugym.pool.process.output import Output
+from fmugym.pool.process.output import Output, describe_exit, lines_of_echo
 from fmugym.pool.process.setup import Setup
 from fmugym.pool.process.shared_memory import Memory
-from fmugym.pool.reports import loading_failed
+from fmugym.pool.reports import Receiver, loading_failed
 from fmugym.pool.requests import (
     Answer,
     Answers,

@@ -34,20 +34,26 @@ from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
 from fmugym.task.warm_up import WarmUps
-from fmugym.vector.actions import checked_actions
+from fmugym.vector.action_arrays import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.engines.engine import Engine, StepResult
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import compile_hooks
-from fmugym.vector.hooks import results
+from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.rollouts import costs_in
-from fmugym.vector.saving import columns_of, place_column, place_columns, require_fit, which_of
 from fmugym.vector.streams import EpisodeStreams, no_draws
+from fmugym.vector.vector_saving import (
+    columns_of,
+    place_column,
+    place_columns,
+    require_fit,
+    which_of,
+)
 from fmugym.vector.views import batched, column, some, take
 
 __all__ = ["BatchEngine"]
@@ -419,7 +425,7 @@ class BatchEngine(Engine):
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
-            rows = {n: results.environments_last(v) for n, v in plan.named(drawn).items()}
+            rows = {n: hook_results.environments_last(v) for n, v in plan.named(drawn).items()}
             self._place(rows, indices)
         if not default or self._any_foreign:
             self._place(plan.constant_parameters, indices)
@@ -445,7 +451,7 @@ class BatchEngine(Engine):
         if name in variables:
             row: FloatArray = variables[name]
             if type(row) is not np.ndarray or row.shape[-1:] != (self._n,):
-                row = variables[name] = results.variable(name, row, self._n)
+                row = variables[name] = hook_results.variable(name, row, self._n)
         else:
             known = self._parameters.get(name)
             row = np.full(self._n, np.nan) if known is None else known
@@ -657,7 +663,7 @@ class BatchEngine(Engine):
         """Call this hook on arrays, before the pool takes over the actions."""
         env, read = self.env, self.env.inside.readings
         before = read.action, read.previous_action, read.previous_state
-        read.previous_action, read.action = read.action, results.environments_last(actions)
+        read.previous_action, read.action = read.action, hook_results.environments_last(actions)
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
@@ -667,7 +673,7 @@ class BatchEngine(Engine):
 
     def _write_inputs(self, values: Any, resetting: MaskArray | None) -> None:
         inputs = self._pool.inputs
-        results.write_inputs(values, inputs)
+        hook_results.write_inputs(values, inputs)
         if not self.env.inside.input_writer.all_real:
             for index in self._stepping(resetting):
                 inputs[:, index] = fmu_spaces.to_input_types(
@@ -714,7 +720,8 @@ class BatchEngine(Engine):
             concluded = conclude_left(env, self, left, result[:-1])
             observations, rewards, terminated, truncated = concluded
             if "_get_observation" in left:
-                observations = results.observations(observations, env.observation_space, self._n)
+                space = env.observation_space
+                observations = hook_results.observations(observations, space, self._n)
             infos = result.infos
             if "_get_info" in left:
                 infos = self._infos(np.ones(self._n, _BOOL)) | infos
@@ -735,14 +742,14 @@ class BatchEngine(Engine):
 
     def flags(self, hook: str, value: Any) -> MaskArray:
         """See ``Form.flags``; nothing is done where the FMU has not stepped."""
-        found = results.flags(hook, value, self._n)
+        found = hook_results.flags(hook, value, self._n)
         if self._idle is not None and hook == "_is_done":
             found[self._idle] = False
         return found
 
     def rewards(self, value: Any) -> FloatArray:
         """See ``Form.rewards``."""
-        return results.rewards(value, self._n)
+        return hook_results.rewards(value, self._n)
 
     def update(self, env: Hooks) -> None:
         """Call the hook, but keep the variables of environments that did not step.
@@ -760,27 +767,27 @@ class BatchEngine(Engine):
             self._restore_variables(self._idle)
 
     def _kept_variable(self, name: str, value: Any) -> npt.NDArray[Any]:
-        row = results.variable(name, value, self._n)
+        row = hook_results.variable(name, value, self._n)
         if row.dtype == np.float64:
             return row
         return row.astype(
-            results.type_of_variable(self.env.inside.plan, name, row.dtype), copy=False
+            hook_results.type_of_variable(self.env.inside.plan, name, row.dtype), copy=False
         )
 
     def _restore_variables(self, mask: MaskArray) -> None:
         for name, values in self._memory.before.items():
-            results.restore_variable(name, self._row(name), mask, values)
+            hook_results.restore_variable(name, self._row(name), mask, values)
 
     def _observe(self) -> Any:
         env = self.env
-        return results.observations(env._get_observation(), env.observation_space, self._n)
+        return hook_results.observations(env._get_observation(), env.observation_space, self._n)
 
     def _infos(self, mask: MaskArray) -> dict[str, Any]:
         if not self.env.inside.has_info:
             return {}
-        infos = results.info_arrays(self.env._get_info(), mask)
+        infos = hook_results.info_arrays(self.env._get_info(), mask)
         if self.env.inside.pool_tells:
-            infos |= results.info_arrays(self._pool.info(), mask)
+            infos |= hook_results.info_arrays(self._pool.info(), mask)
         return infos
 
     def _stopped(self, statuses: StatusArray) -> MaskArray:
@@ -822,7 +829,7 @@ class BatchEngine(Engine):
         inputs = self._pool.inputs
         if not self.env.inside.input_writer.all_real and not np.isfinite(inputs).all():
             wanted = np.array(inputs)
-            results.write_inputs(self.env._get_inputs(), wanted)
+            hook_results.write_inputs(self.env._get_inputs(), wanted)
             for index in self._stepping(resetting):
                 fmu_spaces.to_input_types(self.env.inside.interface.inputs, wanted[:, index])
         self._require_finite_inputs(resetting)
@@ -871,7 +878,7 @@ class BatchEngine(Engine):
         texts[faulty] = list(reasons.values())
         rates = fault_rates(self._pool.health())
         result.infos.update(coded({"fault": texts, "fault_rate": rates}, faulty))
-        result.rewards[faulty] = results.rewards(env._fault_reward(), self._n)[faulty]
+        result.rewards[faulty] = hook_results.rewards(env._fault_reward(), self._n)[faulty]
         result.terminated[faulty] = config.on_fault == "terminate"
         result.truncated[faulty] = config.on_fault == "truncate"
 

@@ -27,11 +27,11 @@ from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
 from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
-from fmugym.vector.actions import checked_actions, is_array_space
+from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
 from fmugym.vector.codec import gathered
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.base import Engine, StepResult
+from fmugym.vector.engines.engine import Engine, StepResult
 
 __all__ = ["PerEnvEngine"]
 

@@ -20,7 +20,7 @@ from fmugym.signals import ordinary
 from fmugym.task.readings import Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.task.values import ParameterValues
-from fmugym.vector.actions import is_array_space
+from fmugym.vector.action_arrays import is_array_space
 from fmugym.vector.contents import Contents, borrowed, differs
 from fmugym.vector.views import batched, column, some
 

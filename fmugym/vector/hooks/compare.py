@@ -13,7 +13,7 @@ from fmugym.errors import ConfigError
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.readings import Readings, reading
 from fmugym.vector.contents import borrowed
-from fmugym.vector.hooks import results
+from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.graph import TOLERANCES
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import (
@@ -73,7 +73,7 @@ class _Comparison:
         before, env.previous_state = env.previous_state, env.state.copy()
         evaluate(self._task.inputs, memory.find, memory.actions)
         expected = np.array(env.inputs)
-        results.write_inputs(env._get_inputs(), expected)
+        hook_results.write_inputs(env._get_inputs(), expected)
         self._require_unwritten(self._before)
         for index in range(self._count):
             expected[:, index] = self._typed(expected[:, index])
@@ -101,15 +101,15 @@ class _Comparison:
         if env.inside.own.update:
             env._update()
             for name in self._task.updated:
-                kept = results.variable(name, env.variables[name], count)
+                kept = hook_results.variable(name, env.variables[name], count)
                 env.variables[name] = kept.astype(self._task.variables[name])
-        env.done = results.flags("_is_done", env._is_done(), count)
+        env.done = hook_results.flags("_is_done", env._is_done(), count)
         self._require_equal("_is_done", judged[0], env.done)
         if "_is_truncated" not in self._task.left:
-            truncated = results.flags("_is_truncated", env._is_truncated(), count)
+            truncated = hook_results.flags("_is_truncated", env._is_truncated(), count)
             self._require_equal("_is_truncated", judged[1], truncated)
         if "_reward_policy" not in self._task.left:
-            rewards = results.rewards(env._reward_policy(), count)
+            rewards = hook_results.rewards(env._reward_policy(), count)
             self._require_equal("_reward_policy", judged[2], rewards)
         self._compare_seen(seen)
         self._compare_variables()
@@ -130,7 +130,7 @@ class _Comparison:
 
     def _rows(self, name: str) -> npt.NDArray[Any]:
         """The present values of an episode variable, a row for each element."""
-        value = results.variable(name, self._env.variables[name], self._count)
+        value = hook_results.variable(name, self._env.variables[name], self._count)
         return np.broadcast_to(value, self._before[name].shape).reshape(-1, self._count)
 
     def _compare_seen(self, seen: tuple[npt.NDArray[Any], ...]) -> None:
@@ -138,9 +138,11 @@ class _Comparison:
         tree: dict[str, Any] = {}
         if any(array.path[0] == "observation" for array in self._task.seen):
             observation = env._get_observation()
-            tree["observation"] = results.observations(observation, env.observation_space, count)
+            tree["observation"] = hook_results.observations(
+                observation, env.observation_space, count
+            )
         if any(array.path[0] == "info" for array in self._task.seen):
-            tree["info"] = results.info_arrays(env._get_info(), np.ones(count, np.bool_))
+            tree["info"] = hook_results.info_arrays(env._get_info(), np.ones(count, np.bool_))
         for array, description in zip(seen, self._task.seen, strict=True):
             expected: Any = tree
             for name in description.path:

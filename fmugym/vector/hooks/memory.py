@@ -13,7 +13,7 @@ from fmugym.env import FMUEnv
 from fmugym.pool.base import MaskArray
 from fmugym.task.episode import Draw
 from fmugym.task.readings import Readings
-from fmugym.vector.hooks import results
+from fmugym.vector.hooks import hook_results
 from fmugym.vector.hooks.program import LETTERS, Row
 from fmugym.vector.hooks.trace import TracedTask
 
@@ -60,7 +60,7 @@ class Memory:
         """Make the arrays of the episode variables in the types that programs store."""
         self.variables, self.before = {}, {}
         for name, dtype in task.variables.items():
-            row = results.variable(name, self._readings.variables[name], self._n)
+            row = hook_results.variable(name, self._readings.variables[name], self._n)
             self.variables[name] = np.ascontiguousarray(row, dtype).copy()
             self.before[name] = self.variables[name].copy()
         self.show()

@@ -24,10 +24,10 @@ from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import ORDER
 from fmugym.vector.contents import Contents, borrowed
 from fmugym.vector.hooks.graph import Graph
+from fmugym.vector.hooks.hook_results import type_of_variable
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
 from fmugym.vector.hooks.program import TYPES, Program, UntraceableError, letter_of
-from fmugym.vector.hooks.results import type_of_variable
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,

@@ -12,11 +12,11 @@ from fmu_tools import grouped
 
 import fmugym
 from fmugym.errors import LicenceError
-from fmugym.pool.seats import taking
+from fmugym.pool.instance_limit import claiming
 from fmugym.pool.spec import PoolSpec
 
 
-class SeatedEnv(fmugym.FMI2CSEnv):
+class LimitedEnv(fmugym.FMI2CSEnv):
     def __init__(self, backend=None, isolation=None, **config):
         config = {"model_input_names": "tau", "model_output_names": ["q", "q_dot"]} | config
         path = fmugym.bundled_fmu("Pendulum")
@@ -27,17 +27,17 @@ class SeatedEnv(fmugym.FMI2CSEnv):
 
 
 def take_one(**config):
-    env = SeatedEnv(max_instances=1, **config)
+    env = LimitedEnv(max_instances=1, **config)
     env.reset(seed=0)
     env.close()
 
 
 @pytest.mark.parametrize("options", [{}, {"isolation": "process"}])
 def test_of_two_environments(options):
-    first = SeatedEnv(max_instances=2, **options)
-    second = SeatedEnv(max_instances=2, **options)
+    first = LimitedEnv(max_instances=2, **options)
+    second = LimitedEnv(max_instances=2, **options)
     with pytest.raises(LicenceError) as caught:
-        SeatedEnv(max_instances=2, **options)
+        LimitedEnv(max_instances=2, **options)
     text = str(caught.value)
     assert "Pendulum.fmu needs 1 more instance(s)" in text
     assert "'max_instances' of 'foreign' allows 2 at once in this process" in text
@@ -46,14 +46,14 @@ def test_of_two_environments(options):
     assert "licence_wait" in text
     first.reset(seed=0)
     first.close()
-    third = SeatedEnv(max_instances=2, **options)
+    third = LimitedEnv(max_instances=2, **options)
     third.close()
     third.close()
     second.close()
 
 
 def test_of_a_vector_environment_beside_a_single_one():
-    make = functools.partial(SeatedEnv, max_instances=4)
+    make = functools.partial(LimitedEnv, max_instances=4)
     envs = fmugym.FMUVectorEnv(make, 3)
     single = make()
     with pytest.raises(LicenceError, match=r"in use: .*3 for an environment"):
@@ -66,7 +66,7 @@ def test_of_a_vector_environment_beside_a_single_one():
 
 
 def test_are_waited_for(caplog):
-    other, over = SeatedEnv(max_instances=1), threading.Event()
+    other, over = LimitedEnv(max_instances=1), threading.Event()
 
     def end():
         while not over.wait(0.05) and "waiting for" not in caplog.text:
@@ -84,14 +84,14 @@ def test_are_waited_for(caplog):
 
 
 def test_waiting_ends():
-    env = SeatedEnv(max_instances=1)
+    env = LimitedEnv(max_instances=1)
     with pytest.raises(LicenceError, match=r"no licence came within 0\.2 s"):
         take_one(licence_wait=0.2)
     env.close()
 
 
 def test_environments_that_nobody_uses_have_none():
-    class Knot(SeatedEnv):
+    class Knot(LimitedEnv):
         def __init__(self, **config):
             super().__init__(**config)
             self.knot = self
@@ -107,11 +107,11 @@ def test_environments_that_nobody_uses_have_none():
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there are no forks")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_fork_has_its_own():
-    env = SeatedEnv(max_instances=1)
+    env = LimitedEnv(max_instances=1)
     child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
-            SeatedEnv(max_instances=1)
+            LimitedEnv(max_instances=1)
             os._exit(0)
         os._exit(1)
     assert os.waitpid(child, 0)[1] == 0
@@ -122,7 +122,7 @@ def test_a_fork_has_its_own():
 
 
 def test_other_fmus_and_environments_without_the_key_do_not_count():
-    free = [SeatedEnv() for _ in range(3)]
+    free = [LimitedEnv() for _ in range(3)]
     other = fmugym.envs.CartPoleEnv()
     take_one()
     for env in (*free, other):
@@ -131,7 +131,7 @@ def test_other_fmus_and_environments_without_the_key_do_not_count():
 
 def test_a_constructor_that_fails_returns_them():
     with pytest.raises(fmugym.FMUGymError):
-        SeatedEnv(max_instances=1, model_parameters={"m": -1.0}, time_step=-1.0)
+        LimitedEnv(max_instances=1, model_parameters={"m": -1.0}, time_step=-1.0)
     take_one()
 
 
@@ -142,7 +142,7 @@ def test_threads_never_get_more_than_there_are():
 
     def work():
         for _ in range(20):
-            with contextlib.suppress(LicenceError), taking(fmu, spec, 2, "a test"):
+            with contextlib.suppress(LicenceError), claiming(fmu, spec, 2, "a test"):
                 with lock:
                     taken[0] += 2
                     most[0] = max(most[0], taken[0])

@@ -1,4 +1,4 @@
-"""The records of episodes that are in saved states."""
+"""The recorded inputs of episodes that are in saved states."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fmugym.pool.bundle import FloatArray, head_of, outputs_of
 from fmugym.pool.form import START_TIME_TYPE, table_of, type_number
 from fmugym.pool.spec import START_TIME, PoolSpec
 
-__all__ = ["Record", "record_in"]
+__all__ = ["RecordedInputs", "inputs_in"]
 
 
 def _variables_of(
@@ -51,12 +51,12 @@ def _variables_of(
 _START: Final = np.dtype(
     [("value", "f8"), *((name, "u4") for name in ("type", "reference", "place", "unused"))]
 )
-"""A start value in a record; ``RecordedStart`` of ``native/pool.h``."""
+"""A start value among recorded inputs; ``RecordedStart`` of ``native/pool.h``."""
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
-    """The episode of an instance until it was saved.
+class RecordedInputs:
+    """What an instance was given in its episode until it was saved.
 
     Attributes:
         variables: Those that were set before initialization.
@@ -69,8 +69,8 @@ class Record:
     inputs: FloatArray
 
 
-def record_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> Record:
-    """Read the record in a state that has one.
+def inputs_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> RecordedInputs:
+    """Read the recorded inputs in a state that has some.
 
     Args:
         description: That of the FMU.
@@ -78,18 +78,18 @@ def record_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> Re
         state: The state. That of a worker may be anything.
 
     Raises:
-        SimulationError: If it has no such record.
+        SimulationError: If it has none of this FMU.
     """
     try:
-        return _record_in(description, spec, state)
+        return _inputs_in(description, spec, state)
     except (KeyError, IndexError, ValueError):
-        raise SimulationError("the record of an episode is damaged") from None
+        raise SimulationError("the recorded inputs of an episode are damaged") from None
 
 
-def _record_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> Record:
+def _inputs_in(description: ModelDescription, spec: PoolSpec, state: bytes) -> RecordedInputs:
     head, (_, content) = head_of(state), outputs_of(state, len(spec.outputs))
     end = head.starts * _START.itemsize
     starts = np.frombuffer(content[:end], _START)
     parts = (starts[name].tolist() for name in ("type", "reference", "place", "value"))
     inputs = np.frombuffer(content[end:]).reshape(head.rows, len(spec.inputs))
-    return Record(_variables_of(description, *parts), starts["value"], inputs)
+    return RecordedInputs(_variables_of(description, *parts), starts["value"], inputs)

@@ -1,4 +1,4 @@
-#include "records.h"
+#include "recorded_inputs.h"
 
 #include <stdlib.h>
 #include <string.h>

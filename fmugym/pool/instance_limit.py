@@ -1,6 +1,6 @@
-"""Seats: how many instances of an FMU this process may have at once, its workers' included.
+"""The limit of how many instances of an FMU this process may have, its workers' included.
 
-Each environment that limits its instances takes a seat for each of them, and so does a trial.
+Each environment that limits its instances claims all that it makes, and so does a trial.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from fmugym.archive.fmu import FMU
 from fmugym.errors import LicenceError
 from fmugym.pool.spec import PoolSpec
 
-__all__ = ["Claim", "take", "taking"]
+__all__ = ["Claim", "claim_instances", "claiming"]
 
 
 @dataclass(eq=False)
 class Claim:
-    """Seats of an FMU that are taken until this object is released or gone."""
+    """Instances of an FMU that count until this object is released or gone."""
 
     content: str
-    seats: int
+    instances: int
     purpose: str
 
     def release(self) -> None:
-        """Let others have the seats; more than one call is fine."""
+        """Let others make instances; more than one call is fine."""
         _claims.discard(self)
 
     def __str__(self) -> str:
-        return f"{self.seats} for {self.purpose}"
+        return f"{self.instances} for {self.purpose}"
 
 
 _claims: Final[weakref.WeakSet[Claim]] = weakref.WeakSet()
@@ -44,29 +44,29 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_claims.clear)
 
 
-def take(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Claim:
-    """Take seats of an FMU.
+def claim_instances(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Claim:
+    """Claim instances of an FMU.
 
     Args:
         fmu: The FMU.
-        spec: Says how many seats there are.
-        count: How many to take.
+        spec: Says how many there may be.
+        count: How many to claim.
         purpose: What for, for the messages that others get.
 
     Returns:
-        The seats; they need not be released if their number is not limited.
+        The claim; it need not be released if their number is not limited.
 
     Raises:
-        LicenceError: If there are not so many left; the text tells what they are taken for.
+        LicenceError: If there are not so many left; the text tells what the others are for.
     """
     if spec.max_instances is None:
         return Claim("", count, purpose)
     content = fmu.content
-    if sum(claim.seats for claim in _taken(content)) + count > spec.max_instances:
-        gc.collect()  # environments that nobody uses any more still have their seats
+    if sum(claim.instances for claim in _taken(content)) + count > spec.max_instances:
+        gc.collect()  # environments that nobody uses any more still have their instances
     with _lock:
         taken = _taken(content)
-        if sum(claim.seats for claim in taken) + count > spec.max_instances:
+        if sum(claim.instances for claim in taken) + count > spec.max_instances:
             name, most = fmu.path.name, spec.max_instances
             raise LicenceError(_refusal(name, most, count, purpose, taken))
         claim = Claim(content, count, purpose)
@@ -88,9 +88,9 @@ def _refusal(name: str, most: int, count: int, purpose: str, taken: list[Claim])
 
 
 @contextlib.contextmanager
-def taking(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
-    """Take seats for this context, if they are limited; see ``take``."""
-    claim = take(fmu, spec, count, purpose)
+def claiming(fmu: FMU, spec: PoolSpec, count: int, purpose: str) -> Iterator[None]:
+    """Claim instances for this context, if they are limited; see ``claim_instances``."""
+    claim = claim_instances(fmu, spec, count, purpose)
     try:
         yield
     finally:

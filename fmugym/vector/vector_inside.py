@@ -10,7 +10,7 @@ from fmugym.env import FMUEnv
 from fmugym.pool import Pool
 from fmugym.task.alone import Guard, make_guard
 from fmugym.vector.attributes import Attributes
-from fmugym.vector.engines.base import Engine
+from fmugym.vector.engines.engine import Engine
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.making import EnvMaker
 

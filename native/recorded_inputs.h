@@ -1,8 +1,8 @@
 /* Records: the start values and the inputs of the episode of each instance. An instance that cannot
  * save its state returns to a step of its episode by playing it again. */
 
-#ifndef FMUGYM_RECORDS_H
-#define FMUGYM_RECORDS_H
+#ifndef FMUGYM_RECORDED_INPUTS_H
+#define FMUGYM_RECORDED_INPUTS_H
 
 #include "pool.h"
 

@@ -31,10 +31,9 @@ from fmugym.vector.arguments import (
 )
 from fmugym.vector.attributes import Attributes
 from fmugym.vector.choosing import make_engine
-from fmugym.vector.engines.base import StepResult
+from fmugym.vector.engines.engine import StepResult
 from fmugym.vector.episodes import Episodes
 from fmugym.vector.infos import final_infos, merged, observations_of, restricted
-from fmugym.vector.inside import VectorInside
 from fmugym.vector.making import EnvMaker
 from fmugym.vector.overlap import Background, PendingStepError
 from fmugym.vector.rollouts import (
@@ -45,7 +44,8 @@ from fmugym.vector.rollouts import (
     tables_of,
     tunable_values,
 )
-from fmugym.vector.saving import chosen, sources_for
+from fmugym.vector.vector_inside import VectorInside
+from fmugym.vector.vector_saving import chosen, sources_for
 
 __all__ = ["FMUVectorEnv", "require_open"]
 
