@@ -408,7 +408,7 @@ def test_scipy_is_named_with_its_extra(monkeypatch):
 
 @measured
 class TestMeasured:
-    """On real swings; where they come from is told in docs/lab.md."""
+    """On real swings; the readmes in ``resources`` tell where they come from."""
 
     def test_single_pendulum(self):
         name = "dfki_simple_pendulum_damped_swing_segment.csv"
