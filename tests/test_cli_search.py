@@ -20,7 +20,7 @@ from fmugym.search.agent import AGENT, Agent
 from fmugym.search.probe import Probe
 from fmugym.search.search import Search
 from fmugym.tools.cli import main
-from fmugym.tools.comparing import Verdict
+from fmugym.training.comparing import Verdict
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},

@@ -27,8 +27,8 @@ from fmugym.search.guessing import guessed_controllers
 from fmugym.search.policy import LIMIT, Form, Policy, Scale
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
-from fmugym.tools import searching
-from fmugym.tools.searching import Quest
+from fmugym.training import searching
+from fmugym.training.searching import Quest
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 

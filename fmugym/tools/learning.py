@@ -28,13 +28,13 @@ from fmugym.tools.options import (
     say_json,
     tell,
 )
-from fmugym.tools.searching import STATE, Quest, search
 from fmugym.tools.targets import maker_of, scenarios_of
 from fmugym.training.agents import FACTS
 from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
 from fmugym.training.hyperparameters import tune
 from fmugym.training.outcome import write_curve, write_outcome
+from fmugym.training.searching import STATE, Quest, search
 from fmugym.training.tracking import TRACKERS, tracker_for
 from fmugym.training.training import TRAINING, Plan, Watch, arguments_of, facts_of, train
 

@@ -1,1 +1,1 @@
-"""Trainings with the algorithms of Stable-Baselines3."""
+"""Trainings: by a search, and with the algorithms of Stable-Baselines3."""

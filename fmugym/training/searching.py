@@ -23,8 +23,8 @@ from fmugym.search.agent import Agent
 from fmugym.search.probe import MOST_PROBED, Probe, task_of
 from fmugym.search.search import FEW, Search
 from fmugym.signals import Ignoring, ordinary
-from fmugym.tools.comparing import Verdict, episodes_of, judge
 from fmugym.training.agents import FACTS
+from fmugym.training.comparing import Verdict, episodes_of, judge
 from fmugym.training.diary import EVALUATIONS
 from fmugym.training.training import require_new
 
