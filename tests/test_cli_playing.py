@@ -83,21 +83,6 @@ class TestRecord:
         assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
         assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
 
-    @pytest.mark.parametrize(
-        ("arguments", "fact"),
-        [
-            (["--output", "a.csv", "--every", "0.03"], "0.02"),
-            (["--output", __file__.replace(".py", ".csv"), "--action", "19"], "'19'"),
-        ],
-    )
-    def test_mistakes(self, arguments, fact, tmp_path, cli, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        code, out, err = cli("simulate", CART_POLE, *arguments)
-        assert (code, out) == (1, "")
-        assert fact in err
-        assert err.count("\n") == 1
-        assert list(tmp_path.iterdir()) == []
-
     def test_without_matplotlib_the_extra_is_named(self, tmp_path, cli, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         code, _, err = cli("simulate", CART_POLE, "--output", tmp_path / "a.html")

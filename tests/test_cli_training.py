@@ -126,20 +126,6 @@ class TestEvaluate:
         assert float(constant[4]) == pytest.approx(1.0)
         assert constant[5:8] == ["10", "2", "truncated"]
 
-    @pytest.mark.parametrize(
-        ("arguments", "fact"),
-        [
-            (["--agent", "/nowhere"], "'/nowhere'"),
-            (["--action", "17"], "'17'"),
-            (["--episodes", "0"], "--episodes"),
-            (["--scenario", "peak"], "peak"),
-        ],
-    )
-    def test_mistakes(self, arguments, fact, capsys):
-        code, out, err = run(capsys, "evaluate", CART_POLE, *arguments)
-        assert (code, out) == (1, "")
-        assert fact in err
-
 
 def test_the_interval_is_students():
     stats = pytest.importorskip("scipy.stats", reason="needs scipy: the extra test")

@@ -63,12 +63,7 @@ class TestTune:
     @pytest.mark.parametrize(
         ("arguments", "fact"),
         [
-            ([RANGES.replace("pid", "pod")], "'pid'"),
-            ([RANGES.replace("setpoint", "setpont")], "'setpoint'"),
-            ([RANGES.replace("of=T", "of=Tr")], "'T'"),
-            ([RANGES.replace("0.05..5", "0.05..five")], "'0.05..five'"),
             ([RANGES.replace("0.05..5", "5..0.05")], "5..0.05"),
-            (["pid of=T setpoint=21 kp=1"], "range"),
             (["pid of=T setpoint=20..21"], "'kp'"),
             (["schedule 06:00=0..1"], "hysteresis, pid"),
             ([RANGES, "--candidates", "7"], "8"),

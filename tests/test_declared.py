@@ -317,10 +317,7 @@ class TestFiles:
 
 
 MISTAKES = {
-    "misspelt alias": ('["q", "q_dot"]', '["q", "q_dit"]', "line 8", "'q_dot'"),
-    "misspelt action": ('["tau"]', '["tua"]', "line 7", "'tau'"),
     "misspelt name": ('"-abs(q)"', '"-abs(q_dto)"', "line 3", "column 6"),
-    "missing reward": ('reward = "-abs(q)"', "", "task.toml", "no reward"),
     "sample of an action": ("max = 1", 'max = 1, sample = "mean"', "line 5", "read from"),
     "read twice": (
         '"-abs(q)"\n[variables]',

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from golden.cases import cases
-from golden.texts import texts
 
 GOLDEN = Path(__file__).parent / "golden"
 RESULTS = json.loads((GOLDEN / "results.json").read_text(encoding="utf-8"))
@@ -42,11 +41,6 @@ def test_all_are_those_of_fmi_2():
         found, expected = numbers(name), numbers(re.sub(r" [13](?=[. ]|$)", " 2", name))
         both = min(len(found), len(expected))  # a state of FMI 1.0 is not restored
         np.testing.assert_array_equal(found[:both], expected[:both], name)
-
-
-def test_texts_of_mistakes_are_as_they_were(tmp_path):
-    expected = json.loads((GOLDEN / "texts.json").read_text(encoding="utf-8"))
-    assert texts(tmp_path) == expected
 
 
 def numbers(name):

@@ -4,7 +4,6 @@ import os
 import signal
 from pathlib import Path
 
-import numpy as np
 import pytest
 from process_tools import linux_only, wait_until
 from test_isolated_hooks import Sampled, TwoPendulums
@@ -18,9 +17,8 @@ from test_single_compiled import (
 )
 
 import fmugym
-from fmugym import ConfigError, SimulationError
+from fmugym import ConfigError
 from fmugym.pool.process.pool import ProcessPool
-from fmugym.series import RecordSeries
 from fmugym.vector.making import make_with_pool
 
 
@@ -129,37 +127,3 @@ def test_snapshots(cls):
     one, other = isolated(cls), here(cls)
     require_same_snapshots(one, other)
     one.close()
-
-
-def test_series_and_pictures():
-    rows, pictures = [], []
-    for isolation in ("process", "none"):
-        env = fmugym.envs.PendulumEnv("rgb_array", hooks="python", isolation=isolation)
-        recorded = RecordSeries(env)
-        recorded.reset(seed=1)
-        for _ in range(5):
-            recorded.step(np.array([1.0], np.float32))
-        pictures.append(env.render())
-        rows.append(recorded.series)
-        recorded.close()
-    assert np.array_equal(*pictures)
-    assert rows[0].columns == rows[1].columns
-    np.testing.assert_array_equal(rows[0].values, rows[1].values)
-
-
-def test_closing(cart):
-    state, worker = cart.state, cart.inside.pool.processes()[0]
-    cart.close()
-    assert cart.state == state
-    with pytest.raises(SimulationError, match="closed"):
-        cart.step(0)
-    with pytest.raises(ProcessLookupError):
-        os.kill(worker, 0)
-
-
-def test_refused_actions_change_nothing(cart):
-    before = cart.state, cart.step_count, cart.action
-    with pytest.raises(ConfigError, match="is not in Discrete"):
-        cart.step(2)
-    assert (cart.state, cart.step_count, cart.action) == before
-    assert cart.step(1)[2] is False

@@ -91,17 +91,6 @@ def test_a_single_environment(number, distribution):
     assert alone(Cart(number, distribution)) == alone(Cart(number, distribution, exact=True))
 
 
-@in_turn({"number": TYPES, "hooks": ["auto", "array", "per_env"]})
-def test_vector_environments(number, hooks):
-    for distribution in (Uniform, Normal):
-        expected = alone(Cart(number, distribution))
-
-        def make(distribution=distribution):
-            return Cart(number, distribution)
-
-        assert together(fmugym.FMUVectorEnv(make, 2, hooks=hooks)) == expected
-
-
 @types
 def test_the_config_has_floats(number):
     config = Cart(number).config

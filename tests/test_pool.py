@@ -10,17 +10,15 @@ import zoo_tools
 from combinations import in_turn
 from fmu_tools import edited_fmu
 from plants import PLANTS
-from pool_tools import LOG, open_pool, reset
+from pool_tools import open_pool, reset
 from wine_tools import for_windows
 
-from fmugym import FMU, ConfigError, FMULoadError, SimulationError, bundled_fmu
+from fmugym import FMU, FMULoadError, SimulationError, bundled_fmu
 from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS, MODELS, is_bundled
 from fmugym.archive.texts import number_of, with_texts
 from fmugym.fmi import Status
-from fmugym.pool import PoolSpec
 from fmugym.systems.system_fmu import SystemFMU
 from fmugym.systems.system_plan import Component, Group, SystemPlan
-from fmugym.trial import opening
 
 OPTIONS = {
     "fmpy": {"backend": "fmpy"},
@@ -306,11 +304,6 @@ class TestConstruction:
         with pytest.raises(FMULoadError, match=r"refused to be instantiated.*the FMU said: step 0"):
             make_pool(path, ["a"], ["mix"], 2)
         assert list(temp_root.iterdir()) == []
-
-    def test_unknown_backend(self, probe):
-        fmu = FMU(probe(2))
-        with pytest.raises(ConfigError, match="unknown backend 'natvie'; did you mean 'native'"):
-            opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG, backend="natvie")
 
 
 class TestSnapshots:

@@ -234,10 +234,6 @@ class TestSingle:
         both = [env.reset(seed=1)[0].tolist() for env in (here, apart)]
         assert both[0] == both[1]
 
-    def test_unknown_isolation(self, make_env):
-        with pytest.raises(ConfigError, match="unknown isolation 'proces'; did you mean 'process'"):
-            make_env(isolation="proces")
-
 
 class TestVector:
     @pytest.mark.parametrize(("fault", "cause"), [("crash", "SIGSEGV"), ("hang", "call_timeout")])

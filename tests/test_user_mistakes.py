@@ -476,10 +476,6 @@ class TestHooks:
 
 
 class TestBundled:
-    def test_unknown_version(self):
-        with pytest.raises(ConfigError, match=r"unknown FMI version '4\.0'"):
-            fmugym.bundled_fmu("CartPole", 4)
-
     @pytest.mark.parametrize(
         ("name", "options"),
         [

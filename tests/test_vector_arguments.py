@@ -86,8 +86,6 @@ def test_unknown_options_are_named(hooks):
 
 
 def test_unknown_ways_and_modes():
-    with pytest.raises(ConfigError, match="did you mean 'array'"):
-        FMUVectorEnv(Drawing, 2, hooks="arrays")
     with pytest.raises(ConfigError, match="did you mean 'next_step'"):
         FMUVectorEnv(Drawing, 2, autoreset_mode="nextstep")
     with pytest.raises(ConfigError, match="unwrapped environment of fmugym, got CartPoleEnv"):

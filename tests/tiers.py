@@ -189,7 +189,6 @@ SLOW_TESTS = (
     "test_isolated_rollouts.py::test_results",
     "test_isolated_single.py::test_interrupts",
     "test_isolated_single.py::test_results",
-    "test_isolated_single.py::test_series",
     "test_native_guards.py::test_want_of_memory",
     "test_native_helpers.py::test_a_busy",
     "test_native_pool.py::test_memory",
@@ -233,7 +232,6 @@ SLOW_TESTS = (
     "test_trial.py::TestSurvival::test_is_remembered",
     "test_trial.py::TestSurvival::test_without_a_place",
     "test_vector_codec.py::test_gathered_as",
-    "test_windows_fmus.py::TestProgram::test_a_compiler",
     "test_windows_fmus.py::TestProgram::test_its_sources_fit",
 )
 """Others, by the beginning of their node ids."""
