@@ -20,7 +20,7 @@ from fmugym.episodes.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_r
 from fmugym.episodes.simulation import Player, action_of
 from fmugym.series.intervals import confidence
 from fmugym.tools.cli import main
-from fmugym.training.training import Plan, arguments_of, train
+from fmugym.training.training import TrainingSettings, arguments_of, train
 
 CART_POLE = str(Path(__file__).parent.parent / "examples" / "cart_pole.toml")
 SCENARIOS = {
@@ -331,8 +331,10 @@ class TestTrain:
         """Numbers are, and choices are not."""
         from stable_baselines3 import PPO
 
-        plan = Plan(Parts, {"held out": Parts}, tmp_path / "agent", steps=64, num_envs=2)
-        train(replace(plan, arguments={"n_steps": 16, "batch_size": 32}, episodes=1))
+        settings = TrainingSettings(Parts, {"held out": Parts}, tmp_path / "agent", steps=64)
+        train(
+            replace(settings, num_envs=2, arguments={"n_steps": 16, "batch_size": 32}, episodes=1)
+        )
         normalization = pickle.loads((tmp_path / "agent" / "normalization.pkl").read_bytes())
         assert normalization.norm_obs_keys == ["angle"]
         assert normalization.obs_rms["angle"].mean == pytest.approx(1000.0, rel=0.01)

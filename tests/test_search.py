@@ -28,7 +28,7 @@ from fmugym.search.policy import LIMIT, Form, Policy, Scale
 from fmugym.search.probe import MOST_PROBED, Probe
 from fmugym.search.search import VALIDATION, Search
 from fmugym.training import searching
-from fmugym.training.searching import Quest
+from fmugym.training.searching import SearchSettings
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector.engines.batch import BatchEngine
 
@@ -1050,13 +1050,15 @@ ROUNDS = 60  # enough for the tuning of one controller, and for the leaders amon
 
 def searched(folder, document=FALLING, *, told=None, resume=False, rounds=ROUNDS, **options):
     """The verdict and the facts of a short search; ``options`` are of quests or of the task."""
-    fields = {name for name in options if name in Quest.__dataclass_fields__}
+    fields = {name for name in options if name in SearchSettings.__dataclass_fields__}
     changes = {name: value for name, value in options.items() if name not in fields}
     make_env = load(document, **{"controllers": CONTROLLERS, **changes})
     given = {"episodes": 3} | {name: options[name] for name in fields}
     given |= {} if told is None else {"tell": told.append}
-    quest = Quest(make_env, {"unseen episodes": make_env}, folder, rounds=rounds, **given)
-    return searching.search(quest, resume=resume)
+    settings = SearchSettings(
+        make_env, {"unseen episodes": make_env}, folder, rounds=rounds, **given
+    )
+    return searching.search(settings, resume=resume)
 
 
 def content(folder):

@@ -34,9 +34,16 @@ from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
 from fmugym.training.hyperparameters import tune
 from fmugym.training.outcome import write_curve, write_outcome
-from fmugym.training.searching import STATE, Quest, search
+from fmugym.training.searching import STATE, SearchSettings, search
 from fmugym.training.tracking import TRACKERS, tracker_for
-from fmugym.training.training import TRAINING, Plan, Watch, arguments_of, facts_of, train
+from fmugym.training.training import (
+    TRAINING,
+    TrainingSettings,
+    Watch,
+    arguments_of,
+    facts_of,
+    train,
+)
 
 __all__ = ["add_train"]
 
@@ -157,7 +164,7 @@ def _search(arguments: argparse.Namespace) -> None:
     scenarios = {
         name: partial(maker_of(task, name, master), physical=True) for name in scenarios_of(task)
     }
-    quest = Quest(
+    settings = SearchSettings(
         make_env,
         scenarios or {"unseen episodes": make_env},
         arguments.output,
@@ -166,11 +173,11 @@ def _search(arguments: argparse.Namespace) -> None:
         tell=tell,
         **counts,
     )
-    total = round(quest.seconds) if isfinite(quest.seconds) else None
+    total = round(settings.seconds) if isfinite(settings.seconds) else None
     with progress(total, "train", "s") as advance:
-        quest = replace(quest, advance=_lines() if advance is no_progress else advance)
+        settings = replace(settings, advance=_lines() if advance is no_progress else advance)
         try:
-            verdict, facts = search(quest, resume=arguments.resume)
+            verdict, facts = search(settings, resume=arguments.resume)
         except KeyboardInterrupt:
             _tell_what_is_kept(arguments.output, STATE)
             raise
@@ -197,22 +204,22 @@ def _lines() -> Advance:
 
 
 def _learn(arguments: argparse.Namespace) -> None:
-    plan, begin_tracker = _plan_of(arguments), None
+    settings, begin_tracker = _settings_of(arguments), None
     if arguments.track is not None:
-        facts = {"task": arguments.task, "steps": plan.steps, **plan.facts()}
-        begin_tracker = tracker_for(arguments.track, facts, plan.folder)
+        facts = {"task": arguments.task, "steps": settings.steps, **settings.facts()}
+        begin_tracker = tracker_for(arguments.track, facts, settings.folder)
     if arguments.tune is not None:
-        plan = _tuned(plan, arguments)
-    with progress(plan.steps, "train") as advance:
+        settings = _tuned(settings, arguments)
+    with progress(settings.steps, "train") as advance:
         watch = Watch(tell, advance, begin_tracker=begin_tracker)
         try:
-            scores = train(plan, resume=arguments.resume, watch=watch)
+            scores = train(settings, resume=arguments.resume, watch=watch)
         except KeyboardInterrupt:
-            _tell_what_is_kept(plan.folder, CHECKPOINT)
-            write_outcome(plan, title_of(arguments.task), tell)
+            _tell_what_is_kept(settings.folder, CHECKPOINT)
+            write_outcome(settings, title_of(arguments.task), tell)
             raise
-    write_outcome(plan, title_of(arguments.task), tell)
-    _show(plan, scores, arguments)
+    write_outcome(settings, title_of(arguments.task), tell)
+    _show(settings, scores, arguments)
 
 
 def _tell_what_is_kept(folder: Path, state: str) -> None:
@@ -225,8 +232,8 @@ def _tell_what_is_kept(folder: Path, state: str) -> None:
         tell(f"{folder} has the best agent until now; the training was too short to resume it")
 
 
-def _plan_of(arguments: argparse.Namespace) -> Plan:
-    """The plan that the options make, together with what a training was begun with."""
+def _settings_of(arguments: argparse.Namespace) -> TrainingSettings:
+    """The settings that the options make, together with what a training was begun with."""
     before = facts_of(arguments.output) if arguments.resume else {}
     given = {name: getattr(arguments, name) for name in _DEFAULTS}
     for name, default in _DEFAULTS.items():
@@ -238,7 +245,7 @@ def _plan_of(arguments: argparse.Namespace) -> Plan:
     names, master = scenarios_of(arguments.task), arguments.master
     make_env = maker_of(arguments.task, master=master)
     held_out = {name: maker_of(arguments.task, name, master) for name in names}
-    return Plan(
+    return TrainingSettings(
         make_env,
         held_out or {"held-out seeds": make_env},
         arguments.output,
@@ -264,10 +271,10 @@ def _diary_of(arguments: argparse.Namespace, before: Any) -> Diary | None:
     return Diary(tuple(arguments.record), environments, own[1], own[2] or "csv")
 
 
-def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
+def _tuned(settings: TrainingSettings, arguments: argparse.Namespace) -> TrainingSettings:
     if arguments.resume:
         raise ConfigError("--tune is for a new training, which --resume is not")
-    arguments.tune_steps = arguments.tune_steps or max(1, plan.steps // 10)
+    arguments.tune_steps = arguments.tune_steps or max(1, settings.steps // 10)
     check_numbers(arguments, "tune", "tune_steps")
     with progress(arguments.tune, "tune", "trials") as advance:
 
@@ -275,16 +282,16 @@ def _tuned(plan: Plan, arguments: argparse.Namespace) -> Plan:
             advance(1)
             tell(line)
 
-        best = tune(plan, arguments.tune, arguments.tune_steps, noted)
+        best = tune(settings, arguments.tune, arguments.tune_steps, noted)
     tell(f"the best arguments are {json.dumps(best)}")
-    return replace(plan, arguments=best)
+    return replace(settings, arguments=best)
 
 
-def _show(plan: Plan, scores: list[Score], arguments: argparse.Namespace) -> None:
+def _show(settings: TrainingSettings, scores: list[Score], arguments: argparse.Namespace) -> None:
     if not arguments.json:
         say(table(scores))
         return
-    best = json.loads((plan.folder / FACTS).read_text(encoding="utf-8"))
-    facts = {"task": arguments.task, "output": arguments.output, "steps": plan.steps}
+    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
+    facts = {"task": arguments.task, "output": arguments.output, "steps": settings.steps}
     told = {"best": best, "scores": [one.as_dict() for one in scores]}
-    say_json({**facts, **plan.facts(), **told})
+    say_json({**facts, **settings.facts(), **told})

@@ -13,7 +13,7 @@ from typing import Any, Final
 from fmugym.errors import ConfigError, FMUGymError
 from fmugym.extras import imported
 from fmugym.training.agents import algorithm_of
-from fmugym.training.training import TRIALS, Plan, Watch, require_new, train
+from fmugym.training.training import TRIALS, TrainingSettings, Watch, require_new, train
 
 __all__ = ["tune"]
 
@@ -36,36 +36,38 @@ _PARTS: Final = 4
 """A trial has at least so many updates."""
 
 
-def tune(plan: Plan, trials: int, steps: int, tell: Callable[[str], None]) -> dict[str, Any]:
+def tune(
+    settings: TrainingSettings, trials: int, steps: int, tell: Callable[[str], None]
+) -> dict[str, Any]:
     """Try arguments of the algorithm in short trainings.
 
-    The sampler is Optuna's tree-structured Parzen estimator, seeded with the plan's seed. A trial
+    The sampler is Optuna's tree-structured Parzen estimator, seeded as the settings say. A trial
     that is below the median of those before it is stopped early. Each trial is in a folder of its
     own, ``trials/000`` and so on, and in a line of ``trials.csv``.
 
     Args:
-        plan: What to train. Arguments that it has are not searched for.
+        settings: What to train. Arguments that it has are not searched for.
         trials: How many to make.
         steps: The steps of a trial.
         tell: Gets a line of text for each trial.
 
     Returns:
-        The arguments of the best trial, those of the plan included.
+        The arguments of the best trial, those of the settings included.
 
     Raises:
         ConfigError: If Optuna is missing, or no trial has come to its end.
-        FileExistsError: If the folder of the plan exists.
+        FileExistsError: If the folder of the settings exists.
     """
     optuna: Any = imported("optuna", "tune")
-    require_new(plan.folder / TRIALS)
+    require_new(settings.folder / TRIALS)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(
         direction="maximize",
-        sampler=optuna.samplers.TPESampler(seed=plan.seed),
+        sampler=optuna.samplers.TPESampler(seed=settings.seed),
         pruner=optuna.pruners.MedianPruner(n_startup_trials=3),
     )
-    objective = _Objective(plan, steps, optuna.TrialPruned)
-    note = _Notes(plan, tell)
+    objective = _Objective(settings, steps, optuna.TrialPruned)
+    note = _Notes(settings, tell)
     study.optimize(objective, n_trials=trials, callbacks=[note], catch=(FMUGymError, ValueError))
     complete = [trial for trial in study.trials if trial.value is not None]
     if not complete:
@@ -77,12 +79,12 @@ def tune(plan: Plan, trials: int, steps: int, tell: Callable[[str], None]) -> di
 class _Objective:
     """A trial: returns the mean reward of its best evaluation."""
 
-    def __init__(self, plan: Plan, steps: int, pruned: type[Exception]) -> None:
-        self._plan, self._steps, self._pruned = plan, steps, pruned
+    def __init__(self, settings: TrainingSettings, steps: int, pruned: type[Exception]) -> None:
+        self._settings, self._steps, self._pruned = settings, steps, pruned
 
     def __call__(self, trial: Any) -> float:
-        given = dict(self._plan.arguments or {})
-        arguments = {**_suggested(trial, self._plan, self._steps), **given}
+        given = dict(self._settings.arguments or {})
+        arguments = {**_suggested(trial, self._settings, self._steps), **given}
         trial.set_user_attr("arguments", arguments)
         rewards: list[float] = []
 
@@ -92,20 +94,22 @@ class _Objective:
             if trial.should_prune():
                 raise self._pruned
 
-        folder = self._plan.folder / TRIALS / f"{trial.number:03}"
-        plan = replace(
-            self._plan, folder=folder, steps=self._steps, arguments=arguments, diary=None
+        folder = self._settings.folder / TRIALS / f"{trial.number:03}"
+        settings = replace(
+            self._settings, folder=folder, steps=self._steps, arguments=arguments, diary=None
         )
-        train(plan, watch=Watch(evaluated=evaluated))
+        train(settings, watch=Watch(evaluated=evaluated))
         return max(rewards)
 
 
-def _suggested(trial: Any, plan: Plan, steps: int) -> dict[str, Any]:
-    """Arguments for a trial, of those that the algorithm has and the plan does not give."""
-    given = plan.arguments or {}
+def _suggested(trial: Any, settings: TrainingSettings, steps: int) -> dict[str, Any]:
+    """Arguments for a trial, of those that the algorithm has and the settings do not give."""
+    given = settings.arguments or {}
     defaults = {
         name: parameter.default
-        for name, parameter in inspect.signature(algorithm_of(plan.algorithm)).parameters.items()
+        for name, parameter in inspect.signature(
+            algorithm_of(settings.algorithm)
+        ).parameters.items()
         if name not in given
     }
     found: dict[str, Any] = {}
@@ -116,7 +120,7 @@ def _suggested(trial: Any, plan: Plan, steps: int) -> dict[str, Any]:
         )
     for name in _COUNTS:
         if type(defaults.get(name)) is int:
-            most = _most(name, plan, steps)
+            most = _most(name, settings, steps)
             counts = {min(most, max(1, math.ceil(defaults[name] * f))) for f in _FACTORS}
             found[name] = trial.suggest_categorical(name, sorted(counts))
     for name, values in _CHOICES.items():
@@ -131,17 +135,17 @@ def _suggested(trial: Any, plan: Plan, steps: int) -> dict[str, Any]:
     return found
 
 
-def _most(name: str, plan: Plan, steps: int) -> int:
+def _most(name: str, settings: TrainingSettings, steps: int) -> int:
     """The largest count with which a trial has some updates."""
-    most = steps // _PARTS // (plan.num_envs if name == "n_steps" else 1)
+    most = steps // _PARTS // (settings.num_envs if name == "n_steps" else 1)
     return 1 << max(3, most.bit_length() - 1)  # so that batches divide what was collected
 
 
 class _Notes:
     """Writes a line for each trial."""
 
-    def __init__(self, plan: Plan, tell: Callable[[str], None]) -> None:
-        self._path, self._tell = plan.folder / f"{TRIALS}.csv", tell
+    def __init__(self, settings: TrainingSettings, tell: Callable[[str], None]) -> None:
+        self._path, self._tell = settings.folder / f"{TRIALS}.csv", tell
 
     def __call__(self, study: Any, trial: Any) -> None:
         state = trial.state.name.lower()

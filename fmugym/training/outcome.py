@@ -17,24 +17,24 @@ from fmugym.series import RecordSeries, TimeSeries, write_report
 from fmugym.series.plots import svg_of
 from fmugym.training.agents import FACTS, agent_player
 from fmugym.training.diary import CURVE, REPORT, Diary, curve_of, draw_curve
-from fmugym.training.training import Plan
+from fmugym.training.training import TrainingSettings
 
 __all__ = ["write_curve", "write_outcome"]
 
 
-def write_outcome(plan: Plan, title: str, tell: Callable[[str], None]) -> None:
+def write_outcome(settings: TrainingSettings, title: str, tell: Callable[[str], None]) -> None:
     """Draw the curve of a training, and write a report if the training was recorded.
 
     Files that are there are replaced. Without Matplotlib there are none.
 
     Args:
-        plan: What was trained.
+        settings: What was trained.
         title: What the task is called.
         tell: Gets a line of text if Matplotlib is missing.
     """
-    figure = write_curve(plan.folder, f"{title}, trained with {plan.algorithm}", tell)
-    if figure is not None and plan.diary is not None:
-        _write_report(plan, plan.diary, title, {"Training": svg_of(figure)})
+    figure = write_curve(settings.folder, f"{title}, trained with {settings.algorithm}", tell)
+    if figure is not None and settings.diary is not None:
+        _write_report(settings, settings.diary, title, {"Training": svg_of(figure)})
 
 
 def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
@@ -59,20 +59,25 @@ def write_curve(folder: Path, title: str, tell: Callable[[str], None]) -> Any:
     return figure
 
 
-def _write_report(plan: Plan, diary: Diary, title: str, charts: Mapping[str, str]) -> None:
+def _write_report(
+    settings: TrainingSettings, diary: Diary, title: str, charts: Mapping[str, str]
+) -> None:
     """Let the best agent play once more, in the first episode of each evaluation."""
-    runs = {name: _played(plan, diary, make_env) for name, make_env in plan.held_out.items()}
-    with closing(plan.make_env()) as env:
+    runs = {
+        name: _played(settings, diary, make_env) for name, make_env in settings.held_out.items()
+    }
+    with closing(settings.make_env()) as env:
         about = About.of(env)
-    best = json.loads((plan.folder / FACTS).read_text(encoding="utf-8"))
+    best = json.loads((settings.folder / FACTS).read_text(encoding="utf-8"))
     facts = {
-        "algorithm": plan.algorithm,
-        "arguments": ", ".join(f"{k} = {v}" for k, v in (plan.arguments or {}).items()) or "none",
-        "seed": str(plan.seed),
-        "environments": str(plan.num_envs),
+        "algorithm": settings.algorithm,
+        "arguments": ", ".join(f"{k} = {v}" for k, v in (settings.arguments or {}).items())
+        or "none",
+        "seed": str(settings.seed),
+        "environments": str(settings.num_envs),
         "steps of the best agent": str(best["steps"]),
     }
-    path = plan.folder / REPORT
+    path = settings.folder / REPORT
     path.unlink(missing_ok=True)
     write_report(
         path,
@@ -85,10 +90,10 @@ def _write_report(plan: Plan, diary: Diary, title: str, charts: Mapping[str, str
     )
 
 
-def _played(plan: Plan, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:
-    player = agent_player(plan.folder)
+def _played(settings: TrainingSettings, diary: Diary, make_env: Callable[[], FMUEnv]) -> TimeSeries:
+    player = agent_player(settings.folder)
     env = player.make_env(make_env)
     with closing(RecordSeries(env, diary.variables, every=diary.every)) as recorder:
         policy = player.make_policy(env)
-        simulate(recorder, policy, HELD_OUT_SEED, plan.most_steps)
+        simulate(recorder, policy, HELD_OUT_SEED, settings.most_steps)
         return recorder.series

@@ -28,7 +28,7 @@ from fmugym.training.comparing import Verdict, episodes_of, judge
 from fmugym.training.diary import EVALUATIONS
 from fmugym.training.training import require_new
 
-__all__ = ["STATE", "Quest", "search"]
+__all__ = ["STATE", "SearchSettings", "search"]
 
 STATE: Final = "search.pkl"
 _MINUTES: Final = 1.0
@@ -45,7 +45,7 @@ _LONGEST: Final = 2**31
 
 
 @dataclass(frozen=True)
-class Quest:
+class SearchSettings:
     """What to search, and how long.
 
     Attributes:
@@ -88,13 +88,13 @@ _Course = tuple[Search, Probe, int]
 """What a search that is resumed goes on with: the steps are those until then."""
 
 
-def search(quest: Quest, *, resume: bool = False) -> tuple[Verdict, dict[str, Any]]:
+def search(settings: SearchSettings, *, resume: bool = False) -> tuple[Verdict, dict[str, Any]]:
     """Search an agent, write it, and let it play the test.
 
     An interruption by Ctrl-C ends the search; the best agent until then is in the folder.
 
     Args:
-        quest: What to search.
+        settings: What to search.
         resume: Whether to go on with the search in the folder.
 
     Returns:
@@ -106,22 +106,22 @@ def search(quest: Quest, *, resume: bool = False) -> tuple[Verdict, dict[str, An
         FileExistsError: If the folder exists, unless a search is resumed.
     """
     begin = monotonic()
-    course = _resumed(quest) if resume else _begun(quest)
+    course = _resumed(settings) if resume else _begun(settings)
     try:
-        run = _Run(quest, *course, begin)
+        run = _Run(settings, *course, begin)
         return run.judged(run.winner())
     finally:
         with Ignoring(OSError):  # something was found, so that the folder is not empty
-            quest.folder.rmdir()
+            settings.folder.rmdir()
 
 
-def _begun(quest: Quest) -> _Course:
-    require_new(quest.folder)
-    if quest.steps is not None and quest.steps <= MOST_PROBED:
+def _begun(settings: SearchSettings) -> _Course:
+    require_new(settings.folder)
+    if settings.steps is not None and settings.steps <= MOST_PROBED:
         raise ConfigError(
-            f"{quest.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
+            f"{settings.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
         )
-    probe = Probe.of(quest.make_env, quest.envs)
+    probe = Probe.of(settings.make_env, settings.envs)
     declared = probe.task.get("controllers", {})
     given = {name: one for name, one in declared.items() if not plans_ahead(one)}
     tunable = [(name, search_of(one)) for name, one in given.items() if has_range(one)]
@@ -133,11 +133,11 @@ def _begun(quest: Quest) -> _Course:
     if not given:
         tunable = [("PI", search_of(one)) for one in probe.guesses]
     for line in _first_lines(probe, given, len(tunable)):
-        quest.tell(line)
+        settings.tell(line)
     sizes = len(probe.task["observations"]), probe.acting
     limits = list(probe.limits.values())
-    made = Search(sizes, fixed, tunable, limits, probe.is_same, quest.seed)
-    quest.folder.mkdir(parents=True, exist_ok=True)
+    made = Search(sizes, fixed, tunable, limits, probe.is_same, settings.seed)
+    settings.folder.mkdir(parents=True, exist_ok=True)
     return made, probe, MOST_PROBED
 
 
@@ -166,7 +166,7 @@ class _Run:
     """Lets a search go on until its time is over, and writes what it has found.
 
     Args:
-        quest: What to search.
+        settings: What to search.
         search: The search.
         probe: What is known of the task.
         steps: Those that were done before.
@@ -174,37 +174,37 @@ class _Run:
     """
 
     def __init__(
-        self, quest: Quest, search: Search, probe: Probe, steps: int, begin: float
+        self, settings: SearchSettings, search: Search, probe: Probe, steps: int, begin: float
     ) -> None:
-        self._quest, self._found, self._probe, self._begin = quest, search, probe, begin
-        self._arena = self._arena_of(quest.make_env, probe.most_steps)
+        self._settings, self._found, self._probe, self._begin = settings, search, probe, begin
+        self._arena = self._arena_of(settings.make_env, probe.most_steps)
         self._arena.steps = self._steps_before = steps
-        self._most = quest.steps or np.inf
+        self._most = settings.steps or np.inf
         self._noted = NO_MERIT if search.baseline is None else search.merit
         few = probe.round_time(FEW, search.episodes)
-        self._is_enough = few * _FEWEST <= quest.seconds - (monotonic() - begin)
+        self._is_enough = few * _FEWEST <= settings.seconds - (monotonic() - begin)
         self._tell_the_plan(few)
 
     def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
-        envs = self._quest.envs
+        envs = self._settings.envs
         group = envs if self._probe.seconds < _SLOW else min(envs, _GROUP)
         return Arena(make_env, group, most_steps, list(self._probe.limits))
 
     def _tell_the_plan(self, few: float) -> None:
         """Tell what will be done, and how long; ``few`` are the seconds of a short round."""
-        quest, probe = self._quest, self._probe
+        settings, probe = self._settings, self._probe
         if not self._is_enough:
-            quest.tell(
+            settings.tell(
                 f"a round of {FEW} candidates takes about {few:.3g} s, so the time will do for the "
                 f"baseline only; for more, give --minutes {np.ceil(few * 2 * _FEWEST / 60):.0f}"
             )
         limits = {
-            f"for {quest.seconds:g} s": np.isfinite(quest.seconds),
-            f"until round {quest.rounds}": quest.rounds,
-            f"for at most {quest.steps} steps": quest.steps,
+            f"for {settings.seconds:g} s": np.isfinite(settings.seconds),
+            f"until round {settings.rounds}": settings.rounds,
+            f"for at most {settings.steps} steps": settings.steps,
         }
         kind = "one episode, as all are the same" if probe.is_same else "new episodes"
-        quest.tell(
+        settings.tell(
             f"candidates play {kind} of up to {probe.most_steps} steps, "
             + " and ".join(text for text, is_given in limits.items() if is_given)
         )
@@ -223,7 +223,7 @@ class _Run:
             finally:
                 if self._found.best is not None:
                     self._save(self._found.best)
-            self._quest.tell(self._text())
+            self._settings.tell(self._text())
             self._arena.ceiling = self._most
             try:
                 winner = self._found.winner(self._arena)
@@ -257,7 +257,7 @@ class _Run:
             self._found = after
             self._note()
             took = monotonic() - begin
-            self._quest.advance(took, self._text())
+            self._settings.advance(took, self._text())
 
     def _reserved(self, found: Search) -> int:
         """The steps that the last validation may take."""
@@ -267,14 +267,14 @@ class _Run:
 
     def _is_over(self, took: float) -> bool:
         """Whether there is no time for another round like the last one, or nothing left to do."""
-        found, quest = self._found, self._quest
-        if found.is_over or found.rounds >= (quest.rounds or np.inf):
+        found, settings = self._found, self._settings
+        if found.is_over or found.rounds >= (settings.rounds or np.inf):
             return True
         if not self._is_enough and found.is_tuned and found.baseline is None:
             return True
         done, seconds = self._arena.steps - self._steps_before, monotonic() - self._begin
         pace = seconds / done if done else self._probe.seconds
-        return seconds + took + self._reserved(found) * pace >= quest.seconds
+        return seconds + took + self._reserved(found) * pace >= settings.seconds
 
     def _text(self) -> str:
         """The scores, for a line of progress."""
@@ -289,7 +289,7 @@ class _Run:
         if found.baseline is None or found.best is None or found.merit <= self._noted:
             return
         self._noted = found.merit
-        path = self._quest.folder / EVALUATIONS
+        path = self._settings.folder / EVALUATIONS
         if not path.exists():
             path.write_text("steps,reward,baseline\n", encoding="utf-8")
         with path.open("a", encoding="utf-8") as file:
@@ -298,7 +298,7 @@ class _Run:
 
     def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
-        folder, found, task = self._quest.folder, self._found, self._probe.task
+        folder, found, task = self._settings.folder, self._found, self._probe.task
         replace(agent, names=task["observations"], actions=task["actions"]).save(folder)
         facts = {
             "algorithm": "search",
@@ -318,19 +318,19 @@ class _Run:
 
     def judged(self, winner: Agent) -> tuple[Verdict, dict[str, Any]]:
         """Let the winner play beside the others, and write what it has reached."""
-        quest, probe, found = self._quest, self._probe, self._found
+        settings, probe, found = self._settings, self._probe, self._found
         if winner is found.baseline:
-            quest.tell(
+            settings.tell(
                 f"nothing was found that beats {winner.name}: the folder has that controller"
             )
         agents = {winner.name: winner}
-        count = 1 if probe.is_same else quest.episodes
+        count = 1 if probe.is_same else settings.episodes
         baseline = found.baseline or winner
         for other in [baseline, *found.others(), *self._planners(baseline.text, count)]:
             agents.setdefault(other.name, other)
         arenas = {
-            name: self._arena_of(make, probe.most_steps if make is quest.make_env else _LONGEST)
-            for name, make in quest.scenarios.items()
+            name: self._arena_of(make, probe.most_steps if make is settings.make_env else _LONGEST)
+            for name, make in settings.scenarios.items()
         }
         verdict = judge(agents, arenas, probe.limits, count)
         return verdict, self._save(winner, test=verdict.as_dict())
@@ -345,10 +345,10 @@ class _Run:
             if plans_ahead(text):
                 warm = warmed(text, baseline)
                 minutes = self._minutes_of_test(warm, episodes)
-                if minutes <= (self._quest.minutes or _MINUTES):
+                if minutes <= (self._settings.minutes or _MINUTES):
                     yield Agent(name, warm)
                 else:
-                    self._quest.tell(
+                    self._settings.tell(
                         f"left out: {name}, whose test would take about {minutes:.0f} min; "
                         "'fmugym evaluate' compares it with the agent"
                     )
@@ -356,26 +356,26 @@ class _Run:
     def _minutes_of_test(self, text: str, episodes: int | None) -> float:
         """How long a controller would take for the test, by the time of its second decision."""
         steps = 0
-        for make_env in self._quest.scenarios.values():
+        for make_env in self._settings.scenarios.values():
             with closing(make_env()) as env:
                 steps += env.config.max_episode_steps or self._probe.most_steps
-        with closing(self._quest.make_env()) as env:
+        with closing(self._settings.make_env()) as env:
             controller = controller_of(text).bind(env)
-            observation, _ = env.reset(seed=self._quest.seed)
+            observation, _ = env.reset(seed=self._settings.seed)
             observation, *_ = env.step(controller.act(observation))
             begin = monotonic()
             controller.act(observation)
             took = monotonic() - begin
-        return took * steps * episodes_of(len(self._quest.scenarios), episodes) / 60.0
+        return took * steps * episodes_of(len(self._settings.scenarios), episodes) / 60.0
 
 
-def _resumed(quest: Quest) -> _Course:
+def _resumed(settings: SearchSettings) -> _Course:
     """Read the state of a search; it is a pickle, which can run code.
 
     Raises:
         ConfigError: If there is none, it is damaged, or it is of another task.
     """
-    folder = quest.folder
+    folder = settings.folder
     try:
         found, probe, steps = pickle.loads((folder / STATE).read_bytes())
         before = probe.task
@@ -385,7 +385,7 @@ def _resumed(quest: Quest) -> _Course:
         raise ConfigError(
             f"the search in {shown(str(folder))} cannot be resumed: {reason(error)}"
         ) from None
-    with closing(quest.make_env()) as env:
+    with closing(settings.make_env()) as env:
         now = task_of(env)
     changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     if changed:

@@ -48,7 +48,7 @@ from fmugym.vector import FMUVectorEnv
 __all__ = [
     "TRAINING",
     "TRIALS",
-    "Plan",
+    "TrainingSettings",
     "Watch",
     "arguments_of",
     "facts_of",
@@ -63,7 +63,7 @@ _SECONDS_BETWEEN_CHECKPOINTS: Final = 30.0
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingSettings:
     """What to train, and how.
 
     Attributes:
@@ -146,7 +146,7 @@ class Watch:
 
 
 def train(
-    plan: Plan,
+    settings: TrainingSettings,
     tell: Callable[[str], None] = lambda line: None,
     *,
     resume: bool = False,
@@ -158,7 +158,7 @@ def train(
     checkpoint from which the training can be resumed.
 
     Args:
-        plan: What to train.
+        settings: What to train.
         tell: Gets a line of text for each evaluation.
         resume: Whether to go on with the training in the folder. If the FMU's state can be saved or
             its steps repeated, all takes the same course as without the interruption, to the last
@@ -175,18 +175,18 @@ def train(
     """
     sb3 = imported_for_training("fmugym.sb3")
     if resume:
-        _require_same(plan)
+        _require_same(settings)
     else:
-        require_new(plan.folder)
-        _check_arguments(plan)
-    wrap = _recorder(plan, resume)
-    venv = sb3.make_sb3_env(plan.make_env, plan.num_envs, seed=plan.seed, wrap=wrap)
+        require_new(settings.folder)
+        _check_arguments(settings)
+    wrap = _recorder(settings, resume)
+    venv = sb3.make_sb3_env(settings.make_env, settings.num_envs, seed=settings.seed, wrap=wrap)
     try:
         if can_be_scaled(venv.action_space):
             venv = sb3.ScaledActions(venv)
-        if plan.normalize:
+        if settings.normalize:
             venv = _normalized(venv)
-        with closing(_Training(plan, venv, watch or Watch(tell), resume)) as training:
+        with closing(_Training(settings, venv, watch or Watch(tell), resume)) as training:
             training.run()
             return training.scores_of_kept()
     finally:
@@ -204,25 +204,25 @@ def _normalized(venv: Any) -> Any:
     return make(venv, norm_obs_keys=names)
 
 
-def _recorder(plan: Plan, resume: bool) -> Callable[[FMUVectorEnv], Any]:
+def _recorder(settings: TrainingSettings, resume: bool) -> Callable[[FMUVectorEnv], Any]:
     """What wraps the environments of a training."""
-    if plan.diary is None:
+    if settings.diary is None:
         return lambda envs: envs
-    begin = latest_checkpoint(plan.folder)[1] if resume else 0
-    return plan.diary.of_training(plan.folder, begin)
+    begin = latest_checkpoint(settings.folder)[1] if resume else 0
+    return settings.diary.of_training(settings.folder, begin)
 
 
-def _check_arguments(plan: Plan) -> None:
+def _check_arguments(settings: TrainingSettings) -> None:
     """Refuse arguments that the algorithm does not have.
 
     Raises:
         ConfigError: With the nearest one.
     """
-    known = inspect.signature(algorithm_of(plan.algorithm)).parameters
+    known = inspect.signature(algorithm_of(settings.algorithm)).parameters
     takes_any = any(one.kind is one.VAR_KEYWORD for one in known.values())
-    for name in () if takes_any else plan.arguments or ():
+    for name in () if takes_any else settings.arguments or ():
         if name not in known:
-            raise unknown_name(f"argument of {plan.algorithm}", name, known)
+            raise unknown_name(f"argument of {settings.algorithm}", name, known)
 
 
 def require_new(folder: Path) -> None:
@@ -251,34 +251,34 @@ def facts_of(folder: Path) -> dict[str, Any]:
         raise ConfigError(f"{shown(str(folder))} has no training to resume") from None
 
 
-def _require_same(plan: Plan) -> None:
-    before = facts_of(plan.folder)
-    for name, value in plan.facts().items():
+def _require_same(settings: TrainingSettings) -> None:
+    before = facts_of(settings.folder)
+    for name, value in settings.facts().items():
         if before.get(name) != value:
             raise ConfigError(
-                f"the training in {shown(str(plan.folder))} has {name} = "
+                f"the training in {shown(str(settings.folder))} has {name} = "
                 f"{shown(before.get(name))}, which cannot change to {shown(value)}"
             )
 
 
-def _new_model(plan: Plan, venv: Any) -> Any:
-    own = _with_fitting_rollouts(plan)
+def _new_model(settings: TrainingSettings, venv: Any) -> Any:
+    own = _with_fitting_rollouts(settings)
     policy = own.pop("policy", None)
     if policy is None:
         is_dict = isinstance(venv.observation_space, spaces.Dict)
-        recurrent = "Lstm" if plan.algorithm.startswith("Recurrent") else ""
+        recurrent = "Lstm" if settings.algorithm.startswith("Recurrent") else ""
         policy = f"{'MultiInput' if is_dict else 'Mlp'}{recurrent}Policy"
     try:
-        algorithm = algorithm_of(plan.algorithm)
-        return algorithm(policy, venv, **{"seed": plan.seed, "device": "cpu", **own})
+        algorithm = algorithm_of(settings.algorithm)
+        return algorithm(policy, venv, **{"seed": settings.seed, "device": "cpu", **own})
     except ordinary(TypeError, ValueError, AssertionError) as error:
-        raise ConfigError(f"{plan.algorithm} cannot be made: {reason(error)}") from error
+        raise ConfigError(f"{settings.algorithm} cannot be made: {reason(error)}") from error
 
 
-def _with_fitting_rollouts(plan: Plan) -> dict[str, Any]:
-    """The arguments of the plan, with shorter rollouts where it has fewer steps than usual ones."""
-    own, most = dict(plan.arguments or {}), plan.steps // plan.num_envs
-    default = inspect.signature(algorithm_of(plan.algorithm)).parameters.get("n_steps")
+def _with_fitting_rollouts(settings: TrainingSettings) -> dict[str, Any]:
+    """The arguments, with shorter rollouts where there are fewer steps than usual ones have."""
+    own, most = dict(settings.arguments or {}), settings.steps // settings.num_envs
+    default = inspect.signature(algorithm_of(settings.algorithm)).parameters.get("n_steps")
     if default is not None and 0 < most < default.default:
         own.setdefault("n_steps", 1 << (most.bit_length() - 1))  # so that batches divide rollouts
     return own
@@ -296,32 +296,34 @@ def _steps_between_updates(model: Any, num_envs: int) -> int:
 class _Training:
     """A training: evaluates the agent now and then, keeps the best one, and can be resumed."""
 
-    def __init__(self, plan: Plan, venv: Any, watch: Watch, resume: bool) -> None:
-        self._plan, self._venv, self._watch = plan, venv, watch
-        self._due = max(1, plan.steps // _EVALUATIONS)
+    def __init__(self, settings: TrainingSettings, venv: Any, watch: Watch, resume: bool) -> None:
+        self._settings, self._venv, self._watch = settings, venv, watch
+        self._due = max(1, settings.steps // _EVALUATIONS)
         self._progress = {"best": -float("inf"), "next": self._due, "last": -1, "updates": -1}
         self._is_new = not resume
         if resume:
             self._load()
         else:
-            self._model = _new_model(plan, venv)
+            self._model = _new_model(settings, venv)
             self._require_an_update()
             self._tell_of_the_plan()
-            plan.folder.mkdir(parents=True, exist_ok=True)
-        facts: dict[str, Any] = {"schema": 1, "steps": plan.steps, **plan.facts()}
-        if plan.diary is not None:
-            (plan.folder / RECORDS).mkdir(exist_ok=True)
-            facts["record"] = plan.diary.facts()
-        (plan.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
+            settings.folder.mkdir(parents=True, exist_ok=True)
+        facts: dict[str, Any] = {"schema": 1, "steps": settings.steps, **settings.facts()}
+        if settings.diary is not None:
+            (settings.folder / RECORDS).mkdir(exist_ok=True)
+            facts["record"] = settings.diary.facts()
+        (settings.folder / TRAINING).write_text(json.dumps(facts), encoding="utf-8")
         self._tracker = None if watch.begin_tracker is None else watch.begin_tracker()
         self._begin = self._told = self._steps
         self._saved_at = monotonic()
 
     def _load(self) -> None:
-        plan = self._plan
-        self._model, more, is_exact = load_checkpoint(plan.folder, plan.algorithm, self._venv)
+        settings = self._settings
+        self._model, more, is_exact = load_checkpoint(
+            settings.folder, settings.algorithm, self._venv
+        )
         self._due, self._progress = more["due"], more["progress"]
-        _drop_rows(plan.folder / EVALUATIONS, self._steps)
+        _drop_rows(settings.folder / EVALUATIONS, self._steps)
         how = "" if is_exact else "; the FMUs cannot, so that their episodes begin anew"
         self._watch.tell(f"goes on after {self._steps} steps{how}")
 
@@ -332,8 +334,8 @@ class _Training:
     def run(self) -> None:
         """Train until the end, and evaluate once more."""
         self._log_to()
-        remaining = self._plan.steps - self._steps
-        remaining -= remaining % _steps_between_updates(self._model, self._plan.num_envs)
+        remaining = self._settings.steps - self._steps
+        remaining -= remaining % _steps_between_updates(self._model, self._settings.num_envs)
         try:
             if remaining > 0:
                 self._model.learn(
@@ -344,28 +346,28 @@ class _Training:
             else:
                 self.evaluate()
         except KeyboardInterrupt:
-            if not (self._plan.folder / FACTS).exists():  # a second one may end the evaluation
+            if not (self._settings.folder / FACTS).exists():  # a second one may end the evaluation
                 self._keep()
             self.evaluate()
             raise
 
     def _require_an_update(self) -> None:
         """Refuse a training that ends before it learns for the first time."""
-        plan = self._plan
-        between = _steps_between_updates(self._model, plan.num_envs)
+        settings = self._settings
+        between = _steps_between_updates(self._model, settings.num_envs)
         name = "n_steps" if hasattr(self._model, "rollout_buffer") else "train_freq"
-        if between > plan.steps:
+        if between > settings.steps:
+            count = settings.num_envs
             raise ConfigError(
-                f"{plan.algorithm} learns after every {between} steps ({name}="
-                f"{between // plan.num_envs} in {plan.num_envs} environments), more than the "
-                f"{plan.steps} of the training: give a smaller {name}, or fewer environments"
+                f"{settings.algorithm} learns after every {between} steps ({name}="
+                f"{between // count} in {count} environments), more than the {settings.steps} of the training: give a smaller {name}, or fewer environments"
             )
 
     def _tell_of_the_plan(self) -> None:
-        plan = self._plan
+        settings = self._settings
         self._watch.tell(
-            f"{plan.algorithm} learns for up to {plan.steps} steps of {plan.num_envs} "
-            f"environments; {plan.episodes * len(plan.held_out)} episodes are played every "
+            f"{settings.algorithm} learns for up to {settings.steps} steps of {settings.num_envs} "
+            f"environments; {settings.episodes * len(settings.held_out)} episodes are played every "
             f"{self._due} steps, and the best agent is kept"
         )
 
@@ -380,7 +382,7 @@ class _Training:
         logger = import_module("stable_baselines3.common.logger")
         suffix = f"_from_{self._begin}" if self._begin else ""
         kinds = ["csv", *(["tensorboard"] if find_spec("tensorboard") else [])]
-        folder = str(self._plan.folder)
+        folder = str(self._settings.folder)
         formats = [logger.make_output_format(kind, folder, suffix) for kind in kinds]
         if self._tracker is not None:
             formats.append(_writer_to(self._tracker, logger.KVWriter))
@@ -415,7 +417,7 @@ class _Training:
 
     def _save_checkpoint(self) -> None:
         more = {"due": self._due, "progress": dict(self._progress)}
-        save_checkpoint(self._plan.folder, self._model, self._venv, more)
+        save_checkpoint(self._settings.folder, self._model, self._venv, more)
 
     def evaluate(self) -> None:
         """Evaluate the agent, unless that was done at this step."""
@@ -439,32 +441,34 @@ class _Training:
 
     def scores_of_kept(self) -> list[Score]:
         """Let the agent in the folder play the episodes of the evaluations once more."""
-        facts = json.loads((self._plan.folder / FACTS).read_text(encoding="utf-8"))
+        facts = json.loads((self._settings.folder / FACTS).read_text(encoding="utf-8"))
         self._watch.tell(f"the agent after {facts['steps']} steps was the best, and is kept")
-        return self._scores(agent_player(self._plan.folder), lambda name: lambda env: env)
+        return self._scores(agent_player(self._settings.folder), lambda name: lambda env: env)
 
     def _scores(self, player: Player, wrap: Callable[[str], Wrap]) -> list[Score]:
-        plan = self._plan
-        seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + plan.episodes)
+        settings = self._settings
+        seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + settings.episodes)
         return [
             score
-            for name, make_env in plan.held_out.items()
-            for score in evaluate(make_env, {name: player}, seeds, plan.most_steps, wrap=wrap(name))
+            for name, make_env in settings.held_out.items()
+            for score in evaluate(
+                make_env, {name: player}, seeds, settings.most_steps, wrap=wrap(name)
+            )
         ]
 
     def _wrap(self, name: str) -> Wrap:
         """What wraps the environment of an evaluation."""
-        plan = self._plan
-        if plan.diary is None:
+        settings = self._settings
+        if settings.diary is None:
             return lambda env: env
-        return plan.diary.of_evaluation(plan.folder, self._steps, name)
+        return settings.diary.of_evaluation(settings.folder, self._steps, name)
 
     def _normalization(self) -> Any:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
     def _note(self, steps: int, mean: float, scores: list[Score]) -> None:
         names = [score.name for score in scores]
-        path = self._plan.folder / EVALUATIONS
+        path = self._settings.folder / EVALUATIONS
         is_new = not path.exists()
         with path.open("a", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
@@ -478,8 +482,8 @@ class _Training:
     def _keep(self, **more: float) -> None:
         (env,) = self._venv.get_attr("unwrapped", 0)
         names = names_of(env)
-        facts = {"algorithm": self._plan.algorithm, "steps": self._steps, **names, **more}
-        save(self._plan.folder, self._model, self._normalization(), facts)
+        facts = {"algorithm": self._settings.algorithm, "steps": self._steps, **names, **more}
+        save(self._settings.folder, self._model, self._normalization(), facts)
 
 
 def _writer_to(tracker: Tracker, base: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The rooms of the package: imports run one way, and no two modules import each other."""
+"""The layers of the package: imports run one way, and no two modules import each other."""
 
 import ast
 import re
@@ -16,28 +16,28 @@ PACKAGE = Path(fmugym.__file__).parent
 
 ROOT = PACKAGE.parent
 RULE = "-" * 20
-"""In the picture: optional rooms are above it, the core is below."""
+"""In the picture: optional packages are above it, the core is below."""
 
 
 def picture():
-    """The house as CONTRIBUTING draws it: the storeys from the ground floor up, and the core."""
+    """The layers as CONTRIBUTING draws them: the lowest one first, and the core."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     (block,) = (b for b in re.findall(r"```text\n(.*?)```", text, re.DOTALL) if RULE in b)
     lines = [re.split(r"\s{2,}", line)[0] for line in block.splitlines()]
     below = lines[[line.startswith(RULE) for line in lines].index(True) + 1 :]
-    drawn = [storeys_on(line) for line in reversed(lines) if not line.startswith(RULE)]
-    return [rooms for line in drawn for rooms in line], {
-        room for line in below for rooms in storeys_on(line) for room in rooms
+    drawn = [layers_on(line) for line in reversed(lines) if not line.startswith(RULE)]
+    return [packages for line in drawn for packages in line], {
+        package for line in below for packages in layers_on(line) for package in packages
     }
 
 
-def storeys_on(line):
-    return [set(storey.split(", ")) for storey in line.split(" <- ")]
+def layers_on(line):
+    return [set(layer.split(", ")) for layer in line.split(" <- ")]
 
 
-STOREYS, CORE = picture()
-DOORS = {"fmugym.systems.system": "fmugym.systems.ssp.archives"}
-"""Where the core opens an optional room: ``FMUSystem.read``, of archives that need it."""
+LAYERS, CORE = picture()
+EXCEPTIONS = {"fmugym.systems.system": "fmugym.systems.ssp.archives"}
+"""Where the core opens an optional package: ``FMUSystem.read``, of archives that need it."""
 
 
 def module_of(path):
@@ -72,34 +72,35 @@ def imported_by(node):
     return {name for name in found if name.split(".")[0] == "fmugym"}
 
 
-def room_of(module):
+def package_of(module):
     parts = module.split(".")[1:] or ["__init__"]
     return "systems/ssp" if parts[:2] == ["systems", "ssp"] else parts[0]
 
 
-def test_the_picture_has_each_room_once():
-    drawn = [room for rooms in STOREYS for room in rooms]
-    assert sorted(drawn) == sorted({*map(room_of, MODULES), "_native"})
+def test_the_picture_has_each_package_once():
+    drawn = [package for packages in LAYERS for package in packages]
+    assert sorted(drawn) == sorted({*map(package_of, MODULES), "_native"})
 
 
-def test_a_room_imports_lower_storeys_only():
-    storey = {room: level for level, rooms in enumerate(STOREYS) for room in rooms}
+def test_a_package_imports_lower_storeys_only():
+    layer = {package: level for level, packages in enumerate(LAYERS) for package in packages}
     upwards = {
         module: name
         for module in MODULES
         for name in imports_of(module)
-        if room_of(name) != room_of(module) and storey[room_of(name)] >= storey[room_of(module)]
+        if package_of(name) != package_of(module)
+        and layer[package_of(name)] >= layer[package_of(module)]
     }
-    assert upwards == DOORS
+    assert upwards == EXCEPTIONS
 
 
-def test_the_core_opens_optional_rooms_in_functions_only():
+def test_the_core_opens_optional_packages_in_functions_only():
     found = []
-    for module in (module for module in MODULES if room_of(module) in CORE):
+    for module in (module for module in MODULES if package_of(module) in CORE):
         tree = tree_of(module)
         named = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
         at_import = {name for node in tree.body for name in imported_by(node)}
-        optional = [n for n in named & MODULES.keys() | at_import if room_of(n) not in CORE]
+        optional = [n for n in named & MODULES.keys() | at_import if package_of(n) not in CORE]
         found += [f"{module}: {name}" for name in optional]
     assert found == []
 
