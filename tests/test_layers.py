@@ -87,9 +87,8 @@ def test_a_package_imports_lower_storeys_only():
     upwards = {
         module: name
         for module in MODULES
-        for name in imports_of(module)
-        if package_of(name) != package_of(module)
-        and layer[package_of(name)] >= layer[package_of(module)]
+        for name, own in ((name, package_of(module)) for name in imports_of(module))
+        if package_of(name) != own and layer[package_of(name)] >= layer[own]
     }
     assert upwards == EXCEPTIONS
 

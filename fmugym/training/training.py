@@ -360,7 +360,8 @@ class _Training:
             count = settings.num_envs
             raise ConfigError(
                 f"{settings.algorithm} learns after every {between} steps ({name}="
-                f"{between // count} in {count} environments), more than the {settings.steps} of the training: give a smaller {name}, or fewer environments"
+                f"{between // count} in {count} environments), more than the {settings.steps} of "
+                f"the training: give a smaller {name}, or fewer environments"
             )
 
     def _tell_of_the_plan(self) -> None:
