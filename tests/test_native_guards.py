@@ -22,7 +22,7 @@ from fmugym.pool import PoolSpec
 from fmugym.pool.form import form_of_program, form_of_programs
 from fmugym.pool.health import no_counts
 from fmugym.pool.native import NativePool
-from fmugym.pool.recorded_inputs import record_in
+from fmugym.pool.recorded_inputs import inputs_in
 from fmugym.vector.hooks.program import CONSTANT, SLOT
 
 
@@ -110,7 +110,7 @@ class TestRecords:
         (state,) = pool.save_states(np.array([1]), True)
         pool.restore_states([state], np.array([0]))
         pool.step(np.full((1, 2), 9.0))
-        found = [record_in(*pool._form, one) for one in pool.save_states(np.arange(2), True)]
+        found = [inputs_in(*pool._form, one) for one in pool.save_states(np.arange(2), True)]
         for record in found:
             assert [variable.name for variable in record.variables] == ["x_0"]
             assert record.starts.tolist() == [0.25]
@@ -132,7 +132,7 @@ class TestRecords:
             starting = rng.random(n) < 0.005
         assert max(map(len, given)) > 64 > min(map(len, given))
         for own, state in zip(given, many.save_states(np.arange(n), True), strict=True):
-            assert record_in(*many._form, state).inputs[:, 0].tolist() == own
+            assert inputs_in(*many._form, state).inputs[:, 0].tolist() == own
         many.close()
 
     def test_that_are_damaged_are_none(self, pool):
@@ -143,7 +143,7 @@ class TestRecords:
             damaged = bytearray(state)
             damaged[place] ^= 0xFF
             try:
-                record_in(*pool._form, bytes(damaged))
+                inputs_in(*pool._form, bytes(damaged))
             except SimulationError as error:
                 told += "damaged" in str(error)
         assert told > 16
