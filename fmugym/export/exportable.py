@@ -21,7 +21,7 @@ __all__ = ["Agent", "agent_of"]
 
 _TAKEN: Final = frozenset(
     {"math", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string"}
-    | {"fmi2", "fmi3", "fmu_instance", "fmu_model"}
+    | {"agent_fmi2", "agent_fmi3", "fmu_instance", "fmu_model"}
     | {f"fmi{n}{part}" for n in (2, 3) for part in ("Functions", "FunctionTypes", "TypesPlatform")}
     | {"fmi3PlatformTypes"}
 )

@@ -81,7 +81,7 @@ def _write_sources(agent: Agent, fmi_version: str, folder: Path) -> str:
     ports = ports_of(agent, fmi_version)
     texts = {f"{agent.name}.h": header(agent), f"{agent.name}.c": source(agent)}
     own = resources.files("fmugym.export") / "sources"
-    for name in ("fmu_instance.h", f"fmi{fmi_version[0]}.c"):
+    for name in ("fmu_instance.h", f"agent_fmi{fmi_version[0]}.c"):
         texts[name] = (own / name).read_text(encoding="ascii")
     told = "\0".join([*texts.values(), *map(repr, ports)])
     token = f"{{{uuid.uuid5(uuid.NAMESPACE_URL, told)}}}"
@@ -164,7 +164,7 @@ def _binaries(
     agent: Agent, fmi_version: str, folder: Path, platforms: Sequence[str]
 ) -> dict[str, bytes]:
     """The libraries by their paths in the archive."""
-    sources, libraries = [f"{agent.name}.c", f"fmi{fmi_version[0]}.c"], dict[str, bytes]()
+    sources, libraries = [f"{agent.name}.c", f"agent_fmi{fmi_version[0]}.c"], dict[str, bytes]()
     for name in platforms:
         place = name if fmi_version == "3.0" else PLATFORMS[name].folder
         if place is None:
