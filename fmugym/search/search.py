@@ -57,7 +57,7 @@ _STARTS: Final = 3
 when that was so in each of these starts."""
 
 _BEST_PART: Final = 4
-"""This part of the candidates tells what observations are like."""
+"""This part of the candidates tells what observations are like, if there is a controller."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -267,9 +267,10 @@ class Search:
         self._contenders += [self._entrant(_Policies(_MIDDLE, form, scale)) for form in alone]
 
     def _scale(self, arena: Arena, history: Form, *agents: Agent) -> Scale:
-        """What observations are like while candidates add constants; those that do best count.
+        """What observations are like while candidates add constants to what agents decide.
 
-        Policies that are worth something see the like. Others may drive the process far away.
+        If there is a controller, only the best candidates count: policies that are worth something
+        see the like, while others may drive the process far away.
         """
         count = history.features
         seen: list[tuple[Merit, FloatArray]] = []
@@ -280,7 +281,8 @@ class Search:
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
             seen += zip(merits_of(outcome, self._limits), outcome.watched.sum(axis=1), strict=True)
             self.rounds += 1
-        best = sorted(seen, key=lambda one: one[0])[-len(seen) // _BEST_PART :]
+        part = 1 if agents[0].text is None else _BEST_PART
+        best = sorted(seen, key=lambda one: one[0])[-(len(seen) // part) :]
         moments = sum((one[1] for one in best), start=np.zeros(()))
         return Scale.of(moments, count)
 
