@@ -20,6 +20,7 @@ shown with ``printable``: it may quote an FMU.
 from __future__ import annotations
 
 import difflib
+import logging
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -43,6 +44,7 @@ __all__ = [
     "shown",
     "unknown_argument",
     "unknown_name",
+    "warn_once",
 ]
 
 _LONGEST: Final = 120
@@ -50,6 +52,8 @@ _LONGEST: Final = 120
 
 _LONGEST_REASON: Final = 400
 """Characters of another error that an error quotes, at most."""
+
+_warned: Final[set[str]] = set()
 
 
 def printable(text: object) -> str:
@@ -196,6 +200,13 @@ def _hint(name: object, known: Iterable[str]) -> str:
         return f"did you mean {near!r}?"
     listing = ", ".join(map(repr, names[:12])) + (", ..." if len(names) > 12 else "")
     return f"known are: {listing or 'none'}"
+
+
+def warn_once(logger: logging.Logger, text: str) -> None:
+    """Warn, unless this process has done so with the same text."""
+    if text not in _warned:
+        _warned.add(text)
+        logger.warning("%s", text)
 
 
 def nearest_name(name: object, known: Sequence[str]) -> str | None:

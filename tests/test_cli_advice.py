@@ -155,6 +155,11 @@ class TestEpisodeLength:
         }
         assert self.length_of(Task.from_dict(cart)) == (None, "")
 
+    def test_what_swings_for_long_gives_none(self):
+        """It passes where it will rest in a quarter of its period of 0.63 s."""
+        swinging = pendulum(time_step=0.05, episode_length=2.0, parameters={**HANGING, "b": 2e-5})
+        assert self.length_of(swinging) == (None, "")
+
     def test_it_is_told_beside_another_time_step(self):
         """And among the findings, in which nothing says that the length is fine."""
         house = {

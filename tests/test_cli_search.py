@@ -228,12 +228,33 @@ def words_after(text, mark):
     return words[: words.index("repeats")]
 
 
+CRANE = {
+    "fmu": {"bundled": "CartPole"},
+    "time_step": 0.05,
+    "episode_length": 15,
+    "variables": {"f": {"min": -20, "max": 20}},
+    "expressions": {"swing": {"expr": "theta + pi / 2", "min": -4, "max": 4}},
+    "parameters": {"theta_0": "-pi / 2"},
+    "setpoints": {"x_set": {"distribution": "uniform", "low": -3, "high": 3}},
+    "agent": {
+        "actions": ["f"],
+        "observations": ["x", "x_dot", "swing", "theta_dot", "x_set"],
+    },
+    "reward": "-abs(x - x_set) - 2 * abs(swing)",
+}
+"""A load hangs from a cart, which constant forces drive far away."""
+
+
 @pytest.mark.parametrize(
     ("task", "rounds", "target"),
-    [("fmugym/CartPole-v0", 40, 475), ("fmugym/CloudPendulum-v0", 100, -95)],
+    [("fmugym/CartPole-v0", 40, 475), ("fmugym/CloudPendulum-v0", 100, -95), (CRANE, 150, -75)],
+    ids=["cart-pole", "cloud-pendulum", "crane"],
 )
 def test_targets_are_reached(task, rounds, target, tmp_path, capsys):
     """By the mean of 100 episodes of the test."""
+    if task is CRANE:
+        task = tmp_path / "crane.toml"
+        fmugym.Task.from_dict(CRANE).write(task)
     options = "--output", tmp_path / "a", "--rounds", rounds, "--json"
     code, out, err = run(capsys, "train", task, *options)
     assert code == 0, err

@@ -8,6 +8,7 @@ import pytest
 from pythonfmu.builder import FmuBuilder
 
 import fmugym
+from fmugym import errors
 from fmugym.testing import check_fmu_env
 
 OUTPUTS = ("level", "overflowing", "switches")
@@ -58,6 +59,14 @@ def directly(area):
 
 def outputs_of(tank):
     return tuple(float(getattr(tank, name)) for name in OUTPUTS)
+
+
+def test_the_need_of_a_tool_is_told_once(tank_fmu, caplog, monkeypatch):
+    """A search opens an FMU many times."""
+    monkeypatch.setattr(errors, "_warned", set())
+    for _ in range(2):
+        TankEnv(tank_fmu).close()
+    assert caplog.text.count("Tank.fmu needs the tool that exported it to run") == 1
 
 
 def test_random_episodes_equal_the_class_itself(env):

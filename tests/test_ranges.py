@@ -9,7 +9,7 @@ from fmu_tools import PlainEnv, edited_fmu
 from scipy import stats
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv, LogUniform, Normal, Uniform
+from fmugym import Choice, ConfigError, FMUVectorEnv, LogUniform, Normal, Uniform, errors
 from fmugym.task import ranges
 from fmugym.testing import check_fmu_env
 
@@ -219,7 +219,7 @@ class TestTruncated:
             make(c=Stuck()).reset(seed=0)
 
     def test_the_log_says_so_once(self, make, text, caplog, monkeypatch):
-        monkeypatch.setattr(ranges, "_told", set())
+        monkeypatch.setattr(errors, "_warned", set())
         with caplog.at_level(logging.WARNING):
             for _ in range(2):
                 make(c=stats.norm(0.5, 0.25)).reset(seed=0)

@@ -21,9 +21,8 @@ Merit = tuple[float, float]
 NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
 
 MOST_EPISODES: Final = 64
-_AGREEMENT: Final = 0.1
-"""If the ranks by two halves of the episodes correlate less, a round has too few of them. Many
-rounds of few episodes find more: with 0.3, rewards of the house were 0.6 lower."""
+_AGREEMENT: Final = 0.3
+"""If the ranks by two halves of the episodes correlate less, a round has too few of them."""
 
 _FADE: Final = 0.1
 """The part of the way by which one round moves the mean correlation, which chance would reach soon

@@ -56,6 +56,9 @@ _STARTS: Final = 3
 """A class that leads and gains nothing in so many rounds starts anew from its best weights. It goes
 when that was so in each of these starts."""
 
+_BEST_PART: Final = 4
+"""This part of the candidates tells what observations are like, if there is a controller."""
+
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
 
@@ -264,16 +267,23 @@ class Search:
         self._contenders += [self._entrant(_Policies(_MIDDLE, form, scale)) for form in alone]
 
     def _scale(self, arena: Arena, history: Form, *agents: Agent) -> Scale:
-        """What observations are like while each candidate adds another constant."""
+        """What observations are like while candidates add constants to what agents decide.
+
+        If there is a controller, only the best candidates count: policies that are worth something
+        see the like, while others may drive the process far away.
+        """
         count = history.features
-        moments: FloatArray = np.zeros(())
+        seen: list[tuple[Merit, FloatArray]] = []
         for agent in agents:
             rows = history.constants(self._rng.uniform(-1, 1, (_MANY, history.acting)))
             make = _Policies(agent, history, Scale(np.zeros(count), np.ones(count), None))
             seeds = self._training(self.episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
-            moments = moments + outcome.watched.sum(axis=(0, 1))
+            seen += zip(merits_of(outcome, self._limits), outcome.watched.sum(axis=1), strict=True)
             self.rounds += 1
+        part = 1 if agents[0].text is None else _BEST_PART
+        best = sorted(seen, key=lambda one: one[0])[-(len(seen) // part) :]
+        moments = sum((one[1] for one in best), start=np.zeros(()))
         return Scale.of(moments, count)
 
     # Who wins.

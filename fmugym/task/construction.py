@@ -20,7 +20,7 @@ from gymnasium import spaces
 from fmugym.checks import check_mapping
 from fmugym.config import EnvConfig
 from fmugym.distributions import as_distribution, support_of
-from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
+from fmugym.errors import ConfigError, SimulationError, shown, unknown_name, warn_once
 from fmugym.pool import Pool, PoolSpec
 from fmugym.signals import ordinary
 from fmugym.systems import FMUSystem
@@ -156,7 +156,8 @@ class Constructed(Pictured):
                 *(type(self).__name__, method, hook),
             )
         if self.fmu.description.capabilities.needs_execution_tool:
-            self.logger.warning("%s needs the tool that exported it to run", self.fmu.path.name)
+            name = self.fmu.path.name
+            warn_once(self.logger, f"{name} needs the tool that exported it to run")
 
     def _prepare_values(self) -> None:
         """Set what hooks may read to what it is before the first reset."""

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from fmugym.archive.variable import Variable
 from fmugym.distributions import is_distribution, support_of, truncated
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, shown, warn_once
 
 __all__ = ["within"]
 
@@ -18,7 +18,6 @@ _OF_FMU: Final = (
 _GIVEN: Final = "the range that the task gives"
 
 logger = logging.getLogger(__name__)
-_told: Final[set[str]] = set()
 
 
 def within(variable: Variable, value: Any) -> Any:
@@ -52,7 +51,7 @@ def within(variable: Variable, value: Any) -> Any:
         own = truncated(value, low, high)
     except ConfigError as error:
         raise _outside(variable, text, error) from None
-    _tell_once(f"{variable.name!r} is drawn again until it lies between {text}")
+    warn_once(logger, f"{variable.name!r} is drawn again until it lies between {text}")
     return own
 
 
@@ -73,9 +72,3 @@ def _lies_in(low: float, value: float, high: float) -> bool:
 
 def _outside(variable: Variable, wanted: str, found: object) -> ConfigError:
     return ConfigError(f"{variable.name!r} must lie between {wanted}; got {found}")
-
-
-def _tell_once(text: str) -> None:
-    if text not in _told:
-        _told.add(text)
-        logger.warning(text)

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from fmugym.archive.variable import Variable
+from fmugym.pool.base import FloatArray
 from fmugym.tools.accuracy import Replay
 from fmugym.tools.advice import Advice, Doubt, rounded_down
 
@@ -67,21 +68,26 @@ def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
 def _time_constants(replay: Replay, steps: int) -> dict[Variable, float]:
     """How long real outputs take to follow constant inputs, in s; 0 if they never change.
 
+    The time at which one comes near the value where it rests counts: what swings has it soon.
     Outputs that do not settle, such as positions and levels, have none.
     """
     outputs = [one for one in replay.spec.outputs if one.kind == "real"]
     held = replace(replay, inputs=np.repeat(replay.inputs[:1], _STEPS, axis=0))
     found: dict[Variable, float] = {}
+    courses: list[tuple[float, FloatArray]] = []  # the changes, and the step that they have
     for factor in (max(1, round(steps / _STEPS_OF_AN_EPISODE)) * one for one in _FACTORS):
         time_step = factor * replay.spec.time_step
         substeps = min(factor, _MOST_SUBSTEPS) * replay.spec.substeps
         course = held.run(time_step=time_step, substeps=substeps, stop_time=None)
         if course is None or not course.is_whole or not np.isfinite(course.outputs).all():
             break
-        for output, values in zip(outputs, course.outputs.T, strict=True):
-            away = np.abs(values - values[0])
+        courses.append((time_step, np.abs(course.outputs - course.outputs[0]).T))
+        for index, output in enumerate(outputs):
+            away = courses[-1][1][index]
             if np.ptp(away[_STEPS // 2 :]) <= _SETTLED * away[-1]:
-                found.setdefault(output, time_step * int(np.argmax(away >= _RISEN * away[-1])))
+                risen = ((step, rows[index] >= _RISEN * away[-1]) for step, rows in courses)
+                first = next(step * int(np.argmax(has)) for step, has in risen if has.any())
+                found.setdefault(output, first)
         if len(found) == len(outputs) or course.seconds > _SLOW:
             break
     return found
