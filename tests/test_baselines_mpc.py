@@ -405,7 +405,9 @@ class TestRefusals:
             def _get_inputs(self):
                 return 10.0 * self.action[0]
 
-        with pytest.raises(ConfigError, match="numbers or one choice"):
+        with pytest.raises(
+            ConfigError, match="gives one number, but the action space is MultiDiscrete"
+        ):
             bound().bind(opened(Several))
 
     def test_of_plants(self, opened, bound):

@@ -189,18 +189,13 @@ def warning_of_one_reward(scores: Sequence[Score]) -> str | None:
 
 
 def table(scores: Sequence[Score]) -> str:
-    """Format scores for a terminal: lines of printable ASCII."""
+    """Format scores for a terminal: lines of printable ASCII, without empty columns."""
     kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
-    gain = ("gain", "+-") if any(score.gains for score in scores) else ()
-    more = *gain, "cost", "steps", "ends", *map(plain, kpis), "x real time"
-    header = ("", "reward", "+-", *more)
-    pairs = zip(_labels(scores), scores, strict=True)
-    rows = [header, *(_row(*pair, kpis, has_gain=bool(gain)) for pair in pairs)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
+    names = "reward", "+-", "gain", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time"
+    rows = [_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True)]
+    columns = [one for one in zip(("", *names), *rows, strict=True) if any(one[1:])]
+    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+    return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))
 
 
 def _labels(scores: Sequence[Score]) -> list[str]:
@@ -210,11 +205,11 @@ def _labels(scores: Sequence[Score]) -> list[str]:
     return [plain(f"{score.name} ({score.scenario})") for score in scores]
 
 
-def _row(label: str, score: Score, kpis: Sequence[str], *, has_gain: bool) -> tuple[str, ...]:
+def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
     return (
         label,
         *_mean_and_half(score.rewards),
-        *(_mean_and_half(score.gains) if has_gain else ()),
+        *_mean_and_half(score.gains),
         f"{np.mean(score.costs):.6g}" if score.costs else "",
         f"{np.mean(score.steps):.6g}",
         ", ".join(f"{count} {end}" for end, count in score.ends.items()),
