@@ -483,6 +483,14 @@ class TestCommandLine:
             assert float(row[4]) == pytest.approx(gain, abs=2e-3)
             assert 0 < float(row[5]) < 0.5 * float(row[3])
 
+    def test_thinking_ahead_costs_least_in_a_house(self, capsys):
+        pid, ahead = "pid of=T setpoint=21 kp=1.3 ti=2000", "mpc horizon=24h candidates=64"
+        asked = [word for name in (pid, ahead) for word in ("--controller", name)]
+        played = ["--scenario", "frost", "--steps", "192", "--episodes", "1", "--json"]
+        assert main(["evaluate", "fmugym/House-v0", *asked, *played]) == 0
+        _, tuned, planned = json.loads(capsys.readouterr().out)["scores"]
+        assert planned["mean_reward"] > 0.98 * tuned["mean_reward"]
+
     def test_training_compares_it_where_there_is_time(self, tmp_path, capsys):
         given = {
             "pi": "pid of=q_dot setpoint=1 kp=0.1..4",
