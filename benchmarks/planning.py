@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import statistics
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -87,7 +88,8 @@ def _measure(table: Table, case: Case, folder: Path, quick: bool) -> None:
     seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + (1 if quick else case.episodes))
     found: dict[str, list[Score]] = {}
     for scenario in case.scenarios:
-        make = partial(fmugym.load, folder / case.task, scenario=scenario)
+        options = {"scenario": scenario, "log_level": logging.ERROR}
+        make = partial(fmugym.load, folder / case.task, **options)
         players = _players(case, folder, facts, scenario)
         for score in evaluate(make, players, seeds, 2 if quick else 10_000, scenario):
             found.setdefault(score.name, []).append(score)
