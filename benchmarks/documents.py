@@ -7,6 +7,7 @@ from contextlib import ExitStack
 
 import cart_poles
 import gymnasium as gym
+import planning
 import single
 import tasks
 import training
@@ -121,12 +122,20 @@ def _single_makers(stack: ExitStack, ours: str, theirs: str) -> dict[str, Callab
 
 def _training(effort: Effort) -> list[Table]:
     """The table of docs/training.md, which tells in its text who reached what is wanted."""
-    (table,) = training.tables(effort)
-    place = table.header.index("reached by")
+    return [_without("reached by", table) for table in training.tables(effort)]
+
+
+def _planning(effort: Effort) -> list[Table]:
+    """The table of docs/training.md that has planning, too; times are told elsewhere."""
+    return [_without("time of a step", table) for table in planning.tables(effort)]
+
+
+def _without(column: str, table: Table) -> Table:
+    place = table.header.index(column)
     table.header, *table.rows = (
         row[:place] + row[place + 1 :] for row in (table.header, *table.rows)
     )
-    return [table]
+    return table
 
 
 DOCUMENTS: dict[str, Callable[[Effort], list[Table]]] = {
@@ -134,5 +143,6 @@ DOCUMENTS: dict[str, Callable[[Effort], list[Table]]] = {
     "vector": _vector,
     "hooks": _hooks,
     "training": _training,
+    "planning": _planning,
 }
 """What measures the tables of the README and of pages of docs/."""

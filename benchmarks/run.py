@@ -29,6 +29,7 @@ import isolation
 import loaded
 import memory
 import overlap
+import planning
 import reset
 import rollouts
 import single
@@ -54,6 +55,7 @@ SECTIONS: dict[str, Callable[[Effort], list[Table]]] = {
     "windows": windows.tables,
     "overlap": overlap.tables,
     "training": training.tables,
+    "planning": planning.tables,
     "memory": memory.tables,
     "loaded": loaded.tables,
 }

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from measure import Effort
 from tables import Table
 
-__all__ = ["tables"]
+__all__ = ["Goal", "tables", "train", "write_plants"]
 
 HERE = Path(__file__).parent
 SEEDS = range(5)
@@ -88,26 +88,28 @@ def tables(effort: Effort) -> list[Table]:
     """Measure."""
     table = Table("Rewards in test episodes, by `fmugym train TASK` from five seeds", HEADER)
     with tempfile.TemporaryDirectory() as folder:
-        _write_plants(Path(folder))
+        write_plants(Path(folder))
         for goal in GOALS[:1] if effort.quick else GOALS:
             seeds = SEEDS[:1] if effort.quick else SEEDS
-            runs = [_run(goal, seed, Path(folder), effort.quick) for seed in seeds]
+            runs = [train(goal, seed, Path(folder), effort.quick) for seed in seeds]
             table.rows.append(_row(goal, runs))
             table.data += [{"task": goal.task, **run} for run in runs]
     return [table]
 
 
-def _write_plants(folder: Path) -> None:
+def write_plants(folder: Path) -> None:
+    """Write the tasks of the drive and the room, and build their FMUs."""
     import fmugym
 
     for name, task in (("drive", DRIVE), ("room", ROOM)):
         script = HERE / f"plant_{name}.py"
         build = [sys.executable, "-m", "pythonfmu", "build", "-f", str(script), "-d", str(folder)]
+        build.append("--handle-state")  # plans begin in saved states
         subprocess.run(build, check=True, capture_output=True)
         fmugym.Task.from_dict(task, folder).write(folder / f"{name}.toml")
 
 
-def _run(goal: Goal, seed: int, folder: Path, quick: bool) -> dict[str, Any]:
+def train(goal: Goal, seed: int, folder: Path, quick: bool) -> dict[str, Any]:
     """Train once; the facts of the agent, and the seconds with the test and the start."""
     begin = time.perf_counter()
     output = folder / f"{goal.task.replace('/', '-')}-{seed}"
@@ -121,7 +123,7 @@ def _run(goal: Goal, seed: int, folder: Path, quick: bool) -> dict[str, Any]:
         cwd=folder,
     )
     facts: dict[str, Any] = json.loads(done.stdout)
-    return {"seed": seed, "seconds": time.perf_counter() - begin, **facts}
+    return {"seed": seed, "folder": str(output), "seconds": time.perf_counter() - begin, **facts}
 
 
 def _row(goal: Goal, runs: list[dict[str, Any]]) -> list[str]:

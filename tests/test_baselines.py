@@ -282,7 +282,10 @@ class TestMistakes:
 
     def test_observations_without_names(self):
         env = gym.make("fmugym/Pendulum-v0")
-        with pytest.raises(fmugym.ConfigError, match=r"have no names.*give bind"):
+        with pytest.raises(
+            fmugym.ConfigError,
+            match=r"have no names.*'fmugym new .*Pendulum.fmu --output .*give bind",
+        ):
             Constant([0.0]).bind(env)
         Constant([0.0]).bind(env, names=["cos", "sin", "rate"]).act(np.zeros(3))
         env.close()

@@ -1,12 +1,12 @@
 """Model predictive control: plans, what they assume of the future, and where they begin."""
 
 import json
+import re
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
-from PIL import Image
 from test_assumed_rollouts import DT, HOUR, WHEEL
 
 import fmugym
@@ -405,7 +405,9 @@ class TestRefusals:
             def _get_inputs(self):
                 return 10.0 * self.action[0]
 
-        with pytest.raises(ConfigError, match="numbers or one choice"):
+        with pytest.raises(
+            ConfigError, match="gives one number, but the action space is MultiDiscrete"
+        ):
             bound().bind(opened(Several))
 
     def test_of_plants(self, opened, bound):
@@ -430,19 +432,64 @@ class TestCommandLine:
         fmugym.Task.of(wheel(controllers={"ahead": "mpc horizon=1h candidates=64"})).write(path)
         return str(path)
 
-    def test_compares_it_with_others(self, path, tmp_path, capsys):
-        perfect = "mpc horizon=1h candidates=64 perfect=true"
-        names = ["pid of=q_dot setpoint=1 kp=1", "ahead", perfect]
+    @pytest.fixture
+    def everyone(self, tmp_path, capsys, monkeypatch):
+        """Who is compared, and the options for it; starts are drawn."""
+        start = {"distribution": "uniform", "low": -0.5, "high": 0.5}
+        ahead = "mpc horizon=1h candidates=64"
+        given = {"pi": "pid of=q_dot setpoint=1 kp=1", "ahead": ahead}
+        task = wheel(controllers=given, parameters=WHEEL["parameters"] | {"q_dot_0": start})
+        monkeypatch.chdir(tmp_path)
+        fmugym.Task.of(task).write(tmp_path / "drawn.toml")
+        trained = ["--output", "agent", "--rounds", "9", "--episodes", "1"]
+        assert main(["train", "drawn.toml", *trained]) == 0
+        capsys.readouterr()
+        names = ["pi", "ahead", f"{ahead} perfect=true"]
         asked = [word for name in names for word in ("--controller", name)]
-        plot = tmp_path / "scores.png"
-        options = ["--steps", "8", "--episodes", "2", "--plot", str(plot), "--json"]
-        assert main(["evaluate", path, *asked, *options]) == 0
+        played = ["--agent", "agent", "--steps", "8", "--episodes", "3"]
+        return [*names, "agent"], ["drawn.toml", *asked, *played]
+
+    def test_compares_it_with_others(self, everyone, tmp_path, capsys):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        names, options = everyone
+        picture = tmp_path / "scores.svg"
+        assert main(["evaluate", *options, "--plot", str(picture), "--json"]) == 0
         scores = json.loads(capsys.readouterr().out)["scores"]
-        found = {score["name"]: score["mean_reward"] for score in scores}
-        assert found[names[0]] < found["ahead"]
-        assert found[perfect] == pytest.approx(found["ahead"], abs=0.02)
-        with Image.open(plot) as image:
-            assert image.size[1] > 300
+        pid, ahead, perfect, agent = (next(s for s in scores if s["name"] == n) for n in names)
+        assert pid["gains"] == []
+        for one in (ahead, perfect, agent):
+            gains = np.subtract(one["rewards"], pid["rewards"])
+            assert one["gains"] == gains.tolist()
+            low, high = one["gain_interval_95"]
+            assert 0 < low < one["mean_gain"] == gains.mean() < high
+            assert high - low < 0.5 * np.ptp(one["interval_95"])
+        assert perfect["mean_reward"] == pytest.approx(ahead["mean_reward"], abs=0.02)
+        drawn = re.findall("<!-- (.*?) -->", picture.read_text(), re.DOTALL)
+        assert "gain beside" in "".join(drawn)
+        assert [text for text in drawn if text in names] == [*names, names[0]]
+
+    def test_a_report_shows_it_beside_others(self, everyone, tmp_path):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        names, options = everyone
+        page = tmp_path / "report.html"
+        assert main(["simulate", *options, "--output", str(page)]) == 0
+        means = page.read_text().split("<table>")[1].replace("\u2212", "-")
+        head, *rows = (re.findall("<t[dh].*?>(.*?)</t", row) for row in means.split("<tr>")[1:])
+        assert head == ["", "episodes", "reward", "± (95 %)", "gain", "± (95 %)"]
+        assert [row[0] for row in rows] == names
+        assert rows[0][4:] == ["", ""]
+        for row in rows[1:]:
+            gain = float(row[2]) - float(rows[0][2])
+            assert float(row[4]) == pytest.approx(gain, abs=2e-3)
+            assert 0 < float(row[5]) < 0.5 * float(row[3])
+
+    def test_thinking_ahead_costs_least_in_a_house(self, capsys):
+        pid, ahead = "pid of=T setpoint=21 kp=1.3 ti=2000", "mpc horizon=24h candidates=64"
+        asked = [word for name in (pid, ahead) for word in ("--controller", name)]
+        played = ["--scenario", "frost", "--steps", "192", "--episodes", "1", "--json"]
+        assert main(["evaluate", "fmugym/House-v0", *asked, *played]) == 0
+        _, tuned, planned = json.loads(capsys.readouterr().out)["scores"]
+        assert planned["mean_reward"] > 0.98 * tuned["mean_reward"]
 
     def test_training_compares_it_where_there_is_time(self, tmp_path, capsys):
         given = {

@@ -120,8 +120,9 @@ class Controller(KnownArguments, ABC):
         names: tuple[str, ...] | None = attribute_of(env, "observation_names")
         if names is None:
             raise ConfigError(
-                "the elements of these observations have no names, because a hook makes them; give "
-                "bind their names in order"
+                "the elements of these observations have no names, because a hook makes them: play "
+                f"a task file, as 'fmugym new {attribute_of(env, 'fmu').path} --output task.toml' "
+                "writes one, or give bind their names in order"
             )
         return names
 

@@ -139,7 +139,7 @@ class MPC(Controller):
 
     def _prepare(self) -> None:
         self.close()
-        self._low, self._high = _limits(self.space)
+        self._low, self._high = self._sides()
         steps = round(self.horizon / self.time_step)
         if steps < 1:
             raise ConfigError(
@@ -153,11 +153,22 @@ class MPC(Controller):
         self._prototype = self._copies.inside.prototype
         self._cost_limits = getattr(self._prototype, "cost_limits", {})
         future = self._prototype.inside.future or Future({}, (), float)
-        self._places = [self._place_of(name) for name in self.states]
+        for name in self.states:
+            self._check_signal("states", name)
+        self._places = list(map(self.names.index, self.states))
         self._require_fit(future)
         self._foresight = _Foresight(self.names, future, self.time_step, steps)
         self._warm = self._bound_warm()
         self._inverse: FloatArray | None = None
+
+    def _sides(self) -> list[FloatArray]:
+        """The lowest and the highest numbers of an action."""
+        space: Any = self.space
+        limits = (space.low, space.high) if isinstance(space, spaces.Box) else self._limits()
+        sides = [np.ravel(one).astype(np.float64) for one in limits]
+        if not np.isfinite(sides).all():
+            raise ConfigError("MPC needs actions with limits: give their variables 'min' and 'max'")
+        return sides
 
     @property
     def _copied(self) -> FMUVectorEnv:
@@ -169,13 +180,13 @@ class MPC(Controller):
         """What makes copies."""
         if self.model is not None:
             return self.model
-        with _single(self._env, 0) as env:
-            if env.inside.pool.save_method is None:
-                raise ConfigError(
-                    "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
-                    "'model', a function that makes the environment to plan with"
-                )
-            return partial(copy.copy, env)
+        env = attribute_of(self._env, "unwrapped")
+        if env.inside.pool.save_method is None:
+            raise ConfigError(
+                "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
+                "'model', a function that makes the environment to plan with"
+            )
+        return partial(copy.copy, env)
 
     def _require_fit(self, future: Future) -> None:
         """Refuse a model of another task, a horizon beyond the data, and states beside data."""
@@ -198,10 +209,6 @@ class MPC(Controller):
                 "MPC takes 'states' for tasks without data only, but there is "
                 f"{min(future.lookups)!r}"
             )
-
-    def _place_of(self, name: str) -> int:
-        self._check_signal("states", name)
-        return self.names.index(name)
 
     def _bound_warm(self) -> list[Controller]:
         """The simple controllers, bound to the copies."""
@@ -318,8 +325,7 @@ class MPC(Controller):
     ) -> tuple[Snapshot, dict[str, Any], dict[str, Any]]:
         """Where candidates begin, the data that they assume, and more arguments of rollouts."""
         if self.perfect:
-            is_vector = hasattr(self._env, "num_envs")
-            return self._env.save_state(*([[index]] if is_vector else [])), {}, {}
+            return self._env.save_state(*([[index]] if self._is_vector else [])), {}, {}
         if self.states:
             return self._moved(episode, row), {}, {"seed": self.seed}
         assert self._inverse is not None
@@ -349,9 +355,8 @@ class MPC(Controller):
     def _actions(self, plans: FloatArray) -> Any:
         """The actions of plans of shape (n, steps, m), shape (n, steps, ...)."""
         values = self._low + plans * (self._high - self._low)
-        if isinstance(self.space, spaces.Discrete):
-            return np.rint(values[..., 0]).astype(self.space.dtype)
-        return values.reshape(*values.shape[:2], *self.space.shape or ()).astype(self.space.dtype)
+        actions = self._as_actions(values.reshape(-1, self._low.size))
+        return actions.reshape(*plans.shape[:2], *actions.shape[1:])
 
     def _search(
         self, episode: _Episode, start: Snapshot, assumed: Mapping[str, Any], row: FloatArray
@@ -572,19 +577,6 @@ class _Foresight:
             values = [before[places[0]], row[places[0]]] if places else [self._means[name]] * 2
             found[name] = [now - self._time_step, now], values
         return found
-
-
-def _limits(space: spaces.Space[Any]) -> tuple[FloatArray, FloatArray]:
-    """The lowest and the highest numbers of an action."""
-    if isinstance(space, spaces.Discrete):
-        first = float(space.start)
-        return np.array([first]), np.array([first + float(space.n) - 1])
-    if not isinstance(space, spaces.Box):
-        raise ConfigError(f"MPC needs actions of numbers or one choice, but they are of {space}")
-    low, high = (np.asarray(side, np.float64).ravel() for side in (space.low, space.high))
-    if not np.isfinite([low, high]).all():
-        raise ConfigError("MPC needs actions with limits: give their variables 'min' and 'max'")
-    return low, high
 
 
 @contextmanager

@@ -35,6 +35,9 @@ _LEAST_WIDTH: Final = 0.01
 
 _LONGEST_LABEL: Final = 48
 
+_RANDOM: Final = "random"
+"""The name of random actions, beside which nobody wants to know a gain."""
+
 Wrap = Callable[[FMUEnv], Any]
 """Puts wrappers around an environment."""
 
@@ -53,6 +56,8 @@ class Score:
         scenario: The scenario of the episodes; None for those of the task.
         kpis: The KPIs of the episodes that have reported some, by name.
         only_reward: The reward of every step of all episodes; None if it has changed.
+        gains: How much more reward each episode has brought than the same episode of the first
+            player, random actions aside; empty for those two.
     """
 
     name: str
@@ -64,6 +69,7 @@ class Score:
     scenario: str | None = None
     kpis: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     only_reward: float | None = None
+    gains: tuple[float, ...] = ()
 
     @property
     def mean(self) -> float:
@@ -77,6 +83,8 @@ class Score:
             "interval_95": _interval(self.rewards),
             "mean_cost": float(np.mean(self.costs)) if self.costs else None,
             "cost_interval_95": _interval(self.costs),
+            "mean_gain": float(np.mean(self.gains)) if self.gains else None,
+            "gain_interval_95": _interval(self.gains),
             "mean_kpis": {name: float(np.mean(values)) for name, values in self.kpis.items()},
         }
 
@@ -110,7 +118,7 @@ def evaluate(
     Yields:
         A score for each player, in their order, as soon as it is known.
     """
-    seeds = list(seeds)
+    seeds, first = list(seeds), tuple[float, ...]()
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form
         for name, player in players.items():
@@ -125,12 +133,20 @@ def evaluate(
                 episodes.extend(each)
             except KeyboardInterrupt:
                 if episodes:
-                    yield _score(name, episodes, perf_counter() - begin, scenario)
+                    yield _score(name, episodes, perf_counter() - begin, scenario, first)
                 raise
-            yield _score(name, episodes, perf_counter() - begin, scenario)
+            score = _score(name, episodes, perf_counter() - begin, scenario, first)
+            yield score
+            first = first or (score.rewards if name != _RANDOM else ())
 
 
-def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | None) -> Score:
+def _score(
+    name: str,
+    episodes: Sequence[Summary],
+    took: float,
+    scenario: str | None,
+    first: Sequence[float],
+) -> Score:
     ends = ["fault" if one.end.startswith("fault") else one.end for one in episodes]
     names = dict.fromkeys(kpi for one in episodes for kpi in one.kpis)
     return Score(
@@ -143,6 +159,7 @@ def _score(name: str, episodes: Sequence[Summary], took: float, scenario: str | 
         scenario,
         {n: tuple(one.kpis[n] for one in episodes if n in one.kpis) for n in names},
         _only(one.only_reward for one in episodes),
+        tuple(one.total_reward - other for one, other in zip(episodes, first, strict=False)),
     )
 
 
@@ -172,15 +189,13 @@ def warning_of_one_reward(scores: Sequence[Score]) -> str | None:
 
 
 def table(scores: Sequence[Score]) -> str:
-    """Format scores for a terminal: lines of printable ASCII."""
+    """Format scores for a terminal: lines of printable ASCII, without empty columns."""
     kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
-    header = ("", "reward", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time")
-    rows = [header, *(_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True))]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
+    names = "reward", "+-", "gain", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time"
+    rows = [_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True)]
+    columns = [one for one in zip(("", *names), *rows, strict=True) if any(one[1:])]
+    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+    return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))
 
 
 def _labels(scores: Sequence[Score]) -> list[str]:
@@ -191,11 +206,10 @@ def _labels(scores: Sequence[Score]) -> list[str]:
 
 
 def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
-    half = confidence(score.rewards)
     return (
         label,
-        f"{score.mean:.6g}",
-        "" if half is None else f"{half:.3g}",
+        *_mean_and_half(score.rewards),
+        *_mean_and_half(score.gains),
         f"{np.mean(score.costs):.6g}" if score.costs else "",
         f"{np.mean(score.steps):.6g}",
         ", ".join(f"{count} {end}" for end, count in score.ends.items()),
@@ -204,8 +218,14 @@ def _row(label: str, score: Score, kpis: Sequence[str]) -> tuple[str, ...]:
     )
 
 
+def _mean_and_half(values: Sequence[float]) -> tuple[str, str]:
+    half = confidence(values)
+    mean = f"{np.mean(values):.6g}" if values else ""
+    return mean, "" if half is None else f"{half:.3g}"
+
+
 def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
-    """Draw rewards and costs: each episode, the mean, and its 95 % confidence interval.
+    """Draw rewards, gains and costs: each episode, the mean, and its 95 % confidence interval.
 
     Random actions are left out beside two others or more if they are worse than all of these: often
     by so much that the others could not be told apart.
@@ -221,6 +241,9 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     figures: Any = imported("matplotlib.figure", "plot")
     scores = _worth_drawing(scores)
     groups = {"reward of an episode": [score.rewards for score in scores]}
+    if any(score.gains for score in scores):
+        first = next(score.name for score in scores if score.name != _RANDOM)
+        groups[f"gain beside\n{_shortened(first)}"] = [score.gains for score in scores]
     if all(score.costs for score in scores):
         groups["cost of an episode"] = [score.costs for score in scores]
     figure = figures.Figure(
@@ -228,6 +251,8 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
     )
     axes = figure.subplots(1, len(groups), sharey=True, squeeze=False)[0]
     for axis, (label, values) in zip(axes, groups.items(), strict=True):
+        if label.startswith("gain"):
+            axis.axvline(0.0, color="#333333", linewidth=0.8)
         _draw_scores(axis, values)
         axis.set_xlabel(label)
     axes[0].set_yticks(range(len(scores)), list(map(_shortened, _labels(scores))))
@@ -237,8 +262,8 @@ def plot_scores(scores: Sequence[Score], path: Path, title: str) -> None:
 
 
 def _worth_drawing(scores: Sequence[Score]) -> Sequence[Score]:
-    others = [score for score in scores if score.name != "random"]
-    randoms = [np.mean(score.rewards) for score in scores if score.name == "random"]
+    others = [score for score in scores if score.name != _RANDOM]
+    randoms = [np.mean(score.rewards) for score in scores if score.name == _RANDOM]
     if not randoms or len({score.name for score in others}) < 2:
         return scores
     return others if max(randoms) < min(np.mean(score.rewards) for score in others) else scores
@@ -251,6 +276,8 @@ def _shortened(text: str) -> str:
 
 def _draw_scores(axis: Any, groups: Sequence[Sequence[float]]) -> None:
     for row, values in enumerate(groups):
+        if not values:
+            continue
         axis.plot(values, [row] * len(values), "o", color="#9aa5ae", markersize=4, alpha=0.6)
         half = confidence(values) or 0.0
         style = {"capsize": 4, "markersize": 6, "linewidth": 1.6}

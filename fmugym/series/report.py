@@ -154,6 +154,9 @@ def _results(
     if any(len(episodes) > 1 for episodes in found.values()):
         yield "<h3>Means over the episodes of each run</h3>"
         yield _means(found, figures)
+        if len(found) > 1:
+            first = escape(next(iter(found)))
+            yield f'<p class="soft">Gain: the reward beside that of {first}, by episodes.</p>'
         yield "<h3>Each episode</h3>"
     several = len({one.environment for _, one in rows}) > 1
     header = ["", *(["environment"] if several else []), "episode", *figures.header]
@@ -197,16 +200,25 @@ class _Figures:
 def _means(found: Mapping[str, Sequence[EpisodeSummary]], figures: _Figures) -> str:
     means = {name: _mean(episodes) for name, episodes in found.items() if episodes}
     best = max(one.reward for one in means.values()) if len(means) > 1 else None
-    cells = [
-        [
-            _text(name, "first"),
-            _cell(str(len(found[name]))),
-            _cell(_number(confidence([episode.reward for episode in found[name]]))),
-            *figures.cells(one, "best" if one.reward == best else ""),
-        ]
-        for name, one in means.items()
-    ]
-    return _table(["", "episodes", "± (95 %)", *figures.header], cells)
+    gain = ["gain", "± (95 %)"] if len(means) > 1 else []
+    reward, *others = figures.header
+    header = ["", "episodes", reward, "± (95 %)", *gain, *others]
+    rows = []
+    for name, one in means.items():
+        cell, *more = figures.cells(one, "best" if one.reward == best else "")
+        half = _number(confidence([episode.reward for episode in found[name]]))
+        gains = _gains(found[name], next(iter(found.values())))
+        both = [fmean(gains) if gains else None, confidence(gains)][: len(gain)]
+        told = cell, _cell(half), *(_cell(_number(number)) for number in both)
+        rows.append([_text(name, "first"), _cell(str(len(found[name]))), *told, *more])
+    return _table(header, rows)
+
+
+def _gains(run: Sequence[EpisodeSummary], first: Sequence[EpisodeSummary]) -> list[float]:
+    """How much more reward the episodes of a run have brought than those of the first run."""
+    rewards = {(one.environment, one.episode): one.reward for one in first if run is not first}
+    pairs = [(one.reward, rewards.get((one.environment, one.episode))) for one in run]
+    return [reward - other for reward, other in pairs if other is not None]
 
 
 def _mean(episodes: Sequence[EpisodeSummary]) -> EpisodeSummary:
