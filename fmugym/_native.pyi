@@ -251,8 +251,9 @@ class Pool:
 
         Returns:
             The result of the step: a tuple of the class that ``prepare_play`` has got. None if
-            nothing was done: the episode has ended, the action is not of the type that was prepared,
-            an attribute has changed, or inputs are not finite. An exception ends the episode.
+            nothing was done: the episode has ended, the action is not of the type that was
+            prepared, an attribute has changed, or inputs are not finite. An exception ends the
+            episode.
         """
 
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
