@@ -208,6 +208,34 @@ def parts_of(observation):
     )
 
 
+class Side(Drawing):
+    def __init__(self):
+        super().__init__(max_episode_steps=40)
+
+    def _get_observation_space(self):
+        return gym.spaces.Discrete(2)
+
+    def _get_observation(self):
+        return np.int64(self.state[0] > 0.2)
+
+    def _is_done(self):
+        return self.state[0] > np.inf
+
+    def _get_info(self):
+        return {"q": self.state[0]}
+
+
+def test_observations_that_are_numbers():
+    env, seen = with_hooks(Side, "compiled"), []
+    env.reset(seed=1)
+    for number in range(40):
+        observation, _, _, _, info = env.step(np.full(1, 0.9 if number < 20 else -0.9, np.float32))
+        assert observation == (info["q"] > 0.2)
+        seen.append(observation)
+    assert set(seen) == {0, 1}
+    env.close()
+
+
 def test_overridden_parameters():
     options = ({}, {"model_parameters": {"theta_0": 0.1}}, {"x_init": 0.2}, {"y_init": 0.3})
 
