@@ -184,3 +184,12 @@ void operation_call(uint16_t operation, const void *first, const void *second, s
         EACH(int64_t, floor_divide_whole(x[j], y[j]));
     }
 }
+
+/* Compilers call a function of the C library that makes both, with the same results as those of one. */
+void operation_turn(const double *angles, size_t count, double *sines, double *cosines) {
+    for (size_t j = 0; j < count; j++) {
+        const double angle = angles[j];
+        sines[j] = sin(angle);
+        cosines[j] = cos(angle);
+    }
+}

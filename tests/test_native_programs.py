@@ -265,3 +265,19 @@ def test_integers_wrap_around_and_divide_by_zero_as_those_of_numpy(ufunc):
     with np.errstate(all="ignore"):
         expected = ufunc(x, y)
     np.testing.assert_array_equal(results_of(f"{ufunc.__name__} q", x, y), expected)
+
+
+@pytest.mark.parametrize("first", ["sin", "cos"])
+def test_a_sine_and_a_cosine_of_the_same_angles(first):
+    """They are made together if they follow each other, and also then those of the C library."""
+    second = "cos" if first == "sin" else "sin"
+    for n in (*LENGTHS, 100_000):
+        x = np.concatenate([np.random.default_rng(n).uniform(-9.0, 9.0, n - 1), [1e9]])
+        for angles in (x, np.full(n, x[0])):
+            one, other = np.zeros(n), np.zeros(n)
+            functions = (f"{first} d", 0, 1, 0), (f"{second} d", 0, 2, 0)
+            stores = ("store_row", 1, 0, 1), ("store_row", 2, 0, 2)
+            lines = ("load_row", 0, 0), *functions, *stores
+            evaluate(lines, (angles, one, other), np.zeros(n))
+            assert one.tolist() == [getattr(math, first)(angle) for angle in angles.tolist()]
+            assert other.tolist() == [getattr(math, second)(angle) for angle in angles.tolist()]
