@@ -227,11 +227,34 @@ class Pool:
         those of ``play``.
         """
 
-    def prepare_one(self, *parts: Any) -> None:
-        """Take over the parts of ``NativePool.prepare_one``."""
+    def step_one(
+        self,
+        guard: Guard,
+        judge: Callable[[], Any],
+        complete: Callable[[Any], Any] | None,
+        watched: tuple[Any, ...],
+        action: Any,
+        attributes: dict[str, Any],
+        /,
+    ) -> Any:
+        """Do a whole step of a single environment, by a pool of one.
 
-    def step_one(self, action: Any, attributes: dict[str, Any], /) -> Any:
-        """Do a step of a single environment; see ``NativePool.prepare_one``."""
+        Args:
+            guard: That of the environment, which is taken meanwhile.
+            judge: Returns the result if the instance has stepped, but its status or a number is not
+                good.
+            complete: Makes the result of a good step whole; None if it is that already.
+            watched: The attributes that the programs were made of: names and values after each
+                other. An ellipsis stands for one that must not be there.
+            action: Of the environment.
+            attributes: Of the environment.
+
+        Returns:
+            The result of the step: a tuple of the class that ``prepare_play`` has got. None if
+            nothing was done: the episode has ended, the action is not of the type that was
+            prepared, an attribute has changed, or inputs are not finite. An exception ends the
+            episode.
+        """
 
     def reset_by(self, options: Any, /) -> tuple[tuple[Any, dict[str, Any]], int, bool] | None:
         """Do a whole reset with a mask; see ``Play.reset`` of ``fmugym.pool.base``."""

@@ -25,7 +25,7 @@ from fmugym.errors import (
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
 from fmugym.pool.bundle import IndexArray
-from fmugym.pool.licences import require_started
+from fmugym.pool.licences import start_instances
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
@@ -208,7 +208,7 @@ class FMUEnv(Constructed):
         inside.ended = True  # there is no episode if the FMU fails
         try:
             if inside.warm_ups is None:
-                self._reset_pool(pool, plan, episode)
+                start_instances(pool, plan.model_variables, episode.start_values, _FIRST)
                 self._begin_episode(episode)
             else:
                 self._begin_with_warm_up(inside.warm_ups, pool, plan, episode)
@@ -225,12 +225,6 @@ class FMUEnv(Constructed):
             self.render()
         return observation, info
 
-    @staticmethod
-    def _reset_pool(pool: Pool, plan: EpisodePlan, episode: Episode) -> None:
-        pool.reset(plan.model_variables, episode.start_values)
-        if pool.statuses.item(0):
-            require_started(pool, _FIRST)
-
     def _begin_with_warm_up(
         self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
     ) -> None:
@@ -239,7 +233,7 @@ class FMUEnv(Constructed):
         read = self.inside.readings
 
         def start(_: IndexArray) -> Readings:
-            self._reset_pool(pool, plan, episode)
+            start_instances(pool, plan.model_variables, starts, _FIRST)
             self._read_outputs()
             return rows_of_one(self)
 

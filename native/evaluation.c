@@ -101,6 +101,25 @@ static inline void run_one(const Evaluation *e, Instruction i) {
     }
 }
 
+/* Whether an instruction and the next one are a sine and a cosine of the same angles. */
+static bool is_pair(const Evaluation *e, size_t i) {
+    const Instruction *first = &e->program->code[i], *second = first + 1;
+
+    return first->operation <= COS && first->operation >= SIN && i + 1 < e->program->length &&
+           second->operation == SIN + COS - first->operation && first->a == second->a &&
+           first->to != second->to && !(e->count > 1 && is_shared(e, *first));
+}
+
+static void run_pair(const Evaluation *e, Instruction sine, Instruction cosine) {
+    Register *sines = &e->registers->own[sine.to], *cosines = &e->registers->own[cosine.to];
+
+    operation_turn(e->registers->places[sine.a], e->count, sines->doubles, cosines->doubles);
+    clear_rest(sines, e->count, e->lanes, sizeof(double));
+    clear_rest(cosines, e->count, e->lanes, sizeof(double));
+    e->registers->places[sine.to] = sines;
+    e->registers->places[cosine.to] = cosines;
+}
+
 static inline size_t whole_blocks(size_t count) {
     return (count + PROGRAM_BLOCK - 1) / PROGRAM_BLOCK * PROGRAM_BLOCK;
 }
@@ -110,6 +129,13 @@ void program_run(const Program *program, const Source *source, size_t begin, siz
     const Evaluation e = {program, source, begin, count, whole_blocks(count), registers, notes};
 
     for (size_t i = 0; i < program->length; i++) {
-        run_one(&e, program->code[i]);
+        const Instruction *next = &program->code[i];
+        if (is_pair(&e, i)) {
+            const bool is_sine = next->operation == SIN;
+            run_pair(&e, next[!is_sine], next[is_sine]);
+            i++;
+        } else {
+            run_one(&e, *next);
+        }
     }
 }

@@ -22,6 +22,14 @@
     case operation:                                                                                \
         EACH(double, function(x[j], y[j]))
 
+/* Lets the C library compute what a loop of arithmetic has left. */
+#define EACH_LEFT(expression)                                                                      \
+    for (size_t j = 0; j < count; j++) {                                                           \
+        if (is_left[j]) {                                                                          \
+            r[j] = (expression);                                                                   \
+        }                                                                                          \
+    }
+
 /* What x * x is more than its rounded product, by Dekker's halves: exact, or not a number where x is
  * too great for it. */
 static inline double rest_of_square(double x, double product) {
@@ -52,11 +60,28 @@ static void operation_raise(const double *x, const double *y, size_t count, doub
     uint8_t is_left[PROGRAM_WIDTH];
 
     square_most(x, y, count, r, is_left);
+    EACH_LEFT(pow(x[j], y[j]));
+}
+
+/* The product of two floats is exact as a double. */
+WIDE static void square_most32(const float *restrict x, const float *restrict y, size_t count,
+                               float *restrict r, uint8_t *restrict is_left) {
     for (size_t j = 0; j < count; j++) {
-        if (is_left[j]) {
-            r[j] = pow(x[j], y[j]);
-        }
+        const double product = (double)x[j] * x[j], slack = 0x1p-28 * product;
+        const float low = (float)(product - slack), high = (float)(product + slack);
+        const bool is_usual = (product > 0x1p-16) & (product < 0x1p16);
+        r[j] = low;
+        is_left[j] = !((y[j] == 2.0F) & is_usual & (low == high));
     }
+}
+
+/* The same for floats. Those libraries compute them as doubles; in the usual range, the results are off
+ * by less than 0.55 units. */
+static void operation_raise32(const float *x, const float *y, size_t count, float *r) {
+    uint8_t is_left[PROGRAM_WIDTH];
+
+    square_most32(x, y, count, r, is_left);
+    EACH_LEFT(powf(x[j], y[j]));
 }
 
 /* The remainder of numpy has the sign of the divisor. */
@@ -67,6 +92,25 @@ static double remainder_of(double x, double y) {
         return copysign(rest, y);
     }
     return (rest < 0.0) != (y < 0.0) ? rest + y : rest;
+}
+
+/* Where the quotient is less than 2, one exact difference makes the remainder. Compilers vectorize this
+ * if zeros are left. */
+WIDE static void divide_most(const double *restrict x, const double *restrict y, size_t count,
+                             double *restrict r, uint8_t *restrict is_left) {
+    for (size_t j = 0; j < count; j++) {
+        const double size = fabs(x[j]), divisor = fabs(y[j]), less = size - divisor;
+        const double rest = copysign(less < 0.0 ? size : less, x[j]);
+        r[j] = rest + (copysign(1.0, rest) * y[j] < 0.0 ? y[j] : 0.0);
+        is_left[j] = !((less < divisor) & (rest != 0.0));
+    }
+}
+
+static void operation_remain(const double *x, const double *y, size_t count, double *r) {
+    uint8_t is_left[PROGRAM_WIDTH];
+
+    divide_most(x, y, count, r, is_left);
+    EACH_LEFT(remainder_of(x[j], y[j]));
 }
 
 /* What numpy rounds the quotient to, so that it fits the remainder. */
@@ -124,16 +168,28 @@ void operation_call(uint16_t operation, const void *first, const void *second, s
         OF_TWO(HYPOT, hypot);
         OF_TWO(FMOD, fmod);
         OF_TWO(COPYSIGN, copysign);
-        OF_TWO(REMAINDER, remainder_of);
         OF_TWO(FLOOR_DIVIDE, floor_divide);
     case POWER:
         operation_raise(first, second, count, to);
         break;
     case POWER_F:
-        EACH(float, powf(x[j], y[j]));
+        operation_raise32(first, second, count, to);
+        break;
+    case REMAINDER:
+        operation_remain(first, second, count, to);
+        break;
     case REMAINDER_Q:
         EACH(int64_t, remainder_of_whole(x[j], y[j]));
     default:
         EACH(int64_t, floor_divide_whole(x[j], y[j]));
+    }
+}
+
+/* Compilers call a function of the C library that makes both, with the same results as those of one. */
+void operation_turn(const double *angles, size_t count, double *sines, double *cosines) {
+    for (size_t j = 0; j < count; j++) {
+        const double angle = angles[j];
+        sines[j] = sin(angle);
+        cosines[j] = cos(angle);
     }
 }

@@ -44,5 +44,6 @@ void operation_compute(uint16_t operation, const void *first, const void *second
 /* functions.c: those of the C library, and what else takes longer. */
 void operation_call(uint16_t operation, const void *first, const void *second, size_t count,
                     void *to);
+void operation_turn(const double *angles, size_t count, double *sines, double *cosines);
 
 #endif

@@ -87,16 +87,16 @@ void play_open(const Turn *turn, PlayScratch *scratch) {
     program_prepare(&turn->play->judgement, scratch->memory, &scratch->judgement);
 }
 
-bool play_makes_inputs(Turn *turn, double *inputs) {
+bool play_makes_inputs(Turn *turn) {
     const Play *play = turn->play;
-    const size_t number = play->number_of_inputs * play->count, bytes = number * sizeof *inputs;
+    const size_t number = play->number_of_inputs * play->count, bytes = number * sizeof(double);
     Source source = source_of(turn);
     Notes notes = {.outside = false};
     PlayScratch scratch;
 
     source.actions = turn->actions;
     source.previous_actions = play->actions.current;
-    memcpy(inputs, play->input_rows, bytes);
+    memcpy(play->inputs_before, play->input_rows, bytes);
     program_prepare(&play->inputs, scratch.memory, &scratch.inputs);
     program_run(&play->inputs, &source, 0, play->count, &scratch.inputs, &notes);
     for (size_t i = 0; i < number; i++) {
@@ -104,7 +104,7 @@ bool play_makes_inputs(Turn *turn, double *inputs) {
     }
     turn->has_inputs = !notes.outside;
     if (notes.outside) {
-        memcpy(play->input_rows, inputs, bytes);
+        memcpy(play->input_rows, play->inputs_before, bytes);
     }
     return turn->has_inputs;
 }

@@ -57,7 +57,7 @@ typedef struct {
     Program judgement; /* stores the rest; its results are done, truncated, reward */
     Source source;     /* only the statuses; each step sets the rest */
     Actions actions;
-    double *input_rows;
+    double *input_rows, *inputs_before;
     const InputStart *input_starts;
     size_t number_of_inputs;
     const double *output_rows;
@@ -100,8 +100,8 @@ typedef struct {
 bool play_has_bad_action(const Turn *turn, size_t steps);
 
 /* Makes the inputs before anything else of a step, which then has them. If they are not finite, returns
- * false and leaves them as they were; there is memory for a copy of them. */
-bool play_makes_inputs(Turn *turn, double *inputs);
+ * false and leaves them as they were. */
+bool play_makes_inputs(Turn *turn);
 
 /* Scratch memory of one thread. */
 typedef struct {

@@ -57,7 +57,7 @@ WIDE static void transpose(const double *restrict from, size_t from_step, size_t
                            size_t columns, double *restrict to, size_t to_step) {
     size_t column = 0;
 
-    if (rows == 1) { /* a single environment, whose step takes little more than its calls */
+    if (rows == 1) { /* as most FMUs have one input */
         for (; column < columns; column++) {
             to[column * to_step] = from[column];
         }
@@ -89,8 +89,8 @@ WIDE static void transpose(const double *restrict from, size_t from_step, size_t
     }
 }
 
-static void gather_unaligned(const Matrix *matrix, size_t begin, size_t count, size_t width,
-                             double *inputs) {
+static void gather_each(const Matrix *matrix, size_t begin, size_t count, size_t width,
+                        double *inputs) {
     for (size_t i = 0; i < width; i++) {
         const char *place = matrix->data + (ptrdiff_t)i * matrix->row_stride +
                             (ptrdiff_t)begin * matrix->column_stride;
@@ -106,12 +106,12 @@ static void gather_inputs(const Task *task, size_t begin, size_t count, double *
     const size_t width = task->pool->settings.inputs->count;
     const ptrdiff_t size = sizeof *inputs;
 
-    if (matrix->column_stride == size && matrix->row_stride % size == 0 &&
+    if (count > 1 && matrix->column_stride == size && matrix->row_stride % size == 0 &&
         matrix->row_stride >= 0 && (uintptr_t)matrix->data % sizeof *inputs == 0) {
         const double *rows = (const double *)(const void *)matrix->data + begin;
         transpose(rows, (size_t)(matrix->row_stride / size), width, count, inputs, width);
     } else {
-        gather_unaligned(matrix, begin, count, width, inputs);
+        gather_each(matrix, begin, count, width, inputs);
     }
 }
 
@@ -134,11 +134,20 @@ static size_t take_not_finite(Task *task, size_t begin, size_t count, double *ou
     return troubled;
 }
 
-static void keep_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
+/* Moves some outputs of a run, from the first of them on, into their rows. For a single instance, the
+ * call would take longer than the move. */
+static inline void keep_outputs(const Task *task, size_t begin, size_t count, size_t first,
+                                size_t number, const double *outputs) {
     const Settings *s = &task->pool->settings;
-    const size_t width = s->outputs->count;
+    double *rows = s->output_values + first * s->count + begin;
 
-    transpose(outputs, width, count, width, s->output_values + begin, s->count);
+    if (count > 1) {
+        transpose(outputs + first, s->outputs->count, count, number, rows, s->count);
+        return;
+    }
+    for (size_t i = 0; i < number; i++) {
+        rows[i * s->count] = outputs[first + i];
+    }
 }
 
 WIDE static void convert(const double *values, size_t count, float *converted) {
@@ -405,8 +414,10 @@ static void add_offsets(const Turn *turn, size_t width, size_t count, double *ou
     }
 }
 
-/* Steps or resets a run, and leaves the outputs in the scratch memory. */
-static size_t advance(Task *task, size_t begin, size_t count, Scratch scratch, bool *fits_floats) {
+/* Steps or resets a run, and leaves the outputs in the scratch memory. For a single instance, a call
+ * with so many arguments is a part of its step. */
+static ALWAYS_INLINE size_t advance(Task *task, size_t begin, size_t count, Scratch scratch,
+                                    bool *fits_floats) {
     gather_inputs(task, begin, count, scratch.inputs);
     records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = are_finite(scratch.inputs, count * task->pool->settings.inputs->count);
@@ -443,7 +454,7 @@ static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) 
     bool fits_floats;
     const size_t troubled = advance(task, begin, count, scratch, &fits_floats);
 
-    keep_outputs(task, begin, count, scratch.outputs);
+    keep_outputs(task, begin, count, 0, task->pool->settings.outputs->count, scratch.outputs);
     return troubled;
 }
 
@@ -451,17 +462,15 @@ static size_t run_step(Task *task, size_t begin, size_t count, Scratch scratch) 
  * keep them, unless a program reads these. It takes few rows at a time, which stay in the cache for
  * both: rows of many instances would drive each other out of it. */
 static void replace_outputs(const Task *task, size_t begin, size_t count, const double *outputs) {
-    const Settings *s = &task->pool->settings;
     const Play *play = task->call->turn->play;
-    const size_t width = s->outputs->count;
+    const size_t width = task->pool->settings.outputs->count;
 
     for (size_t i = 0; i < width; i += TOGETHER) {
         const size_t number = width - i < TOGETHER ? width - i : TOGETHER;
         if (!play->reads_kept) {
             play_keep_outputs(play, i, number, begin, count);
         }
-        transpose(outputs + i, width, count, number, s->output_values + i * s->count + begin,
-                  s->count);
+        keep_outputs(task, begin, count, i, number, outputs);
     }
 }
 

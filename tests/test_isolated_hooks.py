@@ -25,6 +25,7 @@ from fmugym.pool.around import PlayAround
 from fmugym.pool.form import form_of_listing
 from fmugym.pool.process.pool import ProcessPool
 from fmugym.pool.requests import Answer, Request, request_listing
+from fmugym.task.alone import make_guard
 
 
 @pytest.fixture(name="make")
@@ -218,8 +219,8 @@ def test_a_pool_without_a_library_steps_nothing(make):
     for name, more in (("play", (False,)), ("play_before", ()), ("play_after", ())):
         with pytest.raises(ValueError, match="not prepared"):
             getattr(around._pool, name)(actions, *more)
-    with pytest.raises(TypeError, match="not prepared"):
-        around._pool.step_one(0, {})
+    with pytest.raises(ValueError, match="not prepared"):
+        around._pool.step_one(make_guard(), int, None, (), 0, {})
     before = envs.inside.pool.outputs.copy()
     assert around._pool.step_own() == 3
     nothing = _native.Access(form_of_listing(()))

@@ -224,15 +224,18 @@ def hard_numbers(count):
     return np.concatenate([mixed, rng.uniform(-8.0, 8.0, count), few])
 
 
-def test_squares_are_those_of_the_c_library():
+@pytest.mark.parametrize("letter", "df")
+def test_squares_are_those_of_the_c_library(letter):
     """Most are products, but not all: the library rounds a few in the other direction."""
-    rng, count = np.random.default_rng(3), 100_000
-    near = [np.nextafter(rng.choice(2.0 ** np.arange(-9, 9), count), s) for s in (0.0, np.inf)]
-    x = np.concatenate([hard_numbers(count), *near, np.sqrt(rng.uniform(0.5, 2.0, count))])
-    found = results_of("power d", x, np.full_like(x, 2.0))
+    rng, count, kind = np.random.default_rng(3), 100_000, np.dtype(letter).type
+    powers = (2.0 ** np.arange(-9, 9)).astype(kind)
+    near = [np.nextafter(rng.choice(powers, count), kind(s)) for s in (0.0, np.inf)]
+    numbers = [hard_numbers(count), *near, np.sqrt(rng.uniform(0.5, 2.0, count))]
     with np.errstate(all="ignore"):
-        expected = np.array([number**2 for number in x])  # each by the library's pow
+        x = np.concatenate(numbers).astype(kind)
+        expected = np.array([number**2 for number in x])  # each by the library's pow or powf
         products = x * x
+    found = results_of(f"power {letter}", x, np.full_like(x, 2.0))
     np.testing.assert_array_equal(found, expected)
     assert 0 < np.count_nonzero(found != products) < count / 100
 
@@ -262,3 +265,19 @@ def test_integers_wrap_around_and_divide_by_zero_as_those_of_numpy(ufunc):
     with np.errstate(all="ignore"):
         expected = ufunc(x, y)
     np.testing.assert_array_equal(results_of(f"{ufunc.__name__} q", x, y), expected)
+
+
+@pytest.mark.parametrize("first", ["sin", "cos"])
+def test_a_sine_and_a_cosine_of_the_same_angles(first):
+    """They are made together if they follow each other, and also then those of the C library."""
+    second = "cos" if first == "sin" else "sin"
+    for n in (*LENGTHS, 100_000):
+        x = np.concatenate([np.random.default_rng(n).uniform(-9.0, 9.0, n - 1), [1e9]])
+        for angles in (x, np.full(n, x[0])):
+            one, other = np.zeros(n), np.zeros(n)
+            functions = (f"{first} d", 0, 1, 0), (f"{second} d", 0, 2, 0)
+            stores = ("store_row", 1, 0, 1), ("store_row", 2, 0, 2)
+            lines = ("load_row", 0, 0), *functions, *stores
+            evaluate(lines, (angles, one, other), np.zeros(n))
+            assert one.tolist() == [getattr(math, first)(angle) for angle in angles.tolist()]
+            assert other.tolist() == [getattr(math, second)(angle) for angle in angles.tolist()]

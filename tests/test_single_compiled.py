@@ -23,6 +23,7 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
+from fmugym.task.alone import make_guard
 from fmugym.task.readings import READINGS
 from fmugym.vector import FMUVectorEnv
 from fmugym.vector import one as compiler
@@ -206,6 +207,51 @@ def parts_of(observation):
         if isinstance(observation, dict)
         else [observation]
     )
+
+
+class Side(Drawing):
+    def __init__(self):
+        super().__init__(max_episode_steps=40)
+
+    def _get_observation_space(self):
+        return gym.spaces.Discrete(2)
+
+    def _get_observation(self):
+        return np.int64(self.state[0] > 0.2)
+
+    def _is_done(self):
+        return self.state[0] > np.inf
+
+    def _get_info(self):
+        return {"q": self.state[0]}
+
+
+def test_observations_that_are_numbers():
+    env, seen = with_hooks(Side, "compiled"), []
+    env.reset(seed=1)
+    for number in range(40):
+        observation, _, _, _, info = env.step(np.full(1, 0.9 if number < 20 else -0.9, np.float32))
+        assert observation == (info["q"] > 0.2)
+        seen.append(observation)
+    assert set(seen) == {0, 1}
+    env.close()
+
+
+def test_a_pool_steps_one_environment_only_with_what_that_takes():
+    env, envs = with_hooks(Side, "compiled"), FMUVectorEnv(Side, 2, hooks="compiled")
+    guard, action = make_guard(), np.zeros(1, np.float32)
+    good = [guard, int, None, (), action, {}]
+    env.reset(seed=1)
+    envs.reset(seed=1)
+    for place, wrong in ((0, None), (3, []), (5, [])):
+        with pytest.raises(TypeError, match="needs a guard"):
+            env.inside.pool.step_one(*good[:place], wrong, *good[place + 1 :])
+    with pytest.raises(TypeError, match="one instance"):
+        envs.inside.pool.step_one(*good)
+    assert env.inside.pool.step_one(*good) is None  # the environment keeps the episode itself
+    assert len(env.step(action)) == 5
+    env.close()
+    envs.close()
 
 
 def test_overridden_parameters():

@@ -11,9 +11,10 @@ from typing import Final, TypeVar
 
 import numpy as np
 
+from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import Pool
+from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "require_licence",
     "require_started",
     "speaks_of_licence",
+    "start_instances",
 ]
 
 R = TypeVar("R")
@@ -96,6 +98,30 @@ def require_started(pool: Pool, indices: IndexArray, doing: str = "") -> None:
         failure = f"{doing}{pool.failure(index)}"
         error = LicenceError if speaks_of_licence(failure) else SimulationError
         raise error(failure if pool.num_instances == 1 else f"environment {index}: {failure}")
+
+
+def start_instances(
+    pool: Pool,
+    variables: tuple[Variable, ...],
+    values: FloatArray,
+    indices: IndexArray,
+    mask: MaskArray | None = None,
+) -> None:
+    """Reset instances for new episodes.
+
+    Args:
+        pool: Has the instances.
+        variables: The start variables.
+        values: Their values, shape (P, N).
+        indices: The instances, shape (M,).
+        mask: The same as a mask of shape (N,); None for all.
+
+    Raises:
+        SimulationError: If one fails, see ``require_started``.
+    """
+    _, statuses = pool.reset(variables, values, mask)
+    if np.count_nonzero(statuses):
+        require_started(pool, indices)
 
 
 class LicenceWait:

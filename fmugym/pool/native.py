@@ -390,27 +390,9 @@ class NativePool(AskingPool):
         """
         return self._open_pool().rollout(*arrays)
 
-    def prepare_one(self, *parts: Any) -> Callable[[Any, dict[str, Any]], Any]:
-        """Prepare a pool of one instance to do whole steps of a single environment.
-
-        Args:
-            parts: After ``prepare_play``, without results: the arrays of a step, with a first axis
-                of length 1: the observation of float32, or the arrays that the second program
-                stores; reward, terminated and truncated. The attributes that the programs were
-                made of: tuples of a name and the address of the object, or of a name alone that
-                must not be among the attributes. A function that makes the observation, and one
-                that makes the info, or None. A function that returns the result if the instance
-                has stepped, but its status or a number is not good; and one that makes the result
-                of a good step whole, or None. The guard of the environment, which is taken for each
-                step.
-
-        Returns:
-            A function of an action and the attributes of the environment. It returns the result of
-            the step. It returns None if nothing was done: the episode has ended, the action is not
-            of the type that was prepared, an attribute has changed, or inputs are not finite. An
-            exception ends the episode.
-        """
-        self._pool.prepare_one(*parts)
+    @property
+    def step_one(self) -> Callable[..., Any]:
+        """See ``_native.Pool.step_one``."""
         return self._pool.step_one
 
 

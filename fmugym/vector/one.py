@@ -43,8 +43,6 @@ that are far, hooks may fail; both batches are of the same size."""
 
 _NUMBERS: Final = (bool, int, float, np.bool_, np.integer, np.floating)
 
-_NOTHING: Final = object()
-
 
 def player_of(env: FMUEnv, required: bool) -> Player | None:
     """Compile the hooks of an environment in an episode.
@@ -89,8 +87,8 @@ class Player:
     Attributes:
         readings: What hooks read from the pool's arrays.
         left: The hooks that stay in Python, and why.
-        step: Does a step by an action and the attributes of the environment; see ``prepare_one`` of
-            the pool.
+        step: Does a step by an action and the attributes of the environment; see
+            ``_native.Pool.step_one``.
 
     Raises:
         UntraceableError: If the hooks cannot be compiled.
@@ -123,7 +121,9 @@ class Player:
 
     def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
         """Hand the programs and their arrays to the pool."""
-        plan, layout = env.inside.plan, Layout(task, env, 1)
+        plan, (shapes, form, self._divided) = env.inside.plan, Layout(task, env, 1).of_one()
+        real, flags = np.dtype(np.float64), ((1,), np.dtype(np.bool_))
+        arrays = *shapes, ((1,), real), flags, flags, flags, ((0, 1), real)
         self._pool.prepare_play(
             plan.model_variables,
             memory.programs(task),
@@ -131,23 +131,18 @@ class Player:
             self._starts,
             (no_draws(), np.zeros((1, 6), np.uint64)),
             (self._rows.step_count, memory.ended, env.inside.step_limit),
-            memory.surroundings(task, (), results=None),
+            memory.surroundings(task, (), (tuple, form, (), arrays, (None,) * 3)),
         )
-        arrays = tuple(np.zeros(shape, dtype) for shape, dtype in layout.shapes)
-        flags = np.zeros(1, np.bool_), np.zeros(1, np.bool_)
-        self._observe, inform = layout.of_one(arrays)
-        seen = arrays[0] if arrays and not task.seen else arrays
-        self._arrays = seen, np.zeros(1), *flags, self._observe, inform
         self._watch()
 
     def _watch(self) -> None:
         """Let the pool compare the attributes before each step."""
-        *arrays, observe, inform = self._arrays
-        complete = partial(_complete, self._env) if self.left else None
+        whole = self._divided is None and not self.left
+        complete = None if whole else partial(_complete, self._env, self._divided)
         self._may_change = [one for one in self._watched if one.copy is not None]
-        addresses = tuple(one.address for one in self._watched)
-        functions = observe, inform, partial(_judge_again, self._env), complete
-        self.step = self._pool.prepare_one(*arrays, addresses, *functions, self._guard)
+        watched = tuple(part for one in self._watched for part in one[:2])
+        judge = partial(_judge_again, self._env)
+        self.step = partial(self._pool.step_one, self._guard, judge, complete, watched)
 
     def play(self, env: FMUEnv, action: Any) -> Result | None:
         """Let the pool do the whole step.
@@ -270,9 +265,14 @@ def _judge_again(ref: weakref.ref[FMUEnv]) -> Result:
     return after_step(env, judged, inside.pool.statuses.item(0))
 
 
-def _complete(ref: weakref.ref[FMUEnv], result: Result) -> Result:
-    """Call the hooks that are not compiled."""
+def _complete(ref: weakref.ref[FMUEnv], divided: Callable[[Any], Any] | None, result: Any) -> Any:
+    """Divide what the pool has filled, and call the hooks that are not compiled."""
     env: Any = ref()
+    if divided is not None:
+        observation, info = divided(result[0])
+        result = observation, *result[1:4], info
+    if not env.inside.player.left:
+        return result
     whole = after_step(env, _with_hooks_left, *result)
     return _judge_again(ref) if whole is None else whole
 
@@ -340,7 +340,7 @@ class Watched(NamedTuple):
 
     Attributes:
         name: Its name.
-        value: The object that it is; ``_NOTHING`` for an attribute of the class only.
+        value: The object that it is; an ellipsis for an attribute of the class only.
         copy: What a list, dict or array held.
     """
 
@@ -348,14 +348,9 @@ class Watched(NamedTuple):
     value: Any
     copy: Any
 
-    @property
-    def address(self) -> tuple[Any, ...]:
-        """The name and the address of the object, which stays valid as long as this exists."""
-        return (self.name,) if self.value is _NOTHING else (self.name, id(self.value))
-
     def differs_in(self, env: FMUEnv) -> bool:
         """Whether the attribute of an environment is another object."""
-        return vars(env).get(self.name, _NOTHING) is not self.value
+        return vars(env).get(self.name, ...) is not self.value
 
     def has_changed(self) -> bool:
         """Whether the object has changed in place."""
@@ -368,8 +363,8 @@ def _watched_in(env: FMUEnv) -> Iterator[Watched]:
     if "getattr" in names:
         names |= attributes.keys()
     for name in sorted((names - env.inside.own_names) | set(ORDER)):
-        value = attributes.get(name, _NOTHING)
-        if value is not _NOTHING or hasattr(type(env), name):
+        value = attributes.get(name, ...)
+        if value is not ... or hasattr(type(env), name):
             can_change = isinstance(value, (list, dict, set, tuple, np.ndarray))
             yield Watched(name, value, deepcopy(value) if can_change else None)
 

@@ -63,10 +63,6 @@ typedef struct {
 /* Takes memory that must have so many bytes, whatever its items are. */
 bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size);
 
-/* Takes what the steps of the turn write: one array that the pool fills itself, or those that the
- * program stores. */
-bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t);
-
 /* Takes an array of actions. Those of another type or shape come back as an exception; the caller then
  * converts them. A first axis of 1 leaves that of the environments out. */
 bool take_array_of_actions(const Playing *playing, PyObject *actions, int first, Py_buffer *buffer);
@@ -77,6 +73,8 @@ void release_turn(const Playing *playing, PyTurn *t);
 
 /* Lets the turn and its call refer to the buffers. */
 void settle_turn(PyPool *self, const Playing *playing, PyTurn *t);
+/* Lets the step fill the arrays that it returns. */
+void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t);
 
 /* Whether a hook looked up an index outside of a table, which is an exception. */
 bool is_outside(const PyTurn *t);

@@ -17,16 +17,6 @@ bool take_bytes(PyObject *object, Py_buffer *buffer, int flags, size_t size) {
     return (size_t)buffer->len == size;
 }
 
-bool take_observations(PyPool *self, const Playing *playing, PyObject *seen, PyTurn *t) {
-    const Settings *s = &self->pool.settings;
-
-    if (playing->form.judgement.program.number_of_seen > 0 || PyTuple_Check(seen)) {
-        return take_seen(&playing->form.judgement, s->count, seen, t->seen_buffers, t->seen);
-    }
-    return take_bytes(seen, &t->buffers[SEEN], PyBUF_WRITABLE,
-                      s->count * s->num_observed * sizeof(float));
-}
-
 /* Whether the items of a buffer are of numpy's type with this letter; it has two for int64. */
 static bool has_letter(const Py_buffer *buffer, int letter) {
     const char *format = buffer->format == NULL ? "B" : buffer->format;
@@ -113,8 +103,7 @@ bool is_outside(const PyTurn *t) {
     return t->ends.outside;
 }
 
-/* Lets the step fill the arrays that it returns. */
-static void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
+void settle_results(const Playing *playing, const ResultArrays *arrays, PyTurn *t) {
     t->turn.rewards = (double *)(void *)arrays->memory[REWARDS_ARRAY];
     t->turn.terminated = (uint8_t *)arrays->memory[TERMINATED_ARRAY];
     t->turn.truncated = (uint8_t *)arrays->memory[TRUNCATED_ARRAY];

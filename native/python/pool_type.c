@@ -58,7 +58,6 @@ static void pool_dealloc(PyObject *object) {
     }
     opening_drop(&self->opening);
     Py_XDECREF(self->playing);
-    Py_XDECREF(self->one);
     Py_XDECREF(self->arguments);
     release_memory(object);
     Py_DECREF(type);
@@ -107,7 +106,6 @@ static PyMethodDef methods[] = {
     {"play_before", py_play_before, METH_O, NULL},
     {"play_after", py_play_after, METH_O, NULL},
     FAST("rollout", py_rollout),
-    {"prepare_one", py_prepare_one, METH_VARARGS, NULL},
     FAST("step_one", py_step_one),
     {"reset_by", py_reset_by, METH_O, NULL},
     {"save", py_save, METH_NOARGS, NULL},

@@ -38,7 +38,6 @@ typedef struct {
     PyObject *arrays[BUFFERS];
     Py_buffer buffers[BUFFERS];
     PyObject *playing; /* a capsule, so that a running call can keep its own reference */
-    PyObject *one;     /* another one */
 } PyPool;
 
 extern PyTypeObject *access_type, *draws_type, *guard_type, *snapshot_type;
@@ -100,7 +99,6 @@ PyObject *py_play(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 PyObject *py_play_before(PyObject *object, PyObject *actions);
 PyObject *py_play_after(PyObject *object, PyObject *actions);
 
-PyObject *py_prepare_one(PyObject *object, PyObject *args);
 PyObject *py_step_one(PyObject *object, PyObject *const *args, Py_ssize_t nargs);
 
 #endif

@@ -21,7 +21,7 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
-from fmugym.pool.licences import require_started
+from fmugym.pool.licences import require_started, start_instances
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
@@ -370,17 +370,10 @@ class BatchEngine(Engine):
         self.has_moved = True
         warm_ups = self.env.inside.warm_ups
         if warm_ups is None:
-            self._reset_pool(mask, indices, plan, values)
+            start_instances(self._pool, plan.model_variables, values, indices, mask)
             self._forget(indices, plan)
         else:
             self._begin_with_warm_up(warm_ups, indices, plan, values)
-
-    def _reset_pool(
-        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, values: FloatArray
-    ) -> None:
-        _, statuses = self._pool.reset(plan.model_variables, values, mask)
-        if np.count_nonzero(statuses):
-            require_started(self._pool, indices)
 
     def _begin_with_warm_up(
         self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
@@ -391,7 +384,7 @@ class BatchEngine(Engine):
         def start(where: IndexArray) -> Readings:
             mask = np.zeros(self._n, np.bool_)
             mask[where] = True
-            self._reset_pool(mask, where, plan, values)
+            start_instances(pool, plan.model_variables, values, where, mask)
             return some(Readings.of(env), where)
 
         rows = {name: self._row(name) for name in env.variables}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -57,15 +56,17 @@ class Layout:
             return arrays[0]
         return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
 
-    def of_one(
-        self, arrays: Sequence[Any]
-    ) -> tuple[Callable[[], Any], Callable[[], dict[str, Any]] | None]:
-        """What makes the observation of a single environment, and its info if there is one."""
-        if self.names is None:
-            return arrays[0][0].copy, None
-        observed, told = self._nested(arrays)
-        inform = partial(_copied, told) if told else None
-        return partial(_copied, observed), inform
+    def of_one(self) -> tuple[tuple[Any, ...], Any, Callable[[Any], tuple[Any, Any]] | None]:
+        """The arrays of a single environment.
+
+        Returns:
+            The shape and type of each; the form of what they are in; and what takes the observation
+            and the info from there, or None if it is the observation.
+        """
+        if self.names is None and len(self.shapes[0][0]) > 1:
+            ((_, *shape), dtype) = self.shapes[0]
+            return ((tuple(shape), dtype),), 0, None
+        return self.shapes, _pairs(dict(enumerate(self._nested(range(len(self._paths)))))), _of_one
 
     def _tree(self, arrays: Any) -> tuple[Any, dict[str, Any]]:
         """The observations and infos of any form."""
@@ -84,10 +85,15 @@ class Layout:
         return tree["observation"], tree["info"]
 
 
-def _copied(tree: Any) -> Any:
-    """Copy the arrays of a tree, without their first axis of one; what has no other is a number."""
+def _of_one(tree: dict[int, Any]) -> tuple[Any, Any]:
+    """The observation and the info of a single environment."""
+    return _first(tree[0]), _first(tree[1])
+
+
+def _first(tree: Any) -> Any:
+    """The arrays of a tree, without their first axis of one; what has no other is a number."""
     if isinstance(tree, dict):
-        return {name: _copied(part) for name, part in tree.items()}
+        return {name: _first(part) for name, part in tree.items()}
     return tree[0].copy() if tree.ndim > 1 else tree.item()
 
 

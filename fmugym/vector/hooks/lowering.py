@@ -26,6 +26,8 @@ __all__ = ["Store", "compile_graph", "registers_of"]
 
 _MOST_INSTRUCTIONS: Final = 20_000
 
+_PARTNERS: Final = {"sin d": "cos d", "cos d": "sin d"}
+
 
 class Store(NamedTuple):
     """A value to store: in a row, or as the element of an array of observations.
@@ -173,6 +175,7 @@ class _Compiler:
 
     def program(self, results: Sequence[int], seen: int) -> Program:
         """Place all values in registers."""
+        self._steps = _with_pairs(self._steps)
         registers = registers_of(
             [(step.node, step.operands) for step in self._steps], self._constants, results
         )
@@ -204,6 +207,16 @@ class _Compiler:
         if sys.byteorder == "little":
             return constants
         raise UntraceableError("this processor stores numbers in another order")
+
+
+def _with_pairs(steps: Sequence[_Step]) -> list[_Step]:
+    """Let a sine and a cosine of the same angles follow each other: the pool makes both at once."""
+    known = {(step.operation, step.operands): step for step in steps}
+    paired: dict[_Step, None] = {}
+    for step in steps:
+        partner = known.get((_PARTNERS.get(step.operation, ""), step.operands))
+        paired.update(dict.fromkeys([step] if partner is None else [step, partner]))
+    return list(paired)
 
 
 def registers_of(
