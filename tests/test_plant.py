@@ -22,6 +22,7 @@ from plant_tools import (
 )
 
 import fmugym
+from fmugym.declared import Task
 from fmugym.declared.series import read_data
 from fmugym.episodes.simulation import action_of, policy_of, simulate
 from fmugym.errors import ConfigError, SimulationError
@@ -472,9 +473,44 @@ class TestCommands:
         for command in (["simulate", "house.toml", "--plant"], ["serve", "house.toml"]):
             assert main(command) == 1
             assert "[plant]" in capsys.readouterr().err
+        assert main(["serve", "house.toml"]) == 1
+        assert "--modbus or --opcua" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("protocol", ["modbus", "opcua"])
+    def test_serve_proposes_tags(self, protocol, clock, tmp_path, monkeypatch, capsys):
+        """With what is printed, the task reads all that it needs: here 48 hours of prices."""
+        if protocol == "opcua":
+            pytest.importorskip("asyncua", reason="needs asyncua, of the extra plant")
+        monkeypatch.chdir(tmp_path)
+        ahead = {"of": ["price", "T_out"], "horizon": "48h", "step": "30min"}
+        task = house(agent={"forecast": ahead})
+        del task.document["plant"]
+        task.write(tmp_path / "house.toml")
+        options = ["--speed", "90000", "--steps", "2"]
+        assert main(["serve", "house.toml", f"--{protocol}", *options]) == 0
+        with Path("house.toml").open("a", encoding="utf-8") as file:
+            file.write(capsys.readouterr().out.partition("add this to the task:\n")[2])
+        pasted = Task.read("house.toml")
+        assert set(pasted.document["plant"]["tags"]) == {"u", "T", "T_floor", "power"}
+        assert pasted.document["plant"]["data"]["price"]["count"] == 97
+        with (
+            Server(pasted, "thermostat", clock=clock) as server,
+            watched(clock, server.address, pasted) as env,
+        ):
+            observation, _ = env.reset(seed=0)
+            names = env.unwrapped.observation_names
+            seen = dict(zip(names, observation.tolist(), strict=True))
+        table = read_data(pasted.root.child("data").child("price"))
+        later = float(env.unwrapped.time) + 48 * 3600.0
+        here = np.searchsorted(table.times, later % table.period, side="right") - 1
+        assert seen["price[+172800 s]"] == pytest.approx(table.values[here], rel=1e-6)
+        assert seen["T"] == pytest.approx(20.0, abs=1.5)
+        other = {"modbus": "opcua", "opcua": "modbus"}[protocol]
+        assert main(["serve", "house.toml", f"--{other}", *options]) == 1
+        assert f"protocol '{protocol}', not '{other}'" in capsys.readouterr().err
 
     def test_a_tag_of_no_variable(self, file, capsys):
         text = Path(file).read_text()
-        Path(file).write_text(text.replace("tags = {T =", "tags = {Tt ="))
+        Path(file).write_text(text.replace("\nT = {register", "\nTt = {register"))
         assert main(["simulate", file, "--plant"]) == 1
         assert "plant.tags.Tt: unknown variable of the task 'Tt'" in capsys.readouterr().err

@@ -158,7 +158,7 @@ class ModbusClient:
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
         """The registers or bits, and what the server says instead."""
-        client, count = self._client, place.end - place.begin
+        client = self._client
         ask = {
             "holding": client.read_holding_registers,
             "input": client.read_input_registers,
@@ -167,16 +167,20 @@ class ModbusClient:
         }[place.kind]
         if not client.connected:
             raise LostError("the connection is lost")
-        try:
-            told = await ask(place.begin, count=count, device_id=place.unit_id)
-        except self._errors.ConnectionException:
-            raise LostError("the connection is lost") from None
-        except self._errors.ModbusException:
-            raise LostError("it does not answer, or not by Modbus") from None
-        if told.isError():
-            code, where = told.exception_code, f"{place.kind} {place.begin} of unit {place.unit_id}"
-            return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
-        return (told.bits[:count] if place.is_bits else told.registers), ""
+        cells: list[Any] = []
+        for begin in range(place.begin, place.end, _MOST):
+            count = min(_MOST, place.end - begin)
+            try:
+                told = await ask(begin, count=count, device_id=place.unit_id)
+            except self._errors.ConnectionException:
+                raise LostError("the connection is lost") from None
+            except self._errors.ModbusException:
+                raise LostError("it does not answer, or not by Modbus") from None
+            if told.isError():
+                code, where = told.exception_code, f"{place.kind} {begin} of unit {place.unit_id}"
+                return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
+            cells += told.bits[:count] if place.is_bits else told.registers
+        return cells, ""
 
     async def close(self) -> None:
         """See ``polling.Client``."""

@@ -12,12 +12,14 @@ from typing import Any, Final
 
 from fmugym.checks import check_count, check_number, duration
 from fmugym.declared import Task
+from fmugym.declared.writing import as_toml
 from fmugym.episodes.output_files import Recording
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Summary, simulate
 from fmugym.errors import ConfigError, FMUGymError, plain, shown
 from fmugym.plant import Server, connect
 from fmugym.plant.predicting import Error
+from fmugym.plant.proposing import with_plant
 from fmugym.plant.shadow import holding
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
@@ -133,7 +135,13 @@ def add_serve(commands: Commands) -> None:
     """Add ``serve``."""
     text = "let the FMU of a task be a plant on the loopback, as [plant] of the task describes"
     command = add_command(commands, "serve", _serve, text)
-    command.add_argument("task", metavar="TASK", help="a task file with [plant]")
+    command.add_argument("task", metavar="TASK", help="a task file")
+    protocols = command.add_mutually_exclusive_group()
+    for name, shown_name in (("modbus", "Modbus TCP"), ("opcua", "OPC UA")):
+        text = f"by {shown_name}; without [plant] in the task, print one to be added to it"
+        protocols.add_argument(
+            f"--{name}", action="store_const", const=name, dest="protocol", help=text
+        )
     add_players(command)
     command.add_argument("--port", type=int, default=0, help="by default a free one")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="default 0")
@@ -147,11 +155,19 @@ def _serve(arguments: argparse.Namespace) -> None:
     steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
     task, player = _task_of(arguments), only_player(arguments)
+    has_plant = "plant" in task.document
+    if arguments.protocol is not None:
+        task = with_plant(task, arguments.protocol)
+    elif not has_plant:
+        raise ConfigError(f"{shown(arguments.task)} has no [plant]: say --modbus or --opcua")
     with Server(task, player, clock=_clock(arguments), **options) as server:
+        plant = {**task.document["plant"], "address": server.address}
         if arguments.json:
-            say_json({"task": arguments.task, "address": server.address})
+            say_json({"task": arguments.task, "address": server.address, "plant": plant})
         else:
             say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
+            if not has_plant:
+                say(f"add this to the task:\n\n{as_toml({'plant': plant})}")
         sys.stdout.flush()  # a program may wait for the address
         while not server.wait(0.2):
             pass
