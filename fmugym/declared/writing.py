@@ -17,7 +17,7 @@ Keys = tuple[str, ...]
 _INLINE: Final = ("fmu", "clock", "warm_up")
 """Tables that describe one value; they are written in one line."""
 
-_TABLES: Final = (("plant", "tags"), ("plant", "data"), ("plant", "states"))
+_TABLES: Final = (("plant", "tags"), ("plant", "data"))
 """Tables within others that have a heading of their own."""
 
 

@@ -69,9 +69,10 @@ class Live:
             count, step = entry.value.get("count", 1), entry.value.get("step")
             if "file" in entry.value or count == 1:
                 continue
-            if step is None or (count - 1) * step < self._ahead[name]:
+            ahead = self._ahead[name]
+            if step is None or (count - 1) * step < ahead:
                 raise entry.error(
-                    f"the agent sees {self._ahead[name]:g} s ahead: expected 'count' values that are "
+                    f"the agent sees {ahead:g} s ahead: expected 'count' values that are "
                     f"'step' apart to go as far, got {count} and {step}"
                 )
 

@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 
 from fmugym.checks import check_flag
-from fmugym.declared import Task, TaskEnv
+from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.episodes.simulation import Policy
 from fmugym.plant.feed import Feed, local_time
@@ -198,8 +198,11 @@ def connect(
         written = Written(env, feed, plant)
         read, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
-        make_copy = partial(environment, _without_warm_up(watched).physical())
-        copies = Predictions(make_copy, feed, plant, int(ahead / plant.step + 1e-9))
+        model = _without_warm_up(watched).physical()
+        env.inside.model = partial(load, model)
+        copies = Predictions(
+            partial(environment, model), feed, plant, int(ahead / plant.step + 1e-9)
+        )
         stack.callback(copies.close)
         live = Live(env, plant)
         live.envs += copies.envs
@@ -250,12 +253,13 @@ def _reading(
 
 
 def holding(policy: Policy, shadow: Shadow) -> Policy:
-    """Make a policy hold its last action while values are missing."""
+    """Make a policy hold its last action while values are missing; it still sees all steps."""
     last: list[Any] = []
 
     def act(observation: Any) -> Any:
+        action = policy.act(observation)
         if not (last and shadow.is_missing):
-            last[:] = [policy.act(observation)]
+            last[:] = [action]
         return last[0]
 
     return Policy(act, policy.begin)
