@@ -28,7 +28,7 @@ from fmugym.declared.series import read_data
 from fmugym.episodes.simulation import action_of, policy_of, simulate
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.lab import RealClock
-from fmugym.logs import PlantLog, play_log
+from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
@@ -360,6 +360,24 @@ class TestData:
                 observation, *_, info = env.step(np.float32([0.3]))
                 assert "fault" not in info
 
+    def test_is_in_the_record(self, clock, prices, tmp_path):
+        """Prices and time of the record make its rewards, not those of the task."""
+        task = self.task(prices)
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            watched(clock, server.address, task) as shadow,
+        ):
+            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            simulate(env, action_of(env.unwrapped, "0.5"), 0, 6)
+            env.complete()
+        task.document["clock"] = {"from": "01-01", "to": "02-01"}
+        log = PlantLog.read(tmp_path / "plant.csv")
+        found = as_logged(task, log)
+        (recording,) = play_log(log, lambda **more: fmugym.load(found, physical=True, **more))
+        np.testing.assert_allclose(recording.rewards, env.series["reward"][1:], atol=1e-6)
+        (recording,) = play_log(log, lambda **more: fmugym.load(task, physical=True, **more))
+        assert abs(recording.rewards.sum() - env.series["reward"][1:].sum()) > 0.01
+
     def test_a_file_that_is_not_refreshed(self, clock, prices):
         task = self.task(prices)
         prices[1](5)
@@ -499,6 +517,16 @@ class TestCommands:
         assert told["episodes"][0]["steps"] == 6
         assert {one["ahead"] for one in told["predictions"]} == {900.0, 1800.0}
         log = PlantLog.read("plant.csv")
+        others = "--controller", "thermostat", "--json"
+        assert main(["evaluate", file, "--log", "plant.csv", *others]) == 0
+        scores = {one["name"]: one for one in json.loads(capsys.readouterr().out)["scores"]}
+        assert [*scores][:3] == ["plant, measured", "actions of the plant", "proposed actions"]
+        assert [*scores][3:] == ["thermostat"]
+        assert {tuple(one["steps"]) for one in scores.values()} == {(6,)}
+        measured = scores["plant, measured"]
+        assert measured["mean_reward"] == pytest.approx(np.nansum(log.columns["reward"]), abs=1e-6)
+        assert measured["mean_cost"] == pytest.approx(np.nansum(log.columns["cost"]), abs=1e-6)
+        assert scores["proposed actions"]["rewards"] != scores["actions of the plant"]["rewards"]
         assert np.all((log.columns["proposed.u"][1:] >= 0) & (log.columns["proposed.u"][1:] <= 1))
 
     def test_a_task_without_a_plant(self, tmp_path, monkeypatch, capsys):

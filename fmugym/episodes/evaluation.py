@@ -95,6 +95,7 @@ def evaluate(
     scenario: str | None = None,
     advance: Advance = no_progress,
     wrap: Wrap = lambda env: env,
+    periods: Sequence[tuple[float, int]] = (),
 ) -> Iterator[Score]:
     """Let players play the same episodes.
 
@@ -106,11 +107,14 @@ def evaluate(
         scenario: The scenario that the environment plays, for the scores.
         advance: Is told of each step.
         wrap: Puts wrappers around the environment, such as a recorder.
+        periods: Start times and numbers of steps of the episodes, one for each seed, if the task
+            draws its start time.
 
     Yields:
         A score for each player, in their order, as soon as it is known.
     """
     seeds = list(seeds)
+    starts = periods or [(None, most_steps)] * len(seeds)
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form
         for name, player in players.items():
@@ -120,7 +124,10 @@ def evaluate(
             played = envs[player.is_physical]
             policy, begin = player.make_policy(played.unwrapped), perf_counter()
             episodes: list[Summary] = []
-            each = (simulate(played, policy, seed, most_steps, advance) for seed in seeds)
+            each = (
+                simulate(played, policy, seed, steps, advance, start)
+                for seed, (start, steps) in zip(seeds, starts, strict=True)
+            )
             try:
                 episodes.extend(each)
             except KeyboardInterrupt:

@@ -64,6 +64,6 @@ def _ahead(env: TaskEnv, name: str) -> dict[str, Any]:
     """How many values of data there are, so that the agent sees far enough ahead."""
     root, own = env.task.root, env.inside.spec.time_step
     steps = [one.get("step") or own for one in forecasts(root, name)]
-    return (
-        {"count": round(horizon(root, name) / min(steps)) + 1, "step": min(steps)} if steps else {}
-    )
+    if not steps:
+        return {}
+    return {"count": round(horizon(root, name) / min(steps)) + 1, "step": min(steps)}

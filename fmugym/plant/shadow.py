@@ -16,6 +16,7 @@ from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.episodes.simulation import Policy
+from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed, local_time
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
@@ -30,7 +31,6 @@ from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect", "holding"]
 
-_OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
@@ -47,7 +47,8 @@ class _PresentTime:
 
 def _watched(task: Task, feed: Feed) -> Task:
     """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
-    document = {k: v for k, v in endless(task).document.items() if k not in _OF_SIMULATIONS}
+    task = on_time_of_year(endless(task), _PresentTime(feed))
+    document = dict(task.document)
     variables = document.get("variables", {})
     document["variables"] = {
         alias: {key: value for key, value in given.items() if key not in DEVICE}
@@ -62,7 +63,7 @@ def _watched(task: Task, feed: Feed) -> Task:
     if "history" in agent:
         held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
         document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
-    return replace(task, document={**document, "agent": agent, "start_time": _PresentTime(feed)})
+    return replace(task, document={**document, "agent": agent})
 
 
 def _listed(value: Any) -> list[Any]:

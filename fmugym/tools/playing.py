@@ -8,12 +8,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
 from fmugym.errors import FMUGymError, plain
+from fmugym.logs import PlantLog
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.options import (
     Commands,
@@ -30,6 +32,7 @@ from fmugym.tools.options import (
     shown_in_any_case,
 )
 from fmugym.tools.plants import add_of_plants, follow_plant
+from fmugym.tools.shadows import evaluate_log
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -143,6 +146,12 @@ def add_evaluate(commands: Commands) -> None:
     )
     add_episodes(command, 10, 1_000_000)
     command.add_argument(
+        "--log",
+        metavar="FILE",
+        help="the record of a shadow (.csv): what the plant has reached, and what others reach on "
+        "the FMU in the same periods",
+    )
+    command.add_argument(
         "--plot", type=Path, metavar="FILE", help="a new picture of the rewards and costs"
     )
     add_json(command)
@@ -152,10 +161,15 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
-    players = players_of(arguments, random=True)
+    players = players_of(arguments, random=arguments.log is None)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
+        if arguments.log is not None:
+            task, log = Task.read(arguments.task), PlantLog.read(arguments.log)
+            with progress(None, "evaluate") as advance:
+                scores.extend(evaluate_log(task, log, players, advance))
+            return
         for scenario in _scenarios(arguments):
             make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario
