@@ -491,7 +491,11 @@ class TestCommands:
     def test_serve(self, file, capsys):
         arguments = ["--controller", "thermostat", "--speed", "90000", "--steps", "3"]
         assert main(["serve", file, *arguments]) == 0
-        assert re.search(r"house.toml at 127.0.0.1:\d+", capsys.readouterr().out)
+        said = capsys.readouterr().out
+        assert re.search(r"house.toml at 127.0.0.1:\d+", said)
+        reward = reference(3)["reward"].sum()
+        assert f"seed 0: reward {reward:.6g}, cost" in said
+        assert "in 3 steps (2700 s)" in said
 
     def test_simulate_plant_with_mpc(self, file, clock, capsys, monkeypatch):
         monkeypatch.setattr("fmugym.tools.plants.RealClock", lambda speed: clock)
@@ -552,8 +556,9 @@ class TestCommands:
         task.write(tmp_path / "house.toml")
         options = ["--speed", "90000", "--steps", "2"]
         assert main(["serve", "house.toml", f"--{protocol}", *options]) == 0
+        said = capsys.readouterr().out.partition("add this to the task:\n")[2]
         with Path("house.toml").open("a", encoding="utf-8") as file:
-            file.write(capsys.readouterr().out.partition("add this to the task:\n")[2])
+            file.write(said.partition("seed 0:")[0])
         pasted = Task.read("house.toml")
         assert set(pasted.document["plant"]["tags"]) == {"u", "T", "T_floor", "power"}
         assert pasted.document["plant"]["data"]["price"]["count"] == 97

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from fmugym.checks import duration
 from fmugym.episodes.output_files import require_picture
+from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
@@ -98,15 +99,17 @@ def _fit(arguments: argparse.Namespace) -> None:
     if not arguments.parameter:
         raise ConfigError(f"name what to fit with --parameter: {_possible(make_env)}")
     wash_in = arguments.wash_in
-    fit = fit_logs(
-        make_env,
-        [PlantLog.read(path) for path in arguments.log],
-        dict(map(_range, arguments.parameter)),
-        starts=dict(map(_start, arguments.start)),
-        wash_in=None if wash_in is None else duration("--wash-in", wash_in),
-        columns=dict(map(renaming, arguments.column)),
-        candidates=arguments.candidates,
-    )
+    with progress(None, "fit", "simulations") as advance:
+        fit = fit_logs(
+            make_env,
+            [PlantLog.read(path) for path in arguments.log],
+            dict(map(_range, arguments.parameter)),
+            starts=dict(map(_start, arguments.start)),
+            wash_in=None if wash_in is None else duration("--wash-in", wash_in),
+            columns=dict(map(renaming, arguments.column)),
+            candidates=arguments.candidates,
+            advance=advance,
+        )
     if output is not None:
         rows = output.with_suffix(".npz")
         write_rows(fit, rows)

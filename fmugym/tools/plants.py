@@ -169,5 +169,11 @@ def _serve(arguments: argparse.Namespace) -> None:
             if not has_plant:
                 say(f"add this to the task:\n\n{as_toml({'plant': plant})}")
         sys.stdout.flush()  # a program may wait for the address
-        while not server.wait(0.2):
-            pass
+        with shown_in_any_case(lambda: _tell(arguments, server)):
+            while not server.wait(0.2):
+                pass
+
+
+def _tell(arguments: argparse.Namespace, server: Server) -> None:
+    if not arguments.json:
+        say(plain(server.summary().as_text()))
