@@ -114,7 +114,7 @@ def evaluate(
         A score for each player, in their order, as soon as it is known.
     """
     seeds = list(seeds)
-    starts = periods or [(None, most_steps)] * len(seeds)
+    own: list[tuple[float | None, int]] = [(None, most_steps)] * len(seeds)
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form
         for name, player in players.items():
@@ -126,7 +126,7 @@ def evaluate(
             episodes: list[Summary] = []
             each = (
                 simulate(played, policy, seed, steps, advance, start)
-                for seed, (start, steps) in zip(seeds, starts, strict=True)
+                for seed, (start, steps) in zip(seeds, periods or own, strict=True)
             )
             try:
                 episodes.extend(each)
