@@ -229,8 +229,10 @@ class Server:
             end = await _SERVERS[plant["protocol"]](plant, self._port, twin.values, self._bound)
             try:
                 pause = plant.step / 2 / getattr(self._clock, "speed", 1.0)
-                while not twin.is_over:
+                is_over = False
+                while not is_over:
                     await asyncio.sleep(pause)
+                    is_over = twin.is_over
                     twin.values()
             finally:
                 await end()
