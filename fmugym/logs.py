@@ -359,14 +359,13 @@ def as_logged(task: Task, log: PlantLog) -> Task:
 def _as_logged(entry: Entry, log: PlantLog, name: str) -> dict[str, Any]:
     """Data with the values of a log while there are some, and their own at other times."""
     series, known = read_data(entry), ~np.isnan(log.columns[name])
-    times, first = np.unique(log.times[known], return_index=True)
-    values = log.columns[name][known][first]
+    times, values = log.times[known], log.columns[name][known]
     if series.period == _YEAR and len(times):
-        own = (series.start + series.times) % _YEAR
-        others = (own < times[0]) | (own > times[-1])
-        times, values = np.append(own[others], times), np.append(series.values[others], values)
-        times, first = np.unique(times, return_index=True)
-        values = values[first]
+        own = series.start + series.times
+        others = (own - times[0]) % _YEAR > np.ptp(times)
+        times, values = np.append(times, own[others]), np.append(values, series.values[others])
+    times, first = np.unique(times % _YEAR, return_index=True)
+    values = values[first]
     left_out = "file", "column", "table", "time", "step"
     kept = {key: value for key, value in entry.value.items() if key not in left_out}
     found = {"values": values.tolist(), "times": times.tolist(), "period": _YEAR}

@@ -20,6 +20,7 @@ from plant_tools import (
     nothing_left,
     watched,
 )
+from pymodbus.client import ModbusTcpClient
 
 import fmugym
 from fmugym.baselines import MPC
@@ -108,8 +109,6 @@ class TestShadow:
         assert functions_in(line.sent) == {1, 3, 4}
 
     def test_the_server_refuses_who_writes(self, server):
-        from pymodbus.client import ModbusTcpClient
-
         host, port = server.address.split(":")
         client = ModbusTcpClient(host, port=int(port))
         assert client.connect()
@@ -168,7 +167,7 @@ class TestFaults:
                 told.append((bool(info["missing"]), info.get("fault", "")))
             env.complete()
         assert [missing for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
-        assert ["T: " in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
+        assert ["T, T_floor" in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
         assert re.search("connection|does not answer", told[4][1])
         series = env.series
         assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
@@ -206,13 +205,13 @@ class TestFaults:
             env.step(np.float32([0.5]))
         clock.patience = 0.1
         *_, info = env.step(np.float32([0.5]))
-        assert "T: " in info["fault"]
+        assert "T, T_floor, power, u, clock: " in info["fault"]
         clock.patience = 3.0
         with Server(house(), "thermostat", clock=clock, seed=1) as second:
             line.target = int(second.address.split(":")[1])
             for _ in range(2):
                 *_, info = env.step(np.float32([0.5]))
-            assert "T: " not in info.get("fault", "")
+            assert "T_floor" not in info.get("fault", "")
             env.close()
         line.close()
 
@@ -220,7 +219,7 @@ class TestFaults:
         task = house(timeout="0.2s")
         with (
             watched(clock, "127.0.0.1:9", task) as env,
-            pytest.raises(SimulationError, match=r"T: .*connection"),
+            pytest.raises(SimulationError, match=r"T, T_floor, power, u, clock: .*connection"),
         ):
             env.reset()
 
@@ -473,6 +472,26 @@ class TestServer:
                 env.step(np.float32([0.5]))
         assert np.diff(env.series["T"], 2).std() > 0.5
         assert np.diff(env.series["T_floor"], 2).std() < 5.0
+
+    def test_tells_as_much_as_a_register_can_hold(self, clock):
+        """Some 300 K are 3000 steps of 0.1 K; of 1 mK, there are more than 15 bits hold."""
+        tags = tags_with(
+            T_floor={"register": 30, "type": "uint16", "scale": 0.1, "unit": "K"},
+            T={"register": 31, "type": "int16", "scale": 0.001, "unit": "K"},
+        )
+        with Server(house(tags=tags), "thermostat", clock=clock) as server:
+            host, port = server.address.split(":")
+            client = ModbusTcpClient(host, port=int(port))
+            assert client.connect()
+            floor, room = client.read_holding_registers(30, count=2).registers
+            client.close()
+        assert 2900 < floor < 3300
+        assert room == 2**15 - 1
+
+    def test_refuses_tags_that_share_registers(self, clock):
+        tags = tags_with(T_floor={"register": 3, "type": "int16"})
+        with pytest.raises(ConfigError, match=r"T_floor: it shares holding 3 with 'T'"):
+            Server(house(tags=tags), "thermostat", clock=clock)
 
     def test_ends_after_its_steps(self, clock):
         with Server(house(), "random", clock=clock, steps=2) as server:

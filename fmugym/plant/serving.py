@@ -248,7 +248,8 @@ class Server:
         if isinstance(error, FMUGymError):
             raise error
         if error is not None:
-            raise SimulationError(f"the server has failed: {error}") from error
+            where = f"port {self._port} of the loopback" if self._port else "the loopback"
+            raise SimulationError(f"the server at {where} has failed: {error}") from error
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end, for some real time; tells whether it has come.

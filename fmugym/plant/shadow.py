@@ -17,7 +17,7 @@ from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.episodes.simulation import Policy
 from fmugym.logs import on_time_of_year
-from fmugym.plant.feed import Feed, local_time
+from fmugym.plant.feed import Feed, local_time, told
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
@@ -150,12 +150,12 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _told(self, proposed: dict[str, float], predicted: dict[str, float]) -> dict[str, Any]:
         feed = self._feed
-        faults = [f"{name}: {why}" for name, why in feed.faults.items()]
+        faults = [told(feed.faults)] if feed.faults else []
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        told: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
-        told["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
-        return told | ({"fault": "; ".join(faults)} if faults else {})
+        info: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
+        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
+        return info | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:
         """End the connection."""

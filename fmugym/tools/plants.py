@@ -34,7 +34,7 @@ from fmugym.tools.options import (
     shown_in_any_case,
 )
 
-__all__ = ["add_of_plants", "add_serve", "follow_plant"]
+__all__ = ["add_of_plants", "add_serve", "follow_plant", "task_of"]
 
 _AHEAD: Final = "3h"
 
@@ -58,18 +58,25 @@ def _clock(arguments: argparse.Namespace) -> RealClock:
     return RealClock(check_number("--speed", arguments.speed, positive=True))
 
 
-def _task_of(arguments: argparse.Namespace) -> Task:
+def task_of(arguments: argparse.Namespace) -> Task:
+    """Read the task of a plant.
+
+    Raises:
+        ConfigError: If it is no file, or has a mistake.
+    """
     if not Path(arguments.task).is_file():
-        raise ConfigError(f"a plant needs a task file with [plant], got {shown(arguments.task)}")
+        raise ConfigError(f"a plant needs a task file, got {shown(arguments.task)}")
     return Task.read(arguments.task)
 
 
 def follow_plant(arguments: argparse.Namespace) -> None:
     """Let one who acts be the shadow of a plant, until so many steps are done."""
+    if arguments.scenario is not None or arguments.episodes != 1:
+        raise ConfigError("a plant has no --scenario and no --episodes: say --steps")
     player = only_player(arguments)
     ahead = duration("--ahead", arguments.ahead)
     make_env: Any = partial(
-        connect, _task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
+        connect, task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
     )
     recording, done = Recording(arguments.task, None, arguments.output), list[Summary]()
     with closing(player.make_env(make_env)) as env:
@@ -154,7 +161,7 @@ def _serve(arguments: argparse.Namespace) -> None:
     check_numbers(arguments)
     steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
-    task, player = _task_of(arguments), only_player(arguments)
+    task, player = task_of(arguments), only_player(arguments)
     has_plant = "plant" in task.document
     if arguments.protocol is not None:
         task = with_plant(task, arguments.protocol)

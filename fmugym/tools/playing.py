@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from fmugym.declared import Task
 from fmugym.env import FMUEnv
 from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
@@ -31,7 +30,7 @@ from fmugym.tools.options import (
     say_json,
     shown_in_any_case,
 )
-from fmugym.tools.plants import add_of_plants, follow_plant
+from fmugym.tools.plants import add_of_plants, follow_plant, task_of
 from fmugym.tools.shadows import evaluate_log
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
@@ -166,7 +165,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
         if arguments.log is not None:
-            task, log = Task.read(arguments.task), PlantLog.read(arguments.log)
+            task, log = task_of(arguments), PlantLog.read(arguments.log)
             with progress(None, "evaluate") as advance:
                 scores.extend(evaluate_log(task, log, players, advance))
             return
