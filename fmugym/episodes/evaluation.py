@@ -21,6 +21,7 @@ from fmugym.series.intervals import confidence
 __all__ = [
     "HELD_OUT_SEED",
     "Score",
+    "aligned",
     "evaluate",
     "plot_scores",
     "table",
@@ -182,12 +183,14 @@ def table(scores: Sequence[Score]) -> str:
     """Format scores for a terminal: lines of printable ASCII."""
     kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
     header = ("", "reward", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time")
-    rows = [header, *(_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True))]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
-    return "\n".join(
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
-    )
+    rows = (_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True))
+    return "\n".join(aligned([header, *rows]))
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table whose cells stand below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
 def _labels(scores: Sequence[Score]) -> list[str]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import duration
+from fmugym.episodes.evaluation import aligned
 from fmugym.episodes.output_files import require_picture
 from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
@@ -201,12 +201,7 @@ def _table(fit: FitResult) -> list[str]:
     for name, one in fit.correlations.items():
         numbers = f"{fit.rms(name):.3g}", f"{fit.comparison.explained(name):.2%}"
         outputs.append((name, *numbers, f"{one.first:.2f}", variables.variable(name).unit or ""))
-    return [*_aligned(rows), "", *_aligned(outputs)]
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return [*aligned(rows), "", *aligned(outputs)]
 
 
 def _warnings(fit: FitResult) -> list[str]:

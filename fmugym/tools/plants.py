@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -16,7 +16,7 @@ from fmugym.declared.writing import as_toml
 from fmugym.episodes.output_files import Recording
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Summary, simulate
-from fmugym.errors import ConfigError, FMUGymError, plain, shown
+from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
 from fmugym.plant.predicting import Error
 from fmugym.plant.proposing import with_plant
@@ -86,8 +86,8 @@ def follow_plant(arguments: argparse.Namespace) -> None:
             played = recording.begin("shadow", shadow, arguments.variables, arguments.every)
         policy = holding(player.make_policy(shadow.unwrapped), shadow)
         with (
-            _finished_after_errors(recording, arguments.seed),
-            shown_in_any_case(lambda: _show(arguments, recording, done, shadow.errors())),
+            shown_in_any_case(lambda: _show(arguments, done, shadow.errors())),
+            recording.finished(arguments.seed),
             progress(arguments.steps, "shadow") as advance,
         ):
             while (left := arguments.steps - sum(one.steps for one in done)) > 0:
@@ -96,22 +96,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
                     say(plain(done[-1].as_text()))
 
 
-@contextmanager
-def _finished_after_errors(recording: Recording, seed: int) -> Iterator[None]:
-    try:
-        yield
-    except FMUGymError:
-        recording.finish(seed)
-        raise
-
-
-def _show(
-    arguments: argparse.Namespace,
-    recording: Recording,
-    done: Sequence[Summary],
-    errors: Sequence[Error],
-) -> None:
-    recording.finish(arguments.seed)
+def _show(arguments: argparse.Namespace, done: Sequence[Summary], errors: Sequence[Error]) -> None:
     if arguments.json:
         told = [one.as_dict() for one in done]
         predictions = [one._asdict() for one in errors]

@@ -13,7 +13,7 @@ from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
-from fmugym.errors import FMUGymError, plain
+from fmugym.errors import plain
 from fmugym.logs import PlantLog
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.options import (
@@ -81,22 +81,17 @@ def _simulate(arguments: argparse.Namespace) -> None:
     runs: dict[str, list[Summary]] = {name: [] for name in players}
 
     def show() -> None:
-        recording.finish(arguments.seed)
         if arguments.json:
             told = {name: [one.as_dict() for one in found] for name, found in runs.items()}
             only = {"episodes": next(iter(told.values()))} if len(told) == 1 else {}
             say_json({"task": arguments.task, "output": arguments.output, "runs": told, **only})
 
-    try:
-        for player in players.values() if len(players) > 1 else ():
-            with closing(player.make_env(_maker(arguments))) as env:
-                player.make_policy(env)  # so that no mistake comes up after another has played
-        with shown_in_any_case(show):
-            for name, player in players.items():
-                _play(arguments, recording, name, player, runs)
-    except FMUGymError:
-        recording.finish(arguments.seed)
-        raise
+    for player in players.values() if len(players) > 1 else ():
+        with closing(player.make_env(_maker(arguments))) as env:
+            player.make_policy(env)  # so that no mistake comes up after another has played
+    with shown_in_any_case(show), recording.finished(arguments.seed):
+        for name, player in players.items():
+            _play(arguments, recording, name, player, runs)
 
 
 def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
