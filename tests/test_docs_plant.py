@@ -21,7 +21,8 @@ from fmugym.tools.cli import main
 
 TEXT = (Path(__file__).parent.parent / "docs" / "plant-tutorial.md").read_text(encoding="utf-8")
 REACHED = re.compile(r"seed \d+: reward (\S+), cost \S+ in (\d+) steps")
-PI = re.compile(r"pid of=T setpoint=([\d.]+) kp=([\d.]+) ti=([\d.]+)(?=[\"\n])")
+_NUMBER = r"(\d+(?:\.\d+)?)"
+PI = re.compile(rf"pid of=T setpoint={_NUMBER} kp={_NUMBER} ti={_NUMBER}")
 
 
 def blocks():
