@@ -22,8 +22,8 @@ __all__ = ["Feed", "local_time", "told"]
 _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
 
-_LATE: Final = 0.5
-"""How late a thread of this machine may be, in seconds of real time."""
+_LATE: Final = 2.0
+"""How late a thread or an answer may be, in seconds of real time."""
 
 
 def local_time() -> float:
