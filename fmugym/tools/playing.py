@@ -13,7 +13,7 @@ from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
-from fmugym.errors import plain
+from fmugym.errors import ConfigError, plain
 from fmugym.logs import PlantLog
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.options import (
@@ -155,6 +155,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
+    if arguments.log is not None and arguments.scenario:
+        raise ConfigError("--log has its own periods: leave --scenario out")
     players = players_of(arguments, random=arguments.log is None)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []
