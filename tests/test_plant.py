@@ -561,6 +561,10 @@ class TestCommands:
         for command in (["simulate", "house.toml", "--plant"], ["serve", "house.toml"]):
             assert main(command) == 1
             assert "[plant]" in capsys.readouterr().err
+        others = ["--scenario", "frost"]
+        for command in (["simulate", "--plant"], ["evaluate", "--log", "plant.csv"]):
+            assert main([command[0], "house.toml", *command[1:], *others]) == 1
+            assert "--scenario" in capsys.readouterr().err
         assert main(["serve", "house.toml"]) == 1
         assert "--modbus or --opcua" in capsys.readouterr().err
 
