@@ -28,7 +28,7 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.identification import FitResult, Trajectory
 from fmugym.identification.output_error import fit_of
-from fmugym.identification.problem import Experiment, Problem
+from fmugym.identification.problem import Experiment, Problem, silent
 from fmugym.identification.simulator import median_interval
 from fmugym.logs import Columns, PlantLog, declared_as
 from fmugym.pool.spec import is_start_time
@@ -56,6 +56,7 @@ def fit_logs(
     columns: Mapping[str, str] | None = None,
     candidates: int = 32,
     max_evaluations: int = 100,
+    advance: Callable[[float], None] = silent,
 ) -> FitResult:
     """Fit parameters of a task's FMU to logs of the plant.
 
@@ -76,6 +77,7 @@ def fit_logs(
         columns: The names of the FMU by the names of columns that differ.
         candidates: How many points within the ranges are tried first; see ``fit_parameters``.
         max_evaluations: As for ``fit_parameters``.
+        advance: Is told how many simulations of a log were done since its last call.
 
     Returns:
         Values and all else by the names and in the units of the FMU.
@@ -107,6 +109,7 @@ def fit_logs(
             backend="auto",
             wash_in=check_number("wash_in", wash_in, 0.0),
             plant=plant.env.inside.opening,
+            advance=advance,
         )
         with closing(Problem(experiment, wanted, trajectories)) as problem:
             return fit_of(experiment, problem, max_evaluations, candidates)

@@ -30,6 +30,9 @@ from fmugym.archive.units import conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
+from fmugym.declared.entries import Entry
+from fmugym.declared.series import read_data
+from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.fmi.status import Status
@@ -39,12 +42,25 @@ from fmugym.series.store import TEXT
 from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
-__all__ = ["Actions", "Columns", "PlantLog", "declared_as", "play_log"]
+__all__ = [
+    "Actions",
+    "Columns",
+    "PlantLog",
+    "as_logged",
+    "declared_as",
+    "on_time_of_year",
+    "play_log",
+]
 
 _HEADING: Final = re.compile(r"\s*(?P<name>.*?)\s*(?:\[(?P<unit>[^\[\]]+)\])?\s*$")
 _INDEXED: Final = re.compile(r"\d+(,\s*\d+)*$")
 _SAME_TIME: Final = 1e-9
 """Times that differ by less, in seconds, are the same."""
+
+_YEAR: Final = 365 * 86400.0
+
+_PROPOSED: Final = "proposed."
+"""What the names of columns of proposals begin with."""
 
 _MOST_ACTIONS: Final = 10_000
 """The most actions of discrete spaces that are tried out for a row."""
@@ -109,6 +125,16 @@ class PlantLog:
         units = {name: unit for name, unit in found if unit and unit != TEXT}
         before = "step" in values if inputs_before is None else inputs_before
         return cls(times, values, units, numbers.astype(np.float64), before, texts)
+
+    @property
+    def proposed(self) -> PlantLog | None:
+        """The same with the inputs that were proposed in the shadow of a plant; None for others."""
+        given = {
+            acted: np.where(np.isnan(values), self.columns[acted], values)
+            for name, values in self.columns.items()
+            if (acted := name.removeprefix(_PROPOSED)) != name and acted in self.columns
+        }
+        return replace(self, columns={**self.columns, **given}) if given else None
 
     def parts(self, needed: Sequence[str] = ()) -> Iterator[PlantLog]:
         """The episodes, one by one.
@@ -205,7 +231,8 @@ def play_log(
     that make the task write the logged inputs. Rewards, observations and ends are the task's own.
     Where an episode ends, the next one begins with the row that follows. Where an input or output
     was not measured, an episode is truncated. So is the last one by the end of the log. An episode
-    of the log shorter than one time step is left out.
+    of the log shorter than one time step is left out. A start time that the task draws is that of
+    the log.
 
     Args:
         log: The log. It needs a column for each input and output of the task.
@@ -276,6 +303,7 @@ class _Player:
         for variable in inner.inside.spec.outputs:
             self._columns.require(variable)
         self._actions = Actions(inner, self._columns, tolerance)
+        self._has_drawn_start = inner.config.draws_start_time
 
     def play(self, seed: int) -> list[Recording]:
         episodes: list[Recording] = []
@@ -283,7 +311,9 @@ class _Player:
             times, rows = self._columns.rows(part, self._time_step)
             self._plant.rows, self._plant.row = rows, 0
             while self._plant.left > 0:
-                self._recorder.reset(seed=seed + len(episodes))
+                now = float(times[self._plant.row])
+                options = {"model_parameters": {"start_time": now}} if self._has_drawn_start else {}
+                self._recorder.reset(seed=seed + len(episodes), options=options)
                 episodes.append(self._episode(times, rows))
         if not episodes:
             raise ConfigError(
@@ -303,6 +333,43 @@ class _Player:
         recording = self._recorder.recording
         recording.truncated[-1] |= not over
         return recording
+
+
+def on_time_of_year(task: Task, start_time: Any) -> Task:
+    """Return the task on the time of a plant: seconds of the year, from any time on.
+
+    Args:
+        task: The task. Its clock, start time and warm-up are left out.
+        start_time: When episodes begin.
+    """
+    left_out = "clock", "warm_up", "start_time"
+    document = {key: value for key, value in task.document.items() if key not in left_out}
+    return replace(task, document={**document, "start_time": start_time})
+
+
+def as_logged(task: Task, log: PlantLog) -> Task:
+    """Return the task on the time of a log of seconds of the year, and with the data in it."""
+    task = on_time_of_year(task, Uniform(0.0, _YEAR))
+    entries = task.root.child("data").items().items()
+    data = {n: _as_logged(entry, log, n) for n, entry in entries if n in log.columns}
+    own = task.document.get("data", {})
+    return replace(task, document={**task.document, "data": {**own, **data}}) if data else task
+
+
+def _as_logged(entry: Entry, log: PlantLog, name: str) -> dict[str, Any]:
+    """Data with the values of a log while there are some, and their own at other times."""
+    series, known = read_data(entry), ~np.isnan(log.columns[name])
+    times, values = log.times[known], log.columns[name][known]
+    if series.period == _YEAR and len(times):
+        own = series.start + series.times
+        others = (own - times[0]) % _YEAR > np.ptp(times)
+        times, values = np.append(times, own[others]), np.append(values, series.values[others])
+    times, first = np.unique(times % _YEAR, return_index=True)
+    values = values[first]
+    left_out = "file", "column", "table", "time", "step"
+    kept = {key: value for key, value in entry.value.items() if key not in left_out}
+    found = {"values": values.tolist(), "times": times.tolist(), "period": _YEAR}
+    return {"min": series.low, "max": series.high, **kept, **found}
 
 
 def declared_as(env: FMUEnv, alias: str) -> tuple[str, str | None]:

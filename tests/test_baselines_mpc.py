@@ -13,6 +13,7 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import MPC, PID, controller_of
 from fmugym.baselines.mpc import _Foresight
+from fmugym.baselines.observer import spread
 from fmugym.envs import CartPoleEnv
 from fmugym.episodes.simulation import policy_of, simulate
 from fmugym.task.future import Future, Lookup
@@ -307,7 +308,18 @@ class TestModel:
         play(env, controller, 4, seed)
         episode = controller._episodes[0]
         errors = np.abs(episode.seen[:, 0] - env.state[0])
-        assert errors[episode.best] < 0.5 * errors[0]
+        assert errors[episode.observer.best] < 0.5 * errors[0]
+
+    def test_copies_of_a_fitted_task_have_whole_rows(self, opened, bound, tmp_path):
+        mass = np.random.default_rng(0).uniform(0.5, 1.5, 50)
+        rows = np.stack([mass, 2.0 - mass], axis=1)
+        np.savez(tmp_path / "rows.npz", names=np.array(["m", "l"]), rows=rows)
+        env = opened(wheel() | {"fitted": str(tmp_path / "rows.npz")})
+        values = spread(env, 0)
+        np.testing.assert_allclose(values["m"] + values["l"], 2.0)
+        assert abs(values["m"][0] - np.median(mass)) < 0.05
+        assert np.ptp(values["m"]) > 0.5
+        play(env, bound(), 2)
 
     def test_may_be_another_environment(self, opened, bound):
         """That of the planner is twice as heavy: it pushes too hard."""

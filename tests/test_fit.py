@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from contextlib import contextmanager
 from functools import partial
 
 import fit_coverage
@@ -92,6 +93,16 @@ class TestPendulum:
         code, _, err = cli("fit", task, "--log", log, *NAMES, "--output", output)
         assert code == 1
         assert "exists" in err
+
+    def test_it_shows_how_far_it_is(self, cli, task, tmp_path, monkeypatch):
+        counts = []
+        shown = contextmanager(lambda total, what, unit: iter([counts.append]))
+        monkeypatch.setattr("fmugym.tools.fitting.progress", shown)
+        log = write_log(tmp_path / "log.csv")
+        assert cli("fit", task, "--log", log, *NAMES, *START, "--candidates", 5)[0] == 0
+        assert counts[0] == 1
+        assert max(counts) == 4  # two parameters, a start, and none of them changed
+        assert sum(counts) > 20
 
     def test_a_wrong_model_is_told(self, cli, task, tmp_path):
         """The friction of the plant is Coulomb's, the model's is viscous."""

@@ -9,7 +9,9 @@ from gymnasium import spaces
 
 import fmugym
 from fmugym import ConfigError, bundled_fmu
-from fmugym.logs import PlantLog, play_log
+from fmugym.declared.series import read_data
+from fmugym.envs.house import HOUSE_TASK
+from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.recording import Recorder
 from fmugym.series import RecordSeries
 
@@ -188,3 +190,23 @@ class TestMistakes:
         log = log_of(tmp_path, "time,x,x_dot,f\n0,1,2,3\n1,1,2,3")
         with pytest.raises(ConfigError, match="10000"):
             play_log(log, Many)
+
+
+def test_the_record_of_a_shadow_at_the_end_of_a_year_has_its_own_data():
+    """From noon of December 31 to noon of January 1; before and after, the house has its own."""
+    day, year = 86400.0, 365 * 86400.0
+    times = np.arange(364.5 * day, 365.5 * day, 900.0)
+    log = PlantLog(times, {"price": np.full(len(times), 9.0)}, {}, np.zeros(len(times)))
+    task = fmugym.Task.read(HOUSE_TASK)
+    own, found = (
+        read_data(one.root.child("data").child("price")) for one in (task, as_logged(task, log))
+    )
+
+    def at(series, moment):
+        since = (moment - series.start) % series.period
+        return series.values[np.searchsorted(series.times, since, side="right") - 1]
+
+    assert found.period == year
+    assert [at(found, moment * day) for moment in (364.6, 365.0, 0.1)] == [9.0] * 3
+    for moment in (0.6, 100.0, 364.4):
+        assert at(found, moment * day) == at(own, moment * day)

@@ -76,9 +76,13 @@ def test_nobody_can_write(server, clock):
 
 def test_the_shadow_never_asks_to_write(server, clock, monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        "asyncua.server.internal_session.InternalSession.write", lambda *given: asked.append(given)
-    )
+
+    async def write(_, given):
+        """The server writes its own time to namespace 0."""
+        asked.extend(one for one in given.NodesToWrite if one.NodeId.NamespaceIndex)
+        return [ua.StatusCode()] * len(given.NodesToWrite)
+
+    monkeypatch.setattr("asyncua.server.internal_session.InternalSession.write", write)
     with watched(clock, server.address, house("opcua")) as env:
         env.reset(seed=0)
         env.step(np.float32([0.3]))

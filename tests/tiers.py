@@ -13,6 +13,7 @@ SLOW_MODULES = {
     "test_cli_docs",
     "test_cli_search",
     "test_docs_tutorial",
+    "test_docs_plant",
     "test_cli_tuning",
     "test_clock_fractions",
     "test_compile",
@@ -239,6 +240,7 @@ SLOW_TESTS = (
 EXHAUSTIVE_TESTS = (
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[robertson",
     "test_cli_advice.py::TestSolvers::test_stiff_models_get_one_for_stiff_models[van_der_pol",
+    "test_docs_plant.py::test_the_agent_beats",
     "test_examples_system.py",
     "test_systems_faces.py::TestCommandLine::test_validation",
     "test_systems_ssp.py::TestDamaged",

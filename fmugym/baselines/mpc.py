@@ -16,6 +16,7 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from fmugym.baselines.controller import Controller, FloatArray, attribute_of
+from fmugym.baselines.observer import COPIES, CORRECTION, Observer, spread
 from fmugym.checks import (
     LARGEST_COUNT,
     check_flag,
@@ -24,7 +25,6 @@ from fmugym.checks import (
     check_seed,
     duration,
 )
-from fmugym.distributions import is_distribution
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.task.future import Future
@@ -39,15 +39,6 @@ _PULSES: Final = 2
 
 _DECADES: Final = 1.5
 """Over so many powers of ten the heights of pulses are spread."""
-
-_COPIES: Final = 9
-"""So many different copies run beside each environment."""
-
-_LASTING: Final = 0.98
-"""The part of the past errors of a copy that counts after a step."""
-
-_SAMPLES: Final = 1001
-"""The copies have quantiles of so many samples of what is drawn."""
 
 _PENALTY: Final = 1e9
 """How much more a unit of a cost beyond its limit counts than one of the reward."""
@@ -91,7 +82,8 @@ class MPC(Controller):
             a better search; it shows how much there is to gain.
         seed: Of the candidates. The same arguments give the same actions.
         model: A function that makes the environment to plan with, which has the observations and
-            actions of the controlled one. By default that is copied, which a plant cannot be.
+            actions of the controlled one. By default that is copied; the environments of
+            ``fmugym.plant`` know one.
     """
 
     def __init__(
@@ -100,7 +92,7 @@ class MPC(Controller):
         candidates: int = 256,
         rounds: int = 4,
         warm: Controller | None = None,
-        correction: float = 0.3,
+        correction: float = CORRECTION,
         budget: float | None = 1.0,
         states: Mapping[str, str] | str | None = None,
         perfect: bool = False,
@@ -148,7 +140,7 @@ class MPC(Controller):
             )
         self._plan_shape = steps, self._low.size
         make = self._model_of()
-        self._many = max(_COPIES, self.candidates // self.rounds)
+        self._many = max(COPIES, self.candidates // self.rounds)
         self._copies = FMUVectorEnv(make, self._many, autoreset_mode="Disabled")
         self._prototype = self._copies.inside.prototype
         self._cost_limits = getattr(self._prototype, "cost_limits", {})
@@ -180,7 +172,9 @@ class MPC(Controller):
         """What makes copies."""
         if self.model is not None:
             return self.model
-        env = attribute_of(self._env, "unwrapped")
+        env: FMUEnv = attribute_of(self._env, "unwrapped")
+        if env.inside.model is not None:
+            return env.inside.model
         if env.inside.pool.save_method is None:
             raise ConfigError(
                 "MPC needs an FMU that it can copy, but a backend stands in for this one: give "
@@ -237,7 +231,7 @@ class MPC(Controller):
             if episode is None:
                 episode = self._episodes[index] = self._begun(env)
             else:
-                self._follow(episode, row, now)
+                self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
         with self._copied.inside.episodes.assuming(data):
@@ -245,9 +239,8 @@ class MPC(Controller):
         episode.row, episode.steps, episode.plan = row, episode.steps + 1, best.numbers
         for name, paid in best.costs.items():
             episode.costs[name] = episode.costs.get(name, 0.0) + paid
-        episode.action = self._actions(episode.plan[np.newaxis])[0, 0]
         self._require_time(start, perf_counter() - begin)
-        return np.asarray(episode.action, np.float64)
+        return np.asarray(self._actions(episode.plan[np.newaxis])[0, 0], np.float64)
 
     def _require_time(self, start: Snapshot, took: float) -> None:
         if start.method == "replay" and self.budget is not None and took > self.budget:
@@ -262,10 +255,10 @@ class MPC(Controller):
     def _begun(self, env: FMUEnv) -> _Episode:
         """Begin an episode of the copies; the first one has the nominal parameters."""
         copied, episode = self._copied, _Episode()
-        values = _quantiles(self._prototype, self.seed)
+        values = spread(self._prototype, self.seed)
         if self._prototype.config.draws_start_time:
-            values["start_time"] = np.full(_COPIES, env.time - env.step_count * self.time_step)
-        for place in range(_COPIES if values else 1):
+            values["start_time"] = np.full(COPIES, env.time - env.step_count * self.time_step)
+        for place in range(COPIES if values else 1):
             mask = np.arange(self._many) == place if place else np.ones(self._many, np.bool_)
             options: dict[str, Any] = {"reset_mask": mask}
             given = {name: float(each[place]) for name, each in values.items()}
@@ -276,17 +269,17 @@ class MPC(Controller):
             if np.ndim(value) == 0 and name not in keys and name in self._prototype.variables:
                 copied.inside.engine.set_variable(name, float(value))
         episode.seen = np.asarray(observations, np.float64)
-        episode.errors = np.zeros(episode.seen.shape)
         episode.snapshot = copied.save_state()
         episode.plan = np.full(self._plan_shape, 0.5)
         episode.rng = np.random.default_rng(self.seed)
         episode.warm = copy.deepcopy(self._warm)
         if self._inverse is None:
             self._inverse = self._find_inverse(episode.snapshot[0])
-        episode.offsets = np.zeros((self._many, len(self._inverse)))
+        measured, outputs = episode.seen.shape[1], len(self._inverse)
+        episode.observer = Observer(self._many, measured, outputs, self.correction)
         return episode
 
-    def _follow(self, episode: _Episode, row: FloatArray, now: float) -> None:
+    def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
         """Let the copies do the step that the environment has done, with what was observed."""
         if episode.have_ended:
             return
@@ -294,7 +287,7 @@ class MPC(Controller):
         data = self._foresight.observed(episode.row, row, now)
         with copied.inside.episodes.assuming(data):
             copied.restore_state(episode.snapshot)
-            actions = np.repeat(episode.action[np.newaxis], self._many, axis=0)
+            actions = np.repeat(np.asarray(action)[np.newaxis], self._many, axis=0)
             observations, _, terminated, truncated, _ = copied.step(actions)
             goes_on = np.flatnonzero(~(terminated | truncated))
             episode.have_ended = not len(goes_on)
@@ -304,8 +297,7 @@ class MPC(Controller):
             episode.snapshot = copied.save_state()[sources]
         episode.seen = np.asarray(observations, np.float64)[sources]
         off = (row - episode.seen) * self._foresight.is_present
-        episode.errors = _LASTING * episode.errors[sources] + off**2
-        episode.offsets = episode.offsets[sources]
+        episode.observer.follow(off, sources)
 
     def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
         """How offsets of the outputs follow from differences of observations."""
@@ -329,13 +321,13 @@ class MPC(Controller):
         if self.states:
             return self._moved(episode, row), {}, {"seed": self.seed}
         assert self._inverse is not None
-        wanted = (row - episode.seen) @ self._inverse.T
-        episode.offsets += self.correction * (wanted - episode.offsets)
-        offsets = episode.offsets[episode.best].tolist()
+        episode.observer.correct((row - episode.seen) @ self._inverse.T)
+        best = episode.observer.best
+        offsets = episode.observer.offsets[best].tolist()
         names = list(self._prototype.out)
         assumed = {"offsets": dict(zip(names, offsets, strict=True)), "seed": self.seed}
         data = self._foresight.ahead(episode.told, episode.steps, now)
-        return episode.snapshot[episode.best], data, assumed
+        return episode.snapshot[best], data, assumed
 
     def _moved(self, episode: _Episode, row: FloatArray) -> Snapshot:
         """Let the copies go on in the state that was observed."""
@@ -343,7 +335,7 @@ class MPC(Controller):
         values = expected + self.correction * (row[self._places] - expected)
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
-        nominal = {n: float(v[0]) for n, v in _quantiles(self._prototype, self.seed).items()}
+        nominal = {n: float(v[0]) for n, v in spread(self._prototype, self.seed).items()}
         copied = self._copied
         seed = self.seed + episode.steps
         copied.reset(seed=seed, options={"model_parameters": nominal | starts})
@@ -455,11 +447,9 @@ class _Episode:
     Attributes:
         snapshot: Where the copies are.
         seen: What they observe, shape (n, k).
-        errors: The sums of squared differences from what was observed, shape (n, k).
-        offsets: What is added to the outputs of each, shape (n, o).
+        observer: Knows which copy fits best, and what is added to the outputs of each.
         have_ended: Whether their episodes have ended; the last snapshot stays.
         plan: The latest plan, from 0 to 1, shape (steps, m).
-        action: The latest action, as the copies take it.
         row: The latest observation.
         steps: How many there were before.
         told: The latest forecast of data for each step, by name.
@@ -470,10 +460,8 @@ class _Episode:
 
     snapshot: Snapshot
     seen: FloatArray
-    errors: FloatArray
-    offsets: FloatArray
+    observer: Observer
     plan: FloatArray
-    action: Any
     row: FloatArray
     warm: list[Controller]
     rng: np.random.Generator
@@ -483,13 +471,6 @@ class _Episode:
         self.costs: dict[str, float] = {}
         self.have_ended = False
         self.steps = 0
-
-    @property
-    def best(self) -> int:
-        """The copy that fits best; each observation counts by what copies differ in it."""
-        totals = self.errors.sum(axis=0)
-        parts = self.errors / np.where(totals > 0.0, totals, 1.0)
-        return int(parts.sum(axis=1).argmin())
 
 
 class _Foresight:
@@ -587,18 +568,6 @@ def _single(env: Any, index: int) -> Iterator[FMUEnv]:
         return
     with env.inside.engine.single(index) as one:
         yield one
-
-
-def _quantiles(env: FMUEnv, seed: int) -> dict[str, FloatArray]:
-    """Values of the parameters that are drawn, by name, one for each copy; medians come first."""
-    rng, found = np.random.default_rng(seed), {}
-    others = np.delete(np.arange(_COPIES), _COPIES // 2)
-    for name, value in env.config.model_parameters.items():
-        if is_distribution(value):
-            drawn = [value.sample(rng) for _ in range(_SAMPLES)]
-            each = np.quantile(drawn, (np.arange(_COPIES) + 0.5) / _COPIES)
-            found[name] = each[[_COPIES // 2, *rng.permutation(others)]]
-    return found
 
 
 def _pairs(states: Mapping[str, str] | str | None) -> dict[str, str]:

@@ -654,10 +654,6 @@ PLANT: Final = Table(
             "By name, where the data that the agent sees come from: a file that something else "
             "refreshes (keys as in `data`, times in seconds of the year), or a tag.",
         ),
-        "states": Key(
-            Entries(TEXT),
-            "By measured variable, the parameter in which an episode of the FMU begins with it.",
-        ),
         "encryption": Key(FLAG, "OPC UA: whether messages are signed and encrypted.", True),
         "certificate": Key(PATH, "OPC UA: this client's certificate."),
         "key": Key(PATH, "OPC UA: its private key, a file of mode 600."),

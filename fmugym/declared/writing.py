@@ -17,6 +17,9 @@ Keys = tuple[str, ...]
 _INLINE: Final = ("fmu", "clock", "warm_up")
 """Tables that describe one value; they are written in one line."""
 
+_TABLES: Final = (("plant", "tags"), ("plant", "data"))
+"""Tables within others that have a heading of their own."""
+
 
 def as_toml(document: Mapping[str, Any]) -> str:
     """Write a document as TOML: single values first, then one table for each of its tables.
@@ -35,11 +38,23 @@ def as_toml(document: Mapping[str, Any]) -> str:
         if key not in tables:
             written.add(key, _item(value, (key,)))
     for key, items in tables.items():
-        table = tomlkit.table()
-        for name, value in items.items():
-            table.add(name, _item(value, (key, name)))
-        written.add(key, table)
+        written.add(key, _table(items, (key,)))
     return str(tomlkit.dumps(written))
+
+
+def _table(items: Mapping[str, Any], keys: Keys) -> Any:
+    """A table with a heading; those within it that have one come last."""
+    import tomlkit
+
+    table, last = tomlkit.table(), {}
+    for name, value in items.items():
+        if (*keys, name) in _TABLES:
+            last[name] = _table(value, (*keys, name))
+        else:
+            table.add(name, _item(value, (*keys, name)))
+    for name, one in last.items():
+        table.add(name, one)
+    return table
 
 
 def revised(text: str, document: Mapping[str, Any]) -> str | None:
@@ -80,14 +95,9 @@ def _revise(table: MutableMapping[str, Any], wanted: Mapping[str, Any], keys: Ke
 
 def _new(value: Any, keys: Keys) -> Any:
     """A value for a document that has other values already."""
-    import tomlkit
-
     if len(keys) > 1 or not isinstance(value, Mapping) or keys[0] in _INLINE:
         return _item(value, keys)
-    table = tomlkit.table()
-    for name, one in value.items():
-        table.add(name, _item(one, (*keys, name)))
-    return table
+    return _table(value, keys)
 
 
 def _same(first: Any, second: Any) -> bool:

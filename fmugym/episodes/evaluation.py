@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
+from itertools import compress
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
@@ -21,6 +22,7 @@ from fmugym.series.intervals import confidence
 __all__ = [
     "HELD_OUT_SEED",
     "Score",
+    "aligned",
     "evaluate",
     "plot_scores",
     "table",
@@ -103,6 +105,7 @@ def evaluate(
     scenario: str | None = None,
     advance: Advance = no_progress,
     wrap: Wrap = lambda env: env,
+    periods: Sequence[tuple[float, int]] = (),
 ) -> Iterator[Score]:
     """Let players play the same episodes.
 
@@ -114,11 +117,14 @@ def evaluate(
         scenario: The scenario that the environment plays, for the scores.
         advance: Is told of each step.
         wrap: Puts wrappers around the environment, such as a recorder.
+        periods: Start times and numbers of steps of the episodes, one for each seed, if the task
+            draws its start time.
 
     Yields:
         A score for each player, in their order, as soon as it is known.
     """
     seeds, first = list(seeds), tuple[float, ...]()
+    own: list[tuple[float | None, int]] = [(None, most_steps)] * len(seeds)
     with ExitStack() as stack:
         envs: dict[bool, Any] = {}  # by whether they are in the physical form
         for name, player in players.items():
@@ -128,7 +134,10 @@ def evaluate(
             played = envs[player.is_physical]
             policy, begin = player.make_policy(played.unwrapped), perf_counter()
             episodes: list[Summary] = []
-            each = (simulate(played, policy, seed, most_steps, advance) for seed in seeds)
+            each = (
+                simulate(played, policy, seed, steps, advance, start)
+                for seed, (start, steps) in zip(seeds, periods or own, strict=True)
+            )
             try:
                 episodes.extend(each)
             except KeyboardInterrupt:
@@ -193,9 +202,14 @@ def table(scores: Sequence[Score]) -> str:
     kpis = tuple(dict.fromkeys(name for score in scores for name in score.kpis))
     names = "reward", "+-", "gain", "+-", "cost", "steps", "ends", *map(plain, kpis), "x real time"
     rows = [_row(*pair, kpis) for pair in zip(_labels(scores), scores, strict=True)]
-    columns = [one for one in zip(("", *names), *rows, strict=True) if any(one[1:])]
-    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
-    return "\n".join("  ".join(row).rstrip() for row in zip(*padded, strict=True))
+    has = [any(column) for column in zip(*rows, strict=True)]
+    return "\n".join(aligned([[*compress(row, has)] for row in [("", *names), *rows]]))
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table whose cells stand below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
 def _labels(scores: Sequence[Score]) -> list[str]:

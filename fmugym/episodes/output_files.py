@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -107,8 +107,15 @@ class Recording:
         self._about = About.of(env.unwrapped)
         return self._recorders[name]
 
-    def finish(self, seed: int) -> None:
-        """Write all files with what was recorded until now."""
+    @contextmanager
+    def finished(self, seed: int) -> Iterator[None]:
+        """Write all files at the end, however that comes, with what was recorded until then."""
+        try:
+            yield
+        finally:
+            self._finish(seed)
+
+    def _finish(self, seed: int) -> None:
         runs: dict[str, TimeSeries] = {}
         for name, recorder in self._recorders.items():
             recorder.complete()

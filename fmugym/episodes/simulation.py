@@ -172,6 +172,7 @@ def simulate(
     seed: int,
     most_steps: int,
     advance: Advance = no_progress,
+    start: float | None = None,
 ) -> Summary:
     """Play one episode.
 
@@ -182,6 +183,7 @@ def simulate(
         most_steps: The steps after which to stop. A registered id may have a lower limit, which
             truncates the episode.
         advance: Is told of each step.
+        start: The start time, if the task draws one; None for one that is drawn.
 
     Returns:
         The numbers of the episode.
@@ -189,7 +191,8 @@ def simulate(
     inner: Any = env.unwrapped
     env.action_space.seed(seed)
     policy.begin()
-    observation, info = env.reset(seed=seed)
+    options = None if start is None else {"model_parameters": {"start_time": start}}
+    observation, info = env.reset(seed=seed, options=options)
     total, cost, end, begin = 0.0, None, "stopped", inner.time
     limit = inner.spec.max_episode_steps if inner.spec is not None else None
     values: set[float] = set()

@@ -34,7 +34,7 @@ from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.pool_opening import PoolOpening
 
-__all__ = ["Experiment", "Limits", "Problem", "Uncertainty"]
+__all__ = ["Experiment", "Limits", "Problem", "Uncertainty", "silent"]
 
 Limits = float | tuple[float, float] | tuple[float, float, float]
 
@@ -57,11 +57,16 @@ LEAST_NOISE = 1e-6
 """Of an output, as a part of its standard deviation."""
 
 
+def silent(count: float) -> None:
+    """Tell nobody."""
+
+
 @dataclass(frozen=True)
 class Experiment:
     """The common settings of a fit and its predictions; see ``fit_parameters``.
 
-    ``plant`` is how a task opens the FMU; None if there is no task.
+    ``plant`` is how a task opens the FMU; None if there is no task. ``advance`` is told how many
+    simulations were done since its last call.
     """
 
     fmu: FMU
@@ -73,6 +78,7 @@ class Experiment:
     backend: str
     wash_in: float | None = None
     plant: PoolOpening | None = None
+    advance: Callable[[float], None] = silent
 
     def clean(self, trajectories: Sequence[Trajectory]) -> tuple[Trajectory, ...]:
         """Check the trajectories, and drop stale samples if requested."""
@@ -152,6 +158,7 @@ class Problem:
         self.trajectories = experiment.clean(trajectories)
         self._state_names = list(experiment.initial_states)
         self._states = _measured_states(experiment.initial_states, self.trajectories)
+        self._advance = experiment.advance
         self._counted = [_counted(t, experiment.wash_in) for t in self.trajectories]
         names = [*parameters, *self._state_names]
         self._rows = range(len(names) if fit_states else len(parameters))
@@ -247,13 +254,19 @@ class Problem:
         points[:, 0] = self.start
         return list(points[:, np.argsort(self._costs(points))[:DESCENTS]].T)
 
+    def _simulate(self, values: FloatArray) -> list[FloatArray]:
+        """As ``Simulator.simulate``, and tell that it was done."""
+        found = self._simulator.simulate(values)
+        self._advance(values.shape[1] * values.shape[2])
+        return found
+
     def _costs(self, points: FloatArray) -> FloatArray:
         """The sums of squares at some points, shape (k, n), with the measured initial states."""
         costs: list[FloatArray] = []
         for first in range(0, points.shape[1], self._simulator.num_sets):
             part = points[:, first : first + self._simulator.num_sets]
             values = np.concatenate([self._join(one, self._states) for one in part.T], axis=1)
-            errors = [self._errors(s, w) for w, s in enumerate(self._simulator.simulate(values))]
+            errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
             costs.append(sum((e**2).sum(axis=1) for e in errors))
         found = np.concatenate(costs)
         return np.where(np.isfinite(found), found, np.inf)
@@ -289,7 +302,7 @@ class Problem:
             values = np.reshape([list(state.values()) for state in states], (len(states), -1)).T
         elif refit:
             values = self._fit_states(parameters)[0]
-        simulated = self._simulator.simulate(self._join(parameters, values))
+        simulated = self._simulate(self._join(parameters, values))
         if not all(np.isfinite(outputs).all() for outputs in simulated):
             raise SimulationError(f"the simulation failed: {self._simulator.failure}")
         names = self._simulator.outputs
@@ -387,7 +400,7 @@ class Problem:
         values = np.repeat(base, 1 + len(rows), axis=1)
         for index, row in enumerate(rows):
             values[row, 1 + index] += steps[row]
-        errors = [self._errors(s, w) for w, s in enumerate(self._simulator.simulate(values))]
+        errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
         return [_Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w]) for w, e in enumerate(errors)]
 
     def _join(self, parameters: FloatArray, states: FloatArray) -> FloatArray:

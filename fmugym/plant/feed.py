@@ -17,19 +17,27 @@ from fmugym.plant.polling import Poller, Reading
 from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock
 
-__all__ = ["Feed", "local_time"]
+__all__ = ["Feed", "local_time", "told"]
 
 _LEAST_JUMP: Final = 60.0
 """Clocks that are apart by less, in seconds, have not jumped."""
 
-_LATE: Final = 0.5
-"""How late a thread of this machine may be, in seconds of real time."""
+_LATE: Final = 2.0
+"""How late a thread or an answer may be, in seconds of real time."""
 
 
 def local_time() -> float:
     """The seconds since the beginning of the year, in the time of this place."""
     now = datetime.datetime.now()
     return (now - datetime.datetime(now.year, 1, 1)).total_seconds()
+
+
+def told(faults: Mapping[str, str]) -> str:
+    """What is wrong, in words; tags of which the same is wrong stand together."""
+    names: dict[str, list[str]] = {}
+    for name, why in faults.items():
+        names.setdefault(why, []).append(name)
+    return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
 
 
 @dataclass
@@ -144,8 +152,7 @@ class Feed:
                 raise SimulationError(self._told())
 
     def _told(self) -> str:
-        told = "; ".join(f"{name}: {why}" for name, why in self.faults.items())
-        return f"the plant at {self._plant.address}: {told}"
+        return f"the plant at {self._plant.address}: {told(self.faults)}"
 
     def _require_fit(self) -> None:
         """Refuse values that a wrong type would make."""

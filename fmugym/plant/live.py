@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.plant.tags import DATA, Plant
 from fmugym.pool.base import FloatArray
 
-__all__ = ["Live"]
+__all__ = ["Live", "forecasts", "horizon"]
 
 _JUST = 1e-6
 
@@ -50,7 +49,7 @@ class Live:
     def __init__(self, env: TaskEnv, plant: Plant) -> None:
         root, self._plant = env.task.root, plant
         self._entries = plant.entry.child("data").items()
-        self._ahead = _horizon(root)
+        self._ahead = {name: horizon(root, name) for name in self._entries}
         for name in sorted(_seen(root)):
             if name not in self._entries:
                 text = f"the agent sees {name!r}: say in [plant.data] where it comes from"
@@ -66,13 +65,14 @@ class Live:
 
     def _require_tags(self) -> None:
         """Refuse tags that do not tell as much as the agent sees."""
-        for entry in self._entries.values():
+        for name, entry in self._entries.items():
             count, step = entry.value.get("count", 1), entry.value.get("step")
             if "file" in entry.value or count == 1:
                 continue
-            if step is None or (count - 1) * step < self._ahead:
+            ahead = self._ahead[name]
+            if step is None or (count - 1) * step < ahead:
                 raise entry.error(
-                    f"the agent sees {self._ahead:g} s ahead: expected 'count' values that are "
+                    f"the agent sees {ahead:g} s ahead: expected 'count' values that are "
                     f"'step' apart to go as far, got {count} and {step}"
                 )
 
@@ -112,10 +112,11 @@ class Live:
         values = values * unit.factor + unit.offset
         holds = entry.value["interpolation"] == "previous"
         end = times[-1] + (times[-1] - times[-2] if holds and len(times) > 1 else 0.0)
-        if not times[0] <= now + _JUST or end < now + self._ahead:
+        ahead = self._ahead[name]
+        if not times[0] <= now + _JUST or end < now + ahead:
             raise ConfigError(
                 f"{shown(entry.value['file'])} has {times[0]:.10g} s to {end:.10g} s, expected "
-                f"{now:.10g} s and {self._ahead:g} s more"
+                f"{now:.10g} s and {ahead:g} s more"
             )
         first = np.searchsorted(times, now + _JUST, side="right")
         present = values[first - 1] if holds else np.interp(now, times, values)
@@ -136,10 +137,14 @@ class Live:
                 lookup.tables[lookup.key] = table
 
 
-def _horizon(root: Entry) -> float:
-    """How far ahead the agent sees, in seconds."""
-    forecasts: Sequence[Any] = root.child("agent").child("forecast").value or ()
-    return max((float(one["horizon"]) for one in forecasts), default=0.0)
+def forecasts(root: Entry, name: str) -> list[Any]:
+    """The forecasts in which the agent sees some data."""
+    return [one for one in root.child("agent").child("forecast").value or () if name in one["of"]]
+
+
+def horizon(root: Entry, name: str) -> float:
+    """How far ahead the agent sees some data, in seconds."""
+    return max((float(one["horizon"]) for one in forecasts(root, name)), default=0.0)
 
 
 def _seen(root: Entry) -> set[str]:

@@ -6,7 +6,7 @@ import logging
 import math
 import struct
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
 
 from fmugym.extras import imported
@@ -87,9 +87,16 @@ def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
     if place.is_bits:
         return [int(number > 0.5) for number in numbers]
     form = _FORMATS[tag.address["type"]]
-    given = numbers if form in "fd" else map(round, numbers)
+    given = numbers if form in "fd" else [_saturated(number, form) for number in numbers]
     content = struct.pack(f">{tag.count}{form}", *given)
     return _ordered(tag, struct.unpack(f">{place.end - place.begin}H", content))
+
+
+def _saturated(number: float, form: str) -> int:
+    """The nearest integer of a type, as converters give it; the lowest one for NaN."""
+    bits = 8 * struct.calcsize(f">{form}")
+    low = 0 if form.isupper() else -(2 ** (bits - 1))
+    return low if math.isnan(number) else min(max(round(number), low), low + 2**bits - 1)
 
 
 def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
@@ -158,7 +165,7 @@ class ModbusClient:
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
         """The registers or bits, and what the server says instead."""
-        client, count = self._client, place.end - place.begin
+        client = self._client
         ask = {
             "holding": client.read_holding_registers,
             "input": client.read_input_registers,
@@ -167,16 +174,20 @@ class ModbusClient:
         }[place.kind]
         if not client.connected:
             raise LostError("the connection is lost")
-        try:
-            told = await ask(place.begin, count=count, device_id=place.unit_id)
-        except self._errors.ConnectionException:
-            raise LostError("the connection is lost") from None
-        except self._errors.ModbusException:
-            raise LostError("it does not answer, or not by Modbus") from None
-        if told.isError():
-            code, where = told.exception_code, f"{place.kind} {place.begin} of unit {place.unit_id}"
-            return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
-        return (told.bits[:count] if place.is_bits else told.registers), ""
+        cells: list[Any] = []
+        for begin in range(place.begin, place.end, _MOST):
+            count = min(_MOST, place.end - begin)
+            try:
+                told = await ask(begin, count=count, device_id=place.unit_id)
+            except self._errors.ConnectionException:
+                raise LostError("the connection is lost") from None
+            except self._errors.ModbusException:
+                raise LostError("it does not answer, or not by Modbus") from None
+            if told.isError():
+                code, where = told.exception_code, f"{place.kind} {begin} of unit {place.unit_id}"
+                return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
+            cells += told.bits[:count] if place.is_bits else told.registers
+        return cells, ""
 
     async def close(self) -> None:
         """See ``polling.Client``."""
@@ -201,6 +212,9 @@ async def serve_modbus(
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
     found = [(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
     placed = sorted(found, key=lambda one: one[0])
+    for (place, tag), (after, other) in pairwise(placed):
+        if place[:2] == after[:2] and after.begin < place.end:
+            raise other.entry.error(f"it shares {place.kind} {after.begin} with {tag.name!r}")
     units = groupby(placed, key=lambda one: one[0].unit_id)
     devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))

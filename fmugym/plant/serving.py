@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from types import TracebackType
@@ -16,7 +17,7 @@ from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import CLOCK
 from fmugym.declared.series import Series, read_data
-from fmugym.episodes.simulation import Player, Policy, action_of, policy_of
+from fmugym.episodes.simulation import Player, Policy, Summary, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
 from fmugym.plant.background import Background
 from fmugym.plant.modbus import serve_modbus
@@ -56,10 +57,14 @@ class _Twin:
         policy: Acts.
         clock: Tells the time.
         seed: Of the episode.
+        most: How many steps it has.
     """
 
-    def __init__(self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int) -> None:
+    def __init__(
+        self, env: TaskEnv, plant: Plant, policy: Policy, clock: Clock, seed: int, most: float
+    ) -> None:
         self._env, self._plant, self._policy, self._clock = env, plant, policy, clock
+        self._seed, self._most = seed, most
         assert env.inside.quantities is not None
         self._quantities = env.inside.quantities()
         self._is_late, self._is_straight = self._shapes()
@@ -67,7 +72,8 @@ class _Twin:
         self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
         policy.begin()
         self._observation, _ = env.reset(seed=seed)
-        self._begin, self.steps = clock.time(), 0
+        self._begin, self._steps, self._reward = clock.time(), 0, 0.0
+        self._cost: float | None = None
         self._after = self._read()
         self._advance()
 
@@ -104,18 +110,36 @@ class _Twin:
     def _advance(self) -> None:
         self._before = self._after
         action = self._policy.act(self._observation)
-        self._observation, _, terminated, truncated, info = self._env.step(action)
+        self._observation, reward, terminated, truncated, info = self._env.step(action)
+        self._reward += float(reward)
+        if "cost" in info:
+            self._cost = (self._cost or 0.0) + float(info["cost"])
         if terminated or truncated:
             raise SimulationError(f"the FMU has ended: {info.get('fault', 'its stop time')}")
         self._after = self._read()
-        self.steps += 1
+        self._steps += 1
+
+    def summary(self) -> Summary:
+        """What was reached until now."""
+        seconds = self._steps * self._plant.step
+        return Summary(self._seed, self._steps, seconds, self._reward, self._cost, "stopped")
+
+    @property
+    def _passed(self) -> float:
+        """How many steps have passed, with a part of one."""
+        return min((self._clock.time() - self._begin) / self._plant.step, self._most)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it has done its steps."""
+        return self._passed >= self._most
 
     def values(self) -> dict[str, tuple[float, ...]]:
         """What all tags have now."""
-        passed = (self._clock.time() - self._begin) / self._plant.step
-        while passed >= self.steps:
+        passed = self._passed
+        while self._steps <= passed and self._steps < self._most:
             self._advance()
-        part = passed - (self.steps - 1)
+        part = passed - (self._steps - 1)
         moved = self._before + part * (self._after - self._before)
         now = np.where(self._is_straight, moved, self._before)
         now = np.where(self._is_late, self._after, now)
@@ -167,6 +191,7 @@ class Server:
 
     Attributes:
         address: Where it is served, as ``connect`` takes it.
+        summary: Returns what was reached until now.
 
     Raises:
         ConfigError: If the task has a mistake, or the extra ``plant`` is missing.
@@ -187,6 +212,7 @@ class Server:
         self._player = _player_of(player) if isinstance(player, str) else player
         self._clock, self._seed, self._steps = clock or RealClock(), seed, steps
         self.address, self._is_bound = "", threading.Event()
+        self.summary: Callable[[], Summary]
         self._background = Background(self._serve, "plant server")
         while not self._is_bound.wait(0.01) and not self._background.is_over:
             pass
@@ -196,12 +222,16 @@ class Server:
         env: Any = self._player.make_env(lambda **form: environment(self._task, **form))
         try:
             plant = read_plant(env)
-            twin = _Twin(env, plant, self._player.make_policy(env), self._clock, self._seed)
+            policy, most = self._player.make_policy(env), self._steps or math.inf
+            twin = _Twin(env, plant, policy, self._clock, self._seed, most)
+            self.summary = twin.summary
             end = await _SERVERS[plant["protocol"]](plant, self._port, twin.values, self._bound)
             try:
                 pause = plant.step / 2 / getattr(self._clock, "speed", 1.0)
-                while self._steps is None or twin.steps <= self._steps:
+                is_over = False
+                while not is_over:
                     await asyncio.sleep(pause)
+                    is_over = twin.is_over
                     twin.values()
             finally:
                 await end()
@@ -217,7 +247,8 @@ class Server:
         if isinstance(error, FMUGymError):
             raise error
         if error is not None:
-            raise SimulationError(f"the server has failed: {error}") from error
+            where = f"port {self._port} of the loopback" if self._port else "the loopback"
+            raise SimulationError(f"the server at {where} has failed: {error}") from error
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end, for some real time; tells whether it has come.

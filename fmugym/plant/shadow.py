@@ -13,10 +13,11 @@ import gymnasium
 import numpy as np
 
 from fmugym.checks import check_flag
-from fmugym.declared import Task, TaskEnv
+from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
 from fmugym.episodes.simulation import Policy
-from fmugym.plant.feed import Feed, local_time
+from fmugym.logs import on_time_of_year
+from fmugym.plant.feed import Feed, local_time, told
 from fmugym.plant.live import Live
 from fmugym.plant.modbus import ModbusClient
 from fmugym.plant.opcua import OpcUaClient
@@ -30,7 +31,6 @@ from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect", "holding"]
 
-_OF_SIMULATIONS: Final = ("clock", "warm_up", "start_time")
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
 
@@ -47,7 +47,8 @@ class _PresentTime:
 
 def _watched(task: Task, feed: Feed) -> Task:
     """The task on a plant: its time, its sensors and actuators, and no end of episodes."""
-    document = {k: v for k, v in endless(task).document.items() if k not in _OF_SIMULATIONS}
+    task = on_time_of_year(endless(task), _PresentTime(feed))
+    document = dict(task.document)
     variables = document.get("variables", {})
     document["variables"] = {
         alias: {key: value for key, value in given.items() if key not in DEVICE}
@@ -62,7 +63,7 @@ def _watched(task: Task, feed: Feed) -> Task:
     if "history" in agent:
         held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
         document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
-    return replace(task, document={**document, "agent": agent, "start_time": _PresentTime(feed)})
+    return replace(task, document={**document, "agent": agent})
 
 
 def _listed(value: Any) -> list[Any]:
@@ -149,12 +150,12 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _told(self, proposed: dict[str, float], predicted: dict[str, float]) -> dict[str, Any]:
         feed = self._feed
-        faults = [f"{name}: {why}" for name, why in feed.faults.items()]
+        faults = [told(feed.faults)] if feed.faults else []
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        told: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
-        told["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
-        return told | ({"fault": "; ".join(faults)} if faults else {})
+        info: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
+        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
+        return info | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:
         """End the connection."""
@@ -198,8 +199,11 @@ def connect(
         written = Written(env, feed, plant)
         read, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
-        make_copy = partial(environment, _without_warm_up(watched).physical())
-        copies = Predictions(make_copy, feed, plant, int(ahead / plant.step + 1e-9))
+        model = _without_warm_up(watched).physical()
+        env.inside.model = partial(load, model)
+        copies = Predictions(
+            partial(environment, model), feed, plant, int(ahead / plant.step + 1e-9)
+        )
         stack.callback(copies.close)
         live = Live(env, plant)
         live.envs += copies.envs
@@ -249,12 +253,13 @@ def _reading(
 
 
 def holding(policy: Policy, shadow: Shadow) -> Policy:
-    """Make a policy hold its last action while values are missing."""
+    """Make a policy hold its last action while values are missing; it still sees all steps."""
     last: list[Any] = []
 
     def act(observation: Any) -> Any:
+        action = policy.act(observation)
         if not (last and shadow.is_missing):
-            last[:] = [policy.act(observation)]
+            last[:] = [action]
         return last[0]
 
     return Policy(act, policy.begin)

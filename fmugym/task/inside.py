@@ -85,6 +85,7 @@ class Inside:
         quantities: Lists what a declared task has names for; None for other tasks.
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
+        model: Makes an environment to plan with, where a plant stands in for the FMU; or None.
         own: The hooks that the class has itself.
         readings: What hooks read now.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -115,6 +116,7 @@ class Inside:
     ended: bool
     future: Future | None
     controllers: Callable[[], list[Any]] | None
+    model: Callable[[], Any] | None
     guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
@@ -160,7 +162,7 @@ class Inside:
         self.in_hooks = self.was_reset = False
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
-        self.future = self.controllers = None
+        self.future = self.controllers = self.model = None
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any
 

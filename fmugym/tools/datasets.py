@@ -9,12 +9,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from fmugym.declared import Task, load
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, simulate
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.logs import PlantLog, play_log
+from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.recording import Recorder, Recording
 from fmugym.tools.options import MINARI, only_player, say, say_json
 from fmugym.tools.targets import maker_of
@@ -101,7 +102,10 @@ def _logged(arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]) -> l
             found.append(Recording.load(path))
             continue
         log, seed = PlantLog.read(path), arguments.seed + len(found)
-        found += play_log(log, make_env, columns=columns, tolerance=tolerance, seed=seed)
+        make: Callable[..., FMUEnv] = make_env
+        if log.proposed is not None:  # of the shadow of a plant, so in seconds of the year
+            make = partial(load, as_logged(Task.read(arguments.task), log))
+        found += play_log(log, make, columns=columns, tolerance=tolerance, seed=seed)
     return found
 
 

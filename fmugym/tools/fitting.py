@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import duration
+from fmugym.episodes.evaluation import aligned
 from fmugym.episodes.output_files import require_picture
+from fmugym.episodes.progress_bars import progress
 from fmugym.errors import ConfigError, shown
 from fmugym.fit import fit_logs, write_rows
 from fmugym.identification import FitResult, plot_comparison
@@ -98,15 +99,17 @@ def _fit(arguments: argparse.Namespace) -> None:
     if not arguments.parameter:
         raise ConfigError(f"name what to fit with --parameter: {_possible(make_env)}")
     wash_in = arguments.wash_in
-    fit = fit_logs(
-        make_env,
-        [PlantLog.read(path) for path in arguments.log],
-        dict(map(_range, arguments.parameter)),
-        starts=dict(map(_start, arguments.start)),
-        wash_in=None if wash_in is None else duration("--wash-in", wash_in),
-        columns=dict(map(renaming, arguments.column)),
-        candidates=arguments.candidates,
-    )
+    with progress(None, "fit", "simulations") as advance:
+        fit = fit_logs(
+            make_env,
+            [PlantLog.read(path) for path in arguments.log],
+            dict(map(_range, arguments.parameter)),
+            starts=dict(map(_start, arguments.start)),
+            wash_in=None if wash_in is None else duration("--wash-in", wash_in),
+            columns=dict(map(renaming, arguments.column)),
+            candidates=arguments.candidates,
+            advance=advance,
+        )
     if output is not None:
         rows = output.with_suffix(".npz")
         write_rows(fit, rows)
@@ -198,12 +201,7 @@ def _table(fit: FitResult) -> list[str]:
     for name, one in fit.correlations.items():
         numbers = f"{fit.rms(name):.3g}", f"{fit.comparison.explained(name):.2%}"
         outputs.append((name, *numbers, f"{one.first:.2f}", variables.variable(name).unit or ""))
-    return [*_aligned(rows), "", *_aligned(outputs)]
-
-
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return [*aligned(rows), "", *aligned(outputs)]
 
 
 def _warnings(fit: FitResult) -> list[str]:

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from fmugym.checks import check_count, check_number, duration
 from fmugym.declared import Task
+from fmugym.declared.writing import as_toml
 from fmugym.episodes.output_files import Recording
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Summary, simulate
-from fmugym.errors import ConfigError, FMUGymError, plain, shown
+from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
 from fmugym.plant.predicting import Error
+from fmugym.plant.proposing import with_plant
 from fmugym.plant.shadow import holding
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
@@ -32,7 +34,7 @@ from fmugym.tools.options import (
     shown_in_any_case,
 )
 
-__all__ = ["add_of_plants", "add_serve", "follow_plant"]
+__all__ = ["add_of_plants", "add_serve", "follow_plant", "task_of"]
 
 _AHEAD: Final = "3h"
 
@@ -56,18 +58,25 @@ def _clock(arguments: argparse.Namespace) -> RealClock:
     return RealClock(check_number("--speed", arguments.speed, positive=True))
 
 
-def _task_of(arguments: argparse.Namespace) -> Task:
+def task_of(arguments: argparse.Namespace) -> Task:
+    """Read the task of a plant.
+
+    Raises:
+        ConfigError: If it is no file, or has a mistake.
+    """
     if not Path(arguments.task).is_file():
-        raise ConfigError(f"a plant needs a task file with [plant], got {shown(arguments.task)}")
+        raise ConfigError(f"a plant needs a task file, got {shown(arguments.task)}")
     return Task.read(arguments.task)
 
 
 def follow_plant(arguments: argparse.Namespace) -> None:
     """Let one who acts be the shadow of a plant, until so many steps are done."""
+    if arguments.scenario is not None or arguments.episodes != 1:
+        raise ConfigError("a plant has no --scenario and no --episodes: say --steps")
     player = only_player(arguments)
     ahead = duration("--ahead", arguments.ahead)
     make_env: Any = partial(
-        connect, _task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
+        connect, task_of(arguments), arguments.plant or None, ahead=ahead, clock=_clock(arguments)
     )
     recording, done = Recording(arguments.task, None, arguments.output), list[Summary]()
     with closing(player.make_env(make_env)) as env:
@@ -77,8 +86,8 @@ def follow_plant(arguments: argparse.Namespace) -> None:
             played = recording.begin("shadow", shadow, arguments.variables, arguments.every)
         policy = holding(player.make_policy(shadow.unwrapped), shadow)
         with (
-            _finished_after_errors(recording, arguments.seed),
-            shown_in_any_case(lambda: _show(arguments, recording, done, shadow.errors())),
+            shown_in_any_case(lambda: _show(arguments, done, shadow.errors())),
+            recording.finished(arguments.seed),
             progress(arguments.steps, "shadow") as advance,
         ):
             while (left := arguments.steps - sum(one.steps for one in done)) > 0:
@@ -87,22 +96,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
                     say(plain(done[-1].as_text()))
 
 
-@contextmanager
-def _finished_after_errors(recording: Recording, seed: int) -> Iterator[None]:
-    try:
-        yield
-    except FMUGymError:
-        recording.finish(seed)
-        raise
-
-
-def _show(
-    arguments: argparse.Namespace,
-    recording: Recording,
-    done: Sequence[Summary],
-    errors: Sequence[Error],
-) -> None:
-    recording.finish(arguments.seed)
+def _show(arguments: argparse.Namespace, done: Sequence[Summary], errors: Sequence[Error]) -> None:
     if arguments.json:
         told = [one.as_dict() for one in done]
         predictions = [one._asdict() for one in errors]
@@ -133,7 +127,13 @@ def add_serve(commands: Commands) -> None:
     """Add ``serve``."""
     text = "let the FMU of a task be a plant on the loopback, as [plant] of the task describes"
     command = add_command(commands, "serve", _serve, text)
-    command.add_argument("task", metavar="TASK", help="a task file with [plant]")
+    command.add_argument("task", metavar="TASK", help="a task file")
+    protocols = command.add_mutually_exclusive_group()
+    for name, shown_name in (("modbus", "Modbus TCP"), ("opcua", "OPC UA")):
+        text = f"by {shown_name}; without [plant] in the task, print one to be added to it"
+        protocols.add_argument(
+            f"--{name}", action="store_const", const=name, dest="protocol", help=text
+        )
     add_players(command)
     command.add_argument("--port", type=int, default=0, help="by default a free one")
     command.add_argument("--seed", type=int, default=0, metavar="N", help="default 0")
@@ -146,12 +146,26 @@ def _serve(arguments: argparse.Namespace) -> None:
     check_numbers(arguments)
     steps = arguments.steps if arguments.steps is None else check_count("--steps", arguments.steps)
     options = {"port": arguments.port, "seed": arguments.seed, "steps": steps}
-    task, player = _task_of(arguments), only_player(arguments)
+    task, player = task_of(arguments), only_player(arguments)
+    has_plant = "plant" in task.document
+    if arguments.protocol is not None:
+        task = with_plant(task, arguments.protocol)
+    elif not has_plant:
+        raise ConfigError(f"{shown(arguments.task)} has no [plant]: say --modbus or --opcua")
     with Server(task, player, clock=_clock(arguments), **options) as server:
+        plant = {**task.document["plant"], "address": server.address}
         if arguments.json:
-            say_json({"task": arguments.task, "address": server.address})
+            say_json({"task": arguments.task, "address": server.address, "plant": plant})
         else:
             say(f"serving {plain(arguments.task)} at {server.address}; Ctrl-C ends it")
+            if not has_plant:
+                say(f"add this to the task:\n\n{as_toml({'plant': plant})}")
         sys.stdout.flush()  # a program may wait for the address
-        while not server.wait(0.2):
-            pass
+        with shown_in_any_case(lambda: _tell(arguments, server)):
+            while not server.wait(0.2):
+                pass
+
+
+def _tell(arguments: argparse.Namespace, server: Server) -> None:
+    if not arguments.json:
+        say(plain(server.summary().as_text()))

@@ -13,7 +13,8 @@ from fmugym.episodes.evaluation import Score, evaluate, plot_scores, table
 from fmugym.episodes.output_files import Recording, require_format, require_picture, title_of
 from fmugym.episodes.progress_bars import progress
 from fmugym.episodes.simulation import Player, Summary, simulate
-from fmugym.errors import FMUGymError, plain
+from fmugym.errors import ConfigError, plain
+from fmugym.logs import PlantLog
 from fmugym.tools.datasets import add_of_datasets, dataset_of, make_dataset
 from fmugym.tools.options import (
     Commands,
@@ -29,7 +30,8 @@ from fmugym.tools.options import (
     say_json,
     shown_in_any_case,
 )
-from fmugym.tools.plants import add_of_plants, follow_plant
+from fmugym.tools.plants import add_of_plants, follow_plant, task_of
+from fmugym.tools.shadows import evaluate_log
 from fmugym.tools.speed import Report, bench, speed_table
 from fmugym.tools.targets import maker_of, scenarios_of
 
@@ -79,22 +81,17 @@ def _simulate(arguments: argparse.Namespace) -> None:
     runs: dict[str, list[Summary]] = {name: [] for name in players}
 
     def show() -> None:
-        recording.finish(arguments.seed)
         if arguments.json:
             told = {name: [one.as_dict() for one in found] for name, found in runs.items()}
             only = {"episodes": next(iter(told.values()))} if len(told) == 1 else {}
             say_json({"task": arguments.task, "output": arguments.output, "runs": told, **only})
 
-    try:
-        for player in players.values() if len(players) > 1 else ():
-            with closing(player.make_env(_maker(arguments))) as env:
-                player.make_policy(env)  # so that no mistake comes up after another has played
-        with shown_in_any_case(show):
-            for name, player in players.items():
-                _play(arguments, recording, name, player, runs)
-    except FMUGymError:
-        recording.finish(arguments.seed)
-        raise
+    for player in players.values() if len(players) > 1 else ():
+        with closing(player.make_env(_maker(arguments))) as env:
+            player.make_policy(env)  # so that no mistake comes up after another has played
+    with shown_in_any_case(show), recording.finished(arguments.seed):
+        for name, player in players.items():
+            _play(arguments, recording, name, player, runs)
 
 
 def _maker(arguments: argparse.Namespace) -> Callable[[], FMUEnv]:
@@ -143,6 +140,12 @@ def add_evaluate(commands: Commands) -> None:
     )
     add_episodes(command, 10, 1_000_000)
     command.add_argument(
+        "--log",
+        metavar="FILE",
+        help="the record of a shadow (.csv): what the plant has reached, and what others reach on "
+        "the FMU in the same periods",
+    )
+    command.add_argument(
         "--plot", type=Path, metavar="FILE", help="a new picture of the rewards and costs"
     )
     add_json(command)
@@ -152,10 +155,17 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "episodes", "steps")
     if arguments.plot is not None:
         require_picture(arguments.plot)
-    players = players_of(arguments, random=True)
+    if arguments.log is not None and arguments.scenario:
+        raise ConfigError("--log has its own periods: leave --scenario out")
+    players = players_of(arguments, random=arguments.log is None)
     seeds = range(arguments.seed, arguments.seed + arguments.episodes)
     scores: list[Score] = []
     with shown_in_any_case(lambda: _show_scores(scores, arguments)):
+        if arguments.log is not None:
+            task, log = task_of(arguments), PlantLog.read(arguments.log)
+            with progress(None, "evaluate") as advance:
+                scores.extend(evaluate_log(task, log, players, advance))
+            return
         for scenario in _scenarios(arguments):
             make_env = maker_of(arguments.task, scenario, arguments.master)
             label = "evaluate" if scenario is None else scenario

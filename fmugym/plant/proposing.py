@@ -1,0 +1,69 @@
+"""A section ``[plant]`` for a task that has none: a tag for all that a plant has to tell."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from typing import Any, Final
+
+from fmugym.checks import check_option
+from fmugym.declared import Task, TaskEnv
+from fmugym.errors import ConfigError
+from fmugym.plant.live import forecasts, horizon
+from fmugym.plant.serving import environment
+
+__all__ = ["with_plant"]
+
+_SECTIONS: Final[dict[str, dict[str, Any]]] = {
+    "modbus": {"protocol": "modbus", "address": "127.0.0.1:502"},
+    "opcua": {"protocol": "opcua", "address": "opc.tcp://127.0.0.1:4840", "encryption": False},
+}
+"""Of the loopback, on which nobody reads along."""
+
+
+def with_plant(task: Task, protocol: str) -> Task:
+    """Give a task without ``[plant]`` one for the loopback; that of others has this protocol.
+
+    There are tags for the clock, the actions, the outputs that the task reads, and for its data, as
+    far ahead as the agent sees them.
+
+    Args:
+        task: The task.
+        protocol: ``"modbus"`` or ``"opcua"``.
+
+    Raises:
+        ConfigError: If the plant of the task has another protocol, or the task has a mistake.
+    """
+    check_option("protocol", protocol, _SECTIONS)
+    own = task.document.get("plant", {}).get("protocol", protocol)
+    if own != protocol:
+        raise ConfigError(f"[plant] of the task has the protocol {own!r}, not {protocol!r}")
+    if "plant" in task.document:
+        return task
+    with closing(environment(task)) as env:
+        return replace(task, document={**task.document, "plant": _section(env, protocol)})
+
+
+def _section(env: TaskEnv, protocol: str) -> dict[str, Any]:
+    """All tags, one after another."""
+    assert env.inside.quantities is not None
+    register = 4  # the clock takes those before
+    found: dict[str, dict[str, Any]] = {"tags": {}, "data": {}}
+    for one in env.inside.quantities().all:
+        if one.kind not in ("action", "output", "data"):
+            continue
+        ahead = _ahead(env, one.name) if one.kind == "data" else {}
+        where = {"node": f"ns=2;s={one.name}"} if protocol == "opcua" else {"register": register}
+        found["data" if one.kind == "data" else "tags"][one.name] = where | ahead
+        register += 2 * ahead.get("count", 1)
+    clock = {"node": "ns=2;s=clock"} if protocol == "opcua" else {"register": 0, "type": "float64"}
+    return {**_SECTIONS[protocol], "clock": clock, **{k: v for k, v in found.items() if v}}
+
+
+def _ahead(env: TaskEnv, name: str) -> dict[str, Any]:
+    """How many values of data there are, so that the agent sees far enough ahead."""
+    root, own = env.task.root, env.inside.spec.time_step
+    steps = [one.get("step") or own for one in forecasts(root, name)]
+    if not steps:
+        return {}
+    return {"count": round(horizon(root, name) / min(steps)) + 1, "step": min(steps)}
