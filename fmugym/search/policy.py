@@ -33,13 +33,6 @@ _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
 
-_REGULARIZATION: Final = 0.1
-"""What is added to the variances of observations, of 1, before correlations are inverted."""
-
-_MANY: Final = 48
-"""The correlations of more observations than this are not looked at."""
-
-
 @dataclass(frozen=True)
 class Form:
     """A class of policies.
@@ -74,26 +67,6 @@ class Form:
     def size(self) -> int:
         """The number of weights."""
         return sum(before * after for before, after in self.shapes)
-
-    def covariance(self, correlations: FloatArray | None) -> FloatArray:
-        """Covariances of weights by which all parts of what is observed change outputs alike.
-
-        Observations that go together would otherwise move the outputs more than what differs
-        between them: the weights of the first layer get the inverse of their correlations.
-
-        Args:
-            correlations: Of the k observations, shape (k, k); None if they are not known.
-
-        Returns:
-            Shape (n, n), with n from ``size``.
-        """
-        found = np.eye(self.size)
-        if correlations is not None and correlations.any():
-            inverse = np.linalg.inv(correlations + _REGULARIZATION * np.eye(self.observed))
-            inverse *= self.observed / np.trace(inverse @ correlations)
-            first = np.kron(inverse, np.eye(self.shapes[0][1]))
-            found[: len(first), : len(first)] = first
-        return found
 
     def extended(self, weights: FloatArray) -> FloatArray:
         """The weights that decide as those of a linear policy without a history, shape (n,).
@@ -131,12 +104,10 @@ class Scale(NamedTuple):
     Attributes:
         mean: Of each feature, shape (f,).
         divisor: Its standard deviation, shape (f,); constant ones are not made larger.
-        correlations: Of the observations, the first k features, shape (k, k); None for many.
     """
 
     mean: FloatArray
     divisor: FloatArray
-    correlations: FloatArray | None
 
     @classmethod
     def of(cls, moments: FloatArray, features: int) -> Self:
@@ -146,17 +117,10 @@ class Scale(NamedTuple):
             moments: The sums of what ``Policy.moments`` gives in each step.
             features: The number f.
         """
-        mean, squares, products = np.split(moments[1:] / moments[0], [features, 2 * features])
+        mean, squares = np.split(moments[1:] / moments[0], [features])
         deviation = np.sqrt(np.maximum(squares - mean**2, 0.0))
         is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
-        divisor = np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)
-        if not products.size:
-            return cls(mean, divisor, None)
-        size = math.isqrt(products.size)
-        together = products.reshape(size, size) - np.outer(mean[:size], mean[:size])
-        correlations = together / np.outer(divisor[:size], divisor[:size])
-        correlations[is_constant[:size]] = correlations[:, is_constant[:size]] = 0.0
-        return cls(mean, divisor, correlations)
+        return cls(mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation))
 
 
 class Policy(Controller):
@@ -246,14 +210,9 @@ class Policy(Controller):
 
     @property
     def moments(self) -> FloatArray:
-        """One, the features of the last decision, their squares, and products of observations.
-
-        The shape is (1 + 2 f + k^2, N); where k would be large, it is 0.
-        """
-        k = len(self.names) if len(self.names) <= _MANY else 0
-        shown, observed = self._shown.T, self._shown[:, :k].T
-        products = (observed[:, None] * observed).reshape(-1, self.count)
-        return np.concatenate([np.ones((1, self.count)), shown, shown**2, products])
+        """One, the features of the last decision, and their squares: shape (1 + 2 f, N)."""
+        shown = self._shown.T
+        return np.concatenate([np.ones((1, self.count)), shown, shown**2])
 
     @property
     def middle(self) -> list[float]:

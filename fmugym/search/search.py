@@ -148,7 +148,7 @@ class Search:
             for name, one in tunable
         ]
         if not (fixed or tunable):
-            nothing = Scale(np.empty(0), np.empty(0), None)
+            nothing = Scale(np.empty(0), np.empty(0))
             make = _Policies(_MIDDLE, Form("constant action", 0, sizes[1]), nothing)
             self._tuned = [self._entrant(make, FEW)]
         self._contenders: list[Entrant] = []
@@ -242,14 +242,11 @@ class Search:
         return Entrant(cma, make, self.episodes)
 
     def _cma(self, make: _Policies, start: FloatArray, population: int = _MANY) -> CMA:
-        is_correction = make.under.text is not None
         sigma = _SIGMA * (_OF_NETWORKS if make.form.hidden else 1.0)
-        sigma *= _OF_CORRECTIONS if is_correction else 1.0
-        alike = np.ones(len(start))
-        if len(start) <= _MANY_WEIGHTS:
-            alike = make.form.covariance(make.scale.correlations if is_correction else None)
+        sigma *= 1.0 if make.under.text is None else _OF_CORRECTIONS
+        variances = np.ones(len(start)) if len(start) > _MANY_WEIGHTS else None
         limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
-        return CMA(start, sigma, population, self._rng, alike, **limits)
+        return CMA(start, sigma, population, self._rng, variances, **limits)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
@@ -276,7 +273,7 @@ class Search:
         seen: list[tuple[Merit, FloatArray]] = []
         for agent in agents:
             rows = history.constants(self._rng.uniform(-1, 1, (_MANY, history.acting)))
-            make = _Policies(agent, history, Scale(np.zeros(count), np.ones(count), None))
+            make = _Policies(agent, history, Scale(np.zeros(count), np.ones(count)))
             seeds = self._training(self.episodes)
             outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
             seen += zip(merits_of(outcome, self._limits), outcome.watched.sum(axis=1), strict=True)
