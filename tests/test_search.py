@@ -704,7 +704,7 @@ class Field:
 
     def play(self, make, numbers, seeds, watch=None):
         returns = np.repeat(np.minimum(numbers.sum(axis=1), self.most)[:, None], len(seeds), axis=1)
-        seen = np.ones((*returns.shape, 1 + 2 * 7 + 4))
+        seen = np.ones((*returns.shape, 1 + 2 * 7))
         return Outcome(returns, np.empty((*returns.shape, 0)), seen)
 
 
