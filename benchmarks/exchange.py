@@ -79,7 +79,7 @@ def _build(model: Model, folder: Path) -> Path:
     Raises:
         MissingError: If there is no compiler.
     """
-    tests = str(Path(__file__).parent.parent / "tests")
+    tests = str(Path(__file__).parent.parent / "tests" / "tools")
     if tests not in sys.path:
         sys.path.append(tests)
     from exchange_tools import exchange_fmu

@@ -199,7 +199,7 @@ def _run(
 
 
 def _container(folder: Path, model: Model) -> Path:
-    tests = str(Path(__file__).parent.parent / "tests")
+    tests = str(Path(__file__).parent.parent / "tests" / "tools")
     if tests not in sys.path:
         sys.path.append(tests)
     from container_tools import container

@@ -20,6 +20,8 @@ import fmugym
 from fmugym.tools.cli import main
 from fmugym.wine.prefix import Wine
 
+sys.path += [folder for folder in building.FOLDERS if folder not in sys.path]
+
 # The processes of a test run share a folder: the first one makes it, and removes it.
 if building.FOLDER not in os.environ:
     _folder = tempfile.TemporaryDirectory(prefix="fmugym-tests-", ignore_cleanup_errors=True)
@@ -54,7 +56,7 @@ def pytest_collection_modifyitems(items):
     """Mark what ``tiers.py`` leaves out of the default run and of ``.ci/run``."""
     seen = collections.Counter()
     for item in items:
-        node_id = item.nodeid.removeprefix("tests/")
+        node_id = f"{item.path.name}::{item.nodeid.partition('::')[2]}"
         test = node_id.partition("[")[0]
         if tiers.is_slow(node_id, seen[test]):
             item.add_marker(pytest.mark.slow)

@@ -5,8 +5,8 @@ import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
+import building
 import gymnasium
 import numpy as np
 import pytest
@@ -106,13 +106,12 @@ print(env.unwrapped.state[0] > 0.0)
 
 def load_elsewhere(text):
     """Make an environment of a spec in a program that has not imported fmugym."""
-    here = str(Path(__file__).parent)
     return subprocess.run(
         [sys.executable, "-c", LOAD],
         input=text,
         capture_output=True,
         text=True,
-        env={**os.environ, "PYTHONPATH": here},
+        env={**os.environ, "PYTHONPATH": building.PATH},
         check=False,
     )
 

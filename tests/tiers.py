@@ -266,7 +266,7 @@ def is_slow(node_id, number):
     """Whether the default run leaves out a test.
 
     Args:
-        node_id: As pytest writes it, relative to ``tests/``.
+        node_id: As pytest writes it, without the folder.
         number: How many combinations of the same test came before.
     """
     module = node_id.partition(".py")[0]

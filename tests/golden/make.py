@@ -1,7 +1,7 @@
 """Write the golden results: what the pool in Python gave for all cases before it went.
 
     git worktree add BEFORE 179b934
-    PYTHONPATH=BEFORE:BEFORE/tests:tests:benchmarks python -P -m golden.make RESULTS
+    PYTHONPATH=BEFORE:BEFORE/tests:tests:tests/tools:benchmarks python -P -m golden.make RESULTS
 
 RESULTS is the file to write. The package that Python imports makes them, so run this with the
 environment of that revision; its own tests come first.

@@ -1,0 +1,91 @@
+"""The commands that the documents show do what they say."""
+
+import re
+import shlex
+import shutil
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import ssp_tools
+from source_tools import write_source_fmu
+
+import fmugym
+from fmugym.tools.cli import main
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "command-line.md").read_text()
+PAGES = ("command-line.md", "training.md", "baselines.md", "foreign-fmus.md", "fit.md")
+BLOCKS = [
+    block
+    for page in PAGES
+    for block in re.findall(
+        r"^```bash\n(fmugym .*?)^```", (ROOT / "docs" / page).read_text(), re.M | re.S
+    )
+    if "stand-in" not in block  # takes an old FMU; tests/repair/test_stand_in.py has one
+]
+NEEDS = {
+    "--algorithm": "stable_baselines3",
+    ".html": "matplotlib",
+}
+EXAMPLES = "examples/cart_pole.toml"
+
+
+def commands(block):
+    return [line for line in block.replace("\\\n", " ").splitlines() if line.strip()]
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.split()[1])
+def test_examples_of_commands_run(block, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    if "fmugym info --repair" in block:
+        write_source_fmu(tmp_path / "model.fmu")
+    else:
+        shutil.copy(fmugym.bundled_fmu("Pendulum"), "model.fmu")
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    if "system.ssp" in block:
+        write_system("system.ssp")
+    if "fmugym new" not in block:
+        assert main(["new", "model.fmu", "--output", "task.toml"]) == 0
+    for command in commands(block):
+        for text, module in NEEDS.items():
+            if text in command and not find_spec(module):
+                pytest.skip(f"needs {module}, which an extra of the package brings")
+        program, *arguments = shlex.split(command)
+        assert program == "fmugym"
+        assert main(shortened(arguments)) == 0, capsys.readouterr().err
+    capsys.readouterr()
+
+
+def shortened(arguments):
+    """A search of a few rounds instead of a minute."""
+    is_search = arguments[0] == "train" and "trained" not in arguments
+    is_search = is_search and "--algorithm" not in arguments
+    return [*arguments, "--rounds", "23", "--episodes", "1"] if is_search else arguments
+
+
+def write_system(path):
+    house = fmugym.bundled_fmu("House")
+    wires = ["first.T_air -> second.T_out"]
+    ssp_tools.write(fmugym.FMUSystem({"first": house, "second": house}, wires), path)
+
+
+def test_every_command_has_an_example_or_a_link():
+    shown = {shlex.split(command)[1] for block in BLOCKS for command in commands(block)}
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    listed = set(re.findall(r"^\| \[?`([\w-]+)`", PAGE, re.M)) & known_commands()
+    assert listed == known_commands()
+    assert known_commands() - shown == {"export", "serve"}  # on pages of their own
+
+
+def known_commands():
+    from fmugym.tools.cli import _parser
+
+    (action,) = (one for one in _parser()[0]._actions if one.dest == "==SUPPRESS==" or one.choices)
+    return set(action.choices)
+
+
+def test_exit_codes_are_documented():
+    told = re.findall(r"^\| (\d+(?:, \d+)*) \|", PAGE, re.M)
+    assert told == ["0", "1", "2", "130, 143, 129"]

@@ -1,0 +1,274 @@
+"""The commands that play episodes: record, evaluate with several scenarios, bench."""
+
+import csv
+import json
+import re
+import sys
+import tomllib
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from fmu_tools import interrupted_after
+
+import fmugym
+from fmugym import __main__ as program
+from fmugym.episodes.evaluation import Score, plot_scores
+from fmugym.series import TimeSeries
+from fmugym.tools import speed
+from fmugym.tools.cli import _parsed, _parser
+
+CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
+PID = "pid of=T setpoint=21 kp=0.3 ti=7200"
+FROST = "--scenario", "frost", "--steps", "30"
+
+
+class TestRecord:
+    def test_a_table_of_chosen_variables_at_a_rate(self, tmp_path, cli):
+        path = tmp_path / "a.csv"
+        options = "--variables", "T*", "--variables", "u", "--every", "3600", "--output", path
+        arguments = "--controller", PID, *FROST, *options
+        code, out, err = cli("simulate", "fmugym/House-v0", *arguments, "--json")
+        assert (code, err) == (0, "")
+        (episodes,) = json.loads(out)["runs"].values()
+        rows = list(csv.DictReader(path.read_text().splitlines()))
+        assert list(rows[0])[3:7] == ["u", "T [degC]", "T_floor [degC]", "T_set [degC]"]
+        assert [int(row["step"]) for row in rows] == [0, 4, 8, 12, 16, 20, 24, 28]
+        played = cli("simulate", "fmugym/House-v0", "--controller", PID, *FROST, "--json")
+        assert json.loads(played[1])["episodes"] == episodes
+
+    def test_several_files_at_once(self, tmp_path, cli):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        paths = [tmp_path / name for name in ("a.csv", "b.csv", "a.png", "a.html")]
+        outputs = [text for path in paths for text in ("--output", path)]
+        code, out, _ = cli("simulate", CART_POLE, "--seed", "3", *outputs)
+        assert code == 0
+        assert out.startswith("seed 3: reward")
+        assert paths[0].read_text() == paths[1].read_text() != ""
+        assert paths[2].read_bytes().startswith(b"\x89PNG")
+        page = paths[3].read_text(encoding="utf-8")
+        task = Path(CART_POLE).read_text().splitlines()[-1]
+        assert task in page
+        assert "first seed" in page
+        assert "<h1>cart_pole.toml</h1>" in page
+        assert str(Path(CART_POLE).parent) not in page
+
+    def test_a_report_compares_controllers(self, tmp_path, cli):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.html"
+        who = "--action", "-10", "--action", "10"
+        code, out, _ = cli("simulate", CART_POLE, *who, "--output", path)
+        assert code == 0
+        assert [line.split(":")[0] for line in out.splitlines()] == ["action -10", "action 10"]
+        page = path.read_text(encoding="utf-8")
+        assert page.count("<figure>") == 2
+        assert "<h2>action 10</h2>" in page
+
+    def test_parquet(self, tmp_path, cli):
+        pytest.importorskip("pyarrow", reason="needs pyarrow: the extra parquet")
+        path = tmp_path / "a.parquet"
+        code, *_ = cli("simulate", CART_POLE, "--output", path)
+        assert code == 0
+        assert TimeSeries.read(path)["reward"].sum() == len(TimeSeries.read(path)) - 1
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt, fmugym.SimulationError])
+    def test_an_interruption_keeps_what_is_there(self, error, tmp_path, cli, monkeypatch):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        step = interrupted_after(5, fmugym.FMUEnv.step, error("enough"))
+        monkeypatch.setattr(fmugym.FMUEnv, "step", step)
+        outputs = "--output", tmp_path / "a.csv", "--output", tmp_path / "a.html"
+        code, _, err = cli("simulate", CART_POLE, "--action", "0", *outputs)
+        assert code == (130 if error is KeyboardInterrupt else 1)
+        assert ("enough" in err) == (code == 1)
+        assert len((tmp_path / "a.csv").read_text().splitlines()) == 7
+        assert "stopped" in (tmp_path / "a.html").read_text(encoding="utf-8")
+
+    def test_without_matplotlib_the_extra_is_named(self, tmp_path, cli, monkeypatch):
+        monkeypatch.setitem(sys.modules, "matplotlib", None)
+        code, _, err = cli("simulate", CART_POLE, "--output", tmp_path / "a.html")
+        assert code == 1
+        assert ".[plot]" in err
+
+
+class TestEvaluate:
+    @pytest.mark.parametrize(("random", "is_drawn"), [(-9.0, False), (-1.5, True)])
+    def test_only_random_actions_that_are_the_worst_are_left_out(self, tmp_path, random, is_drawn):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path, rewards = tmp_path / "a.svg", {"random": random, "one": -1.00001, "two": -2.0}
+        scores = [Score(name, (reward,), (), (1,), {}, 1.0) for name, reward in rewards.items()]
+        plot_scores(scores, path, "three")
+        drawn = re.findall("<!-- (.*) -->", path.read_text())
+        assert ("random" in drawn) == is_drawn
+        assert {"one", "two"} <= set(drawn)
+
+    def test_nearly_equal_rewards_look_so(self, tmp_path):
+        """Their ticks are whole numbers, not differences to one that stands elsewhere."""
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.svg"
+        scores = [Score(str(x), (x,), (), (1,), {}, 1.0) for x in (-33.28887, -33.28889)]
+        plot_scores(scores, path, "two")
+        ticks = re.findall("<!-- .(33.*) -->", path.read_text())
+        assert len(ticks) > 2
+        assert float(ticks[0]) - float(ticks[-1]) > 0.1
+
+    def test_several_scenarios_and_a_picture(self, tmp_path, cli):
+        pytest.importorskip("matplotlib", reason="needs Matplotlib: the extra plot")
+        path = tmp_path / "a.png"
+        options = "--steps", "10", "--episodes", "2", "--action", "0", "--plot", path
+        both = "--scenario", "frost", "--scenario", "spring"
+        code, out, _ = cli("evaluate", "fmugym/House-v0", *both, *options, "--json")
+        assert code == 0
+        scores = json.loads(out)["scores"]
+        assert [(one["name"], one["scenario"]) for one in scores] == [
+            *(("random", "frost"), ("action 0", "frost")),
+            *(("random", "spring"), ("action 0", "spring")),
+        ]
+        low, high = scores[1]["cost_interval_95"]
+        assert low <= scores[1]["mean_cost"] <= high
+        assert path.read_bytes().startswith(b"\x89PNG")
+        alone = cli("evaluate", "fmugym/House-v0", *both[2:], *options[:-2], "--json")[1]
+        assert json.loads(alone)["scores"][1]["rewards"] == scores[3]["rewards"]
+
+    def test_an_interruption_keeps_the_scores_that_are_there(self, cli, monkeypatch):
+        step = interrupted_after(200, fmugym.FMUEnv.step)
+        monkeypatch.setattr(fmugym.FMUEnv, "step", step)
+        options = "--episodes", "2", "--steps", "60", "--scenario", "frost", "--action", "0"
+        code, out, _ = cli("evaluate", "fmugym/House-v0", *options, "--json")
+        assert code == 130
+        found = {one["name"]: len(one["rewards"]) for one in json.loads(out)["scores"]}
+        assert found == {"random": 2, "action 0": 1}
+
+    def test_all_scenarios(self, cli):
+        options = "--scenario", "all", "--steps", "2", "--episodes", "1"
+        code, out, _ = cli("evaluate", "fmugym/House-v0", *options)
+        assert code == 0
+        assert [line.split("  ")[0] for line in out.splitlines()[1:]] == [
+            f"random ({name})" for name in ("autumn", "frost", "spring")
+        ]
+
+
+class TestBench:
+    def test_speeds_of_one_and_of_many(self, cli):
+        options = "--envs", "4", "--envs", "16", "--seconds", "0.05"
+        code, out, _ = cli("bench", CART_POLE, *options, "--json")
+        assert code == 0
+        report = json.loads(out)
+        assert [one["envs"] for one in report["speeds"]] == [0, 4, 16]
+        for one in report["speeds"]:
+            count = max(1, one["envs"])
+            assert one["steps_per_second"] * one["microseconds"] == pytest.approx(count * 1e6)
+            assert 0 < one["fmu_share"] <= 1
+            assert one["hooks"] == "compiled"
+        assert report["time_step"] == 0.02
+
+    def test_parameters_are_drawn_as_resets_draw_them(self, caplog):
+        pendulum = {
+            "fmu": {"bundled": "Pendulum"},
+            "parameters": {"m": {"distribution": "uniform", "low": 0.05, "high": 0.1}},
+            "agent": {"actions": ["tau"], "observations": ["q"]},
+            "reward": "-abs(q)",
+            "time_step": 0.05,
+        }
+        *_, report = speed.bench(lambda: fmugym.load(pendulum), [4], 0.05)
+        assert all(0 < one.fmu_share <= 1 for one in report.speeds)
+        assert caplog.text == ""  # a pendulum without a mass would be an error
+
+    def test_a_table_with_words_of_caution(self, cli):
+        code, out, _ = cli("bench", CART_POLE, "--envs", "4", "--seconds", "0.02")
+        assert code == 0
+        assert out.isascii()
+        assert "single" in out
+        assert "busy" in out
+
+
+class TestProgress:
+    @pytest.mark.parametrize("is_terminal", [False, True])
+    def test_bars_are_for_terminals(self, is_terminal, cli, monkeypatch):
+        bars = []
+
+        class Bar:
+            def __init__(self, **arguments):
+                bars.append((arguments["total"], []))
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *error):
+                return None
+
+            def update(self, steps):
+                bars[-1][1].append(steps)
+
+        monkeypatch.setitem(sys.modules, "tqdm", SimpleNamespace(tqdm=Bar))
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
+        options = "--steps", "3", "--episodes", "2"
+        code, *_ = cli("simulate", "fmugym/House-v0", *options)
+        assert code == 0
+        assert bars == ([(6, [1] * 6)] if is_terminal else [])
+
+    def test_without_tqdm_there_are_none(self, cli, monkeypatch):
+        monkeypatch.setitem(sys.modules, "tqdm", None)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+        code, _, err = cli("simulate", "fmugym/House-v0", "--steps", "3")
+        assert (code, err) == (0, "")
+
+
+class TestJson:
+    @pytest.mark.parametrize("options", [[], ["--class"]])
+    def test_of_new(self, options, tmp_path, cli):
+        fmu = fmugym.bundled_fmu("Pendulum")
+        path = tmp_path / "out"
+        code, out, err = cli("new", fmu, *options, "--output", path, "--json")
+        facts = json.loads(out)
+        assert (code, err, facts["output"]) == (0, "", str(path))
+        text = path.read_text()
+        if options:
+            assert facts["program"] == text
+        else:
+            assert facts["task"] == tomllib.loads(text)
+            assert any("reward" in note for note in facts["notes"])
+
+    def test_all_commands_have_it(self):
+        parser = _parser()[0]
+        (commands,) = (action.choices for action in parser._actions if action.choices)
+        for name, command in commands.items():
+            assert any("--json" in action.option_strings for action in command._actions), name
+
+
+def test_arguments_of_an_algorithm_may_stand_anywhere():
+    found = _parsed(["train", "a.toml", "x=1", "--output", "b", "y=2", "z"])
+    assert found.arguments == ["x=1", "y=2", "z"]
+    for wrong in (["simulate", "a.toml", "y=2"], ["train", "a", "--output", "b", "--y", "c"]):
+        with pytest.raises(SystemExit) as caught:
+            _parsed(wrong)
+        assert caught.value.code == 2
+
+
+class TestInterruption:
+    """Ctrl-C in an episode keeps those before it."""
+
+    def test_of_simulate(self, cli, monkeypatch):
+        monkeypatch.setattr(fmugym.FMUEnv, "step", interrupted_after(130, fmugym.FMUEnv.step))
+        options = "--episodes", "9", "--steps", "60", "--json"
+        code, out, _ = cli("simulate", "fmugym/House-v0", *options)
+        assert (code, len(json.loads(out)["episodes"])) == (130, 2)
+
+    def test_of_bench(self, monkeypatch, cli):
+        def interrupted(*_):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(speed, "_of_vector", interrupted)
+        code, out, _ = cli("bench", CART_POLE, "--seconds", "0.01", "--json")
+        assert (code, [one["envs"] for one in json.loads(out)["speeds"]]) == (130, [0])
+
+    def test_while_modules_are_loaded(self, monkeypatch):
+        def interrupted(*_, **__):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(program, "end_as_after_ctrl_c", lambda: None)
+        monkeypatch.delitem(sys.modules, "fmugym.tools.cli")
+        monkeypatch.delattr("fmugym.tools.cli", raising=False)
+        monkeypatch.setattr("builtins.__import__", interrupted)
+        code = program.main()
+        monkeypatch.undo()
+        assert code == 130

@@ -1,0 +1,120 @@
+"""Signals that end the command line: clean-ups are made, and what was written stays."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from process_tools import faulty_fmu, start_values
+
+import fmugym
+from fmugym import __main__ as program
+from fmugym.tools import ending
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+
+CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
+HANGING = """
+import sys
+from fmugym.tools import ending
+ending._TIMEOUT = 0.5
+from fmugym.__main__ import main
+sys.exit(main())
+"""
+
+
+@pytest.fixture
+def start(temp_root):
+    """Start the command line, and wait until it has a temporary folder."""
+    processes = []
+
+    def started(*arguments, begin=("-m", "fmugym"), ignored=()):
+        def prepare():
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN if number in ignored else signal.SIG_DFL)
+
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        command = [sys.executable, *begin, *map(str, arguments)]
+        process = subprocess.Popen(command, preexec_fn=prepare, **pipes)
+        processes.append(process)
+        wait_for(lambda: any(temp_root.glob("fmugym-*")))
+        return process
+
+    yield started
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+def wait_for(condition):
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+class TestEnd:
+    def ended(self, process, number, temp_root):
+        """Send a signal; returns what was printed, after a look at what remains."""
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+        assert process.returncode == 128 + number
+        assert "Traceback" not in err
+        assert list(temp_root.iterdir()) == []
+        return out, err
+
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+    def test_of_bench(self, start, temp_root, number):
+        process = start("bench", CART_POLE, "--seconds", "100")
+        self.ended(process, number, temp_root)
+
+    def test_of_simulate(self, start, temp_root):
+        """The episodes until then are told, as after Ctrl-C."""
+        process = start("simulate", CART_POLE, "--episodes", "1000000", "--json")
+        time.sleep(1.0)
+        out, _ = self.ended(process, signal.SIGTERM, temp_root)
+        assert json.loads(out)["episodes"]
+
+    def test_while_an_fmu_hangs(self, start, temp_root, tmp_path):
+        """Python cannot end the call; the process ends all the same, after a while."""
+        task = tmp_path / "hanging.toml"
+        facts = {
+            "fmu": str(faulty_fmu(tmp_path)),
+            "time_step": 0.1,
+            "episode_length": "10s",
+            "agent": {"actions": ["u"], "observations": ["y"]},
+            "variables": {"u": {"min": -1, "max": 1}},
+            "parameters": start_values("hang", at=1),
+            "reward": "1",
+        }
+        fmugym.Task.from_dict(facts).write(task)
+        process = start("simulate", task, begin=("-c", HANGING))
+        time.sleep(1.0)
+        assert process.poll() is None
+        self.ended(process, signal.SIGTERM, temp_root)
+
+    def test_is_not_asked_for_by_what_is_ignored(self, start, temp_root):
+        """``nohup`` lets programs ignore that the terminal closes."""
+        process = start("bench", CART_POLE, "--seconds", "100", ignored=[signal.SIGHUP])
+        process.send_signal(signal.SIGHUP)
+        time.sleep(0.3)
+        assert process.poll() is None
+        self.ended(process, signal.SIGTERM, temp_root)
+
+
+def test_while_modules_are_loaded(monkeypatch):
+    def signalled():
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(program, "end_as_after_ctrl_c", signalled)
+    monkeypatch.setattr(ending, "_begun", threading.Event())
+    before = signal.signal(signal.SIGTERM, ending._raise)
+    try:
+        assert program.main() == 143
+    finally:
+        signal.signal(signal.SIGTERM, before)

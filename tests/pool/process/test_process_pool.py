@@ -1,0 +1,589 @@
+"""FMUs that end, hang or harm their process: the caller's own goes on, and nothing is left behind.
+
+That the pool is otherwise like any other is shown by test_pool.py.
+"""
+
+import contextlib
+import gc
+import logging
+import os
+import pickle
+import signal
+import subprocess
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from process_tools import (
+    FaultyEnv,
+    faulty_fmu,
+    fixture_faulty,  # noqa: F401  # the fixture "faulty"
+    fixture_opened,  # noqa: F401  # the fixture "opened"
+    is_alive,
+    linux_only,
+    no_descriptors_left,
+    posix_only,
+    processes_with,
+    run_python,
+    start_values,
+    wait_until,
+)
+
+import fmugym
+from fmugym import FMU, ConfigError, FMULoadError, SimulationError, _native, bundled_fmu
+from fmugym.fmi import Status
+from fmugym.pool import PoolSpec
+from fmugym.pool.process import guard, launcher
+from fmugym.pool.process.launcher import _guard
+from fmugym.pool.process.pool import ProcessPool
+from fmugym.trial import opening
+
+LOG = logging.getLogger("fmugym.test")
+
+each_death = pytest.mark.parametrize(
+    ("fault", "cause"),
+    [
+        ("crash", "SIGSEGV"),
+        ("abort", "SIGABRT"),
+        ("exit", "exit status 0"),
+        ("close", "worker process"),
+        ("hang", "took longer than call_timeout"),
+    ],
+)
+
+
+@pytest.fixture(name="make_env")
+def fixture_make_env(faulty, opened):
+    def make(*args, **config):
+        call_timeout = 0.7 if "hang" in args else 20.0
+        return opened(FaultyEnv(faulty, *args, call_timeout=call_timeout, **config))
+
+    return make
+
+
+@pytest.fixture(name="make_vector_env")
+def fixture_make_vector_env(faulty, opened):
+    def make(num_envs, *args, **options):
+        options = {"workers": 2, "call_timeout": 20.0} | options
+        return opened(fmugym.FMUVectorEnv(lambda: FaultyEnv(faulty, *args), num_envs, **options))
+
+    return make
+
+
+@pytest.fixture(name="make_pool")
+def fixture_make_pool(faulty, opened):
+    def make(num_instances=1, path=faulty, **options):
+        fmu = FMU(path)
+        outputs = tuple(map(fmu.variable, ["y", "fault"]))
+        spec = PoolSpec((fmu.variable("u"),), outputs, time_step=0.5, num_observed=1)
+        options = {"isolation": "process", "workers": 2, "call_timeout": 20.0} | options
+        return opened(opening.make_pool(fmu, spec, num_instances, LOG, **options))
+
+    return make
+
+
+def set_up(pool, faulty, fault, mask=None, **stage):
+    """Reset with a fault for each instance."""
+    fmu = FMU(faulty)
+    columns = [list(start_values(one, **stage).values()) for one in fault]
+    variables = tuple(fmu.variable(name) for name in start_values())
+    return pool.reset(variables, np.array(columns, float).T, mask)
+
+
+def step(pool, value=1.0, **options):
+    return pool.step(np.full((1, pool.num_instances), value), **options)
+
+
+INTERRUPTED = """
+import signal, sys
+from test_process_pool import LOG, set_up, step
+from fmugym import FMU
+from fmugym.pool import PoolSpec
+from fmugym.trial.opening import make_pool
+
+path = sys.argv[1]
+fmu = FMU(path)
+spec = PoolSpec((fmu.variable("u"),), (fmu.variable("y"),), time_step=0.5)
+pool = make_pool(fmu, spec, 2, LOG, isolation="process", workers=2, call_timeout=None)
+set_up(pool, path, ["hang", "none"], at=1)
+
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGALRM, interrupt)
+signal.setitimer(signal.ITIMER_REAL, 0.1)
+try:
+    step(pool)
+except KeyboardInterrupt:
+    print("interrupted" in pool.failure(0))
+set_up(pool, path, ["none", "none"])
+print(step(pool)[0][0].tolist())
+pool.close()
+"""
+
+
+class TestSingle:
+    @each_death
+    def test_the_episode_is_truncated_and_the_next_one_goes_well(self, make_env, fault, cause):
+        env = make_env(fault)
+        for _ in range(2):
+            env.reset()
+            assert env.step([1.0])[0] == [0.5]
+            observation, reward, terminated, truncated, info = env.step([1.0])
+            assert (observation.tolist(), reward, terminated, truncated) == (
+                [0.5],
+                0.0,
+                False,
+                True,
+            )
+            assert "Faulty.fmu" in info["fault"]
+            assert "in a step" in info["fault"] or "for a step" in info["fault"]
+            assert cause in info["fault"]
+
+    def test_policies_are_those_of_other_faults(self, make_env):
+        env = make_env("crash", on_fault="terminate", fault_reward=-7)
+        env.reset()
+        env.step([1.0])
+        assert env.step([1.0])[1:4] == (-7.0, True, False)
+        env = make_env("crash", on_fault="raise")
+        env.reset()
+        env.step([1.0])
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            env.step([1.0])
+
+    def test_a_worker_that_is_killed_between_two_calls(self, make_env):
+        env = make_env()
+        env.reset()
+        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
+        assert "SIGKILL" in env.step([1.0])[4]["fault"]
+        env.reset()
+        assert not env.step([1.0])[3]
+
+    def test_last_words_are_told(self, make_pool, faulty):
+        pool = make_pool()
+        set_up(pool, faulty, ["crash"], at=1)
+        assert step(pool)[1].tolist() == [Status.FATAL]
+        assert pool.failure(0).endswith("; the FMU said: [last words] this is fault 1")
+
+    @pytest.mark.parametrize("size", [8, 48, 152, 400, 4096])
+    def test_the_latest_bytes_of_last_words_are_kept(self, opened, monkeypatch, size):
+        for module in ("setup", "shared_memory"):
+            monkeypatch.setattr(f"fmugym.pool.process.{module}.ECHO_SIZE", size)
+        fmu = FMU(bundled_fmu("CartPole"))
+        pool = opened(ProcessPool(fmu, PoolSpec((), (fmu.variable("x"),), 0.05), 1, LOG))
+        for _ in range(5):
+            pool.reset((fmu.variable("m_cart"),), np.array([[-1.0]]))
+        memory = pool._group.supervisors[0]._echo.tobytes()
+        text, _, rest = memory.partition(b"\0")
+        message = (
+            "[logStatusError] fmi2ExitInitializationMode: m_cart, m_pole and pole_length must be "
+        )
+        everything = 5 * f"{message}positive\n"
+        assert text.decode() == everything[-size + 1 :]
+        assert set(rest) <= {0}
+
+    @pytest.mark.parametrize("stage", ["terminate", "free"])
+    def test_the_end_of_an_instance(self, make_env, stage, caplog):
+        env = make_env("crash", stage)
+        env.reset()
+        (pid,) = env.inside.pool.processes()
+        env.close()
+        assert not is_alive(pid)
+        assert "SIGSEGV in its end" in caplog.text
+
+    @pytest.mark.parametrize(("number", "cause"), [(1, "SIGSEGV"), (3, "exit status 0")])
+    def test_instantiation(self, tmp_path, temp_root, number, cause):
+        path = faulty_fmu(tmp_path, f"{{faulty-{number}}}")
+        with pytest.raises(FMULoadError, match=f"{cause} in the instantiation"):
+            FaultyEnv(path)
+        assert list(temp_root.iterdir()) == []
+
+    def test_a_reset_that_ends_the_process_is_done_by_the_next_one(self, make_env):
+        env = make_env("crash", "reset")
+        for _ in range(3):
+            env.reset()
+            assert env.step([1.0])[0] == [0.5]
+
+    def test_a_process_that_ends_in_each_reset(self, make_env):
+        env = make_env("abort", "initialize")
+        for _ in range(5):
+            with pytest.raises(SimulationError, match="SIGABRT in a reset"):
+                env.reset()
+        with pytest.raises(SimulationError, match=r"given up after 5 deaths in a row: .*SIGABRT"):
+            env.reset()
+
+    def test_pickles_with_its_isolation(self, make_env, opened):
+        env = make_env("crash")
+        twin = opened(pickle.loads(pickle.dumps(env)))
+        assert twin.inside.pool.processes() != env.inside.pool.processes()
+        for one in (env, twin):
+            one.reset()
+            assert one.step([1.0])[0] == [0.5]
+            assert one.step([1.0])[3]
+
+    @pytest.mark.parametrize("name", ["CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum"])
+    def test_bundled_environments_take_it_as_an_argument(self, name, opened):
+        here, apart = (
+            opened(gymnasium.make(f"fmugym/{name}-v0", isolation=isolation))
+            for isolation in (None, "process")
+        )
+        assert isinstance(apart.unwrapped.inside.pool, ProcessPool)
+        assert not isinstance(here.unwrapped.inside.pool, ProcessPool)
+        both = [env.reset(seed=1)[0].tolist() for env in (here, apart)]
+        assert both[0] == both[1]
+
+
+class TestVector:
+    @pytest.mark.parametrize(("fault", "cause"), [("crash", "SIGSEGV"), ("hang", "call_timeout")])
+    def test_only_the_episodes_of_one_worker_are_truncated(self, make_vector_env, fault, cause):
+        env = make_vector_env(4, call_timeout=0.7 if fault == "hang" else 20.0)
+        env.set_attr("fault", [start_values(fault)["fault"], 0, 0, 0])
+        env.reset()
+        actions = np.ones((4, 1))
+        env.step(actions)
+        observations, _, terminated, truncated, infos = env.step(actions)
+        assert truncated.tolist() == [True, True, False, False]
+        assert not terminated.any()
+        assert observations.ravel().tolist() == [0.5, 0.5, 1.0, 1.0]
+        assert all(cause in reason for reason in infos["fault"][:2])
+        assert infos["fault"][2:].tolist() == [None, None]
+        observations = env.step(actions)[0]  # the autoreset
+        assert observations.ravel().tolist() == [0.0, 0.0, 1.5, 1.5]
+        observations, _, _, truncated, _ = env.step(actions)
+        assert observations.ravel().tolist() == [0.5, 0.5, 2.0, 2.0]
+        assert not truncated.any()
+
+    def test_training_goes_on(self, make_vector_env):
+        env = make_vector_env(3, workers=3)
+        env.set_attr("fault", [start_values(fault)["fault"] for fault in ("crash", "exit", "none")])
+        env.reset()
+        ends = [env.step(np.ones((3, 1)))[3].tolist() for _ in range(9)]
+        assert ends == [[False] * 3, [True, True, False], [False] * 3] * 3
+
+    @linux_only
+    def test_from_make_vec(self, opened, temp_root):
+        options = {"isolation": "process", "workers": 3}
+        opened(gymnasium.make_vec("fmugym/CartPole-v0", num_envs=5, **options))
+        assert len(processes_with(temp_root)) == 3
+
+
+@posix_only
+class TestShortages:
+    """What the system refuses is blamed on the system; other workers' episodes go on."""
+
+    def test_a_worker_that_dies_when_no_descriptor_is_left(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        with no_descriptors_left():
+            assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+            assert "SIGSEGV in a step" in pool.failure(0)
+            assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+            set_up(pool, faulty, ["none"] * 2, np.array([True, False]))
+            outputs, statuses = step(pool)
+        assert statuses.tolist() == [Status.FATAL, Status.OK]
+        assert outputs[0].tolist() == [0.0, 1.5]
+        assert "Too many open files" in pool.failure(0)
+        set_up(pool, faulty, ["none"] * 2)
+        assert step(pool)[1].tolist() == [Status.OK] * 2
+
+    @pytest.mark.parametrize("left", range(5))
+    def test_a_pool_without_descriptors(self, make_pool, left):
+        make_pool().close()  # the guard is there
+        with no_descriptors_left(left), pytest.raises(FMULoadError, match="Too many open files"):
+            make_pool(3, workers=3)
+
+    def test_no_process_can_be_forked(self, make_pool, faulty, monkeypatch, tmp_path):
+        """The guard lives on, and so do its other workers."""
+        popen, forking = subprocess.Popen, tmp_path / "forking.py"
+        forking.write_text(FORKS_BUT_THE_THIRD)
+        monkeypatch.setattr(
+            subprocess,
+            "Popen",
+            lambda args, **options: popen([*args[:3], str(forking), *args[3:]], **options),
+        )
+        launcher._guards.clear()
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+        assert "SIGSEGV" in pool.failure(0)
+        assert step(pool)[1].tolist() == [Status.FATAL, Status.OK]
+        set_up(pool, faulty, ["none"] * 2, np.array([True, False]))
+        outputs, statuses = step(pool)
+        assert statuses.tolist() == [Status.OK] * 2
+        assert outputs[0].tolist() == [0.5, 1.5]
+        pool.close()
+        launcher._guards.clear()
+
+    def test_no_temporary_folder(self, make_pool, monkeypatch, tmp_path):
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+        with pytest.raises(FMULoadError, match=r"no temporary folder can be made: .*missing"):
+            make_pool()
+
+    def test_a_full_temporary_folder(self, make_pool):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+        try:
+            with pytest.raises(FMULoadError, match=r"Faulty.fmu cannot be .*large"):
+                make_pool()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+class TestOptions:
+    @pytest.mark.parametrize("value", [0, 0.0, -1, np.nan, np.inf, "5", [1.0], 10**400, 1j])
+    def test_call_timeouts_that_are_none(self, make_pool, value):
+        with pytest.raises(ConfigError, match="call_timeout must be"):
+            make_pool(call_timeout=value)
+
+    @pytest.mark.parametrize("name", ["workers", "threads"])
+    @pytest.mark.parametrize("value", [0, -1, 1.5, "2", True])
+    def test_numbers_of_workers_and_threads_that_are_none(self, make_pool, name, value):
+        with pytest.raises(ConfigError, match=f"{name} must be a positive integer, got"):
+            make_pool(**{name: value})
+
+    @pytest.mark.parametrize("value", [1e9, 1e308, 10**12, np.float32(50.0), None])
+    def test_long_call_timeouts(self, make_pool, faulty, value):
+        """They wait that long: the slow answer comes after the first look."""
+        pool = make_pool(call_timeout=value)
+        set_up(pool, faulty, ["pause"], at=1)
+        assert step(pool)[1].tolist() == [Status.OK]
+        with contextlib.closing(pool):
+            os.kill(pool.processes()[0], signal.SIGKILL)
+            assert step(pool)[1].tolist() == [Status.FATAL]
+
+
+FORKS_BUT_THE_THIRD = """
+import errno, itertools, os
+def limited(fork=os.fork, count=itertools.count(1)):
+    if next(count) == 3:
+        raise OSError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+    return fork()
+os.fork = limited
+import runpy, sys
+sys.argv[:] = sys.argv[1:]
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+class TestPool:
+    def test_blocks_and_processes(self, make_pool):
+        assert len(set(make_pool(5, workers=3).processes())) == 3
+        assert len(make_pool(2, workers=9).processes()) == 2
+
+    @linux_only
+    def test_workers_load_nothing_but_the_extension(self, make_pool):
+        (worker,) = make_pool(1).processes()
+        maps = Path(f"/proc/{worker}/maps").read_text()
+        assert _native.__file__ in maps
+        assert str(Path(np.__file__).parent) not in maps
+        command = Path(f"/proc/{worker}/cmdline").read_text().split("\0")
+        assert command[1:4] == ["-I", "-S", guard.__file__]
+
+    def test_lost_instances_stay_so_until_their_own_reset(self, make_pool, faulty):
+        pool = make_pool(4)
+        set_up(pool, faulty, ["crash", "none", "none", "none"], at=1)
+        assert step(pool)[1].tolist() == [4, 4, 0, 0]
+        set_up(pool, faulty, ["none"] * 4, np.array([False, True, False, False]))
+        outputs, statuses = step(pool)
+        assert statuses.tolist() == [4, 0, 0, 0]
+        assert outputs[0].tolist() == [0.0, 0.5, 1.0, 1.0]
+        assert "SIGSEGV" in pool.failure(0)
+        assert pool.step_own() == 1
+        set_up(pool, faulty, ["none"] * 4)
+        assert step(pool)[1].tolist() == [0] * 4
+
+    def test_the_outputs_stay_those_before_the_death(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["none", "abort"], at=2)
+        observations = np.full((2, 1), np.nan, np.float32)
+        step(pool)
+        outputs, _ = step(pool, observations=observations)
+        assert outputs[0].tolist() == [1.0, 0.5]
+        assert observations.ravel().tolist() == [1.0, 0.5]
+
+    def test_a_skipped_instance_cannot_die(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        assert step(pool, skip=np.array([True, False]))[1].tolist() == [0, 0]
+        assert step(pool)[1].tolist() == [4, 0]
+
+    def test_a_new_process_does_as_the_former_one(self, make_pool, faulty):
+        def rollout(pool):
+            set_up(pool, faulty, ["none"] * 3)
+            return [step(pool, 0.1 * index)[0].tobytes() for index in range(5)]
+
+        pool = make_pool(3)
+        before = rollout(pool)
+        set_up(pool, faulty, ["crash", "none", "abort"], at=1)
+        assert step(pool)[1].any()
+        assert rollout(pool) == before
+
+    def test_snapshots_go_with_their_process(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=2)
+        step(pool)
+        snapshot = pool.save()
+        assert step(pool)[1].tolist() == [4, 0]
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.restore(snapshot)
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.save()
+        set_up(pool, faulty, ["none", "none"])
+        with pytest.raises(SimulationError, match=r"process has been replaced since: .*SIGSEGV"):
+            pool.restore(snapshot)
+        outputs, _ = pool.restore(snapshot, np.array([False, True]))
+        assert outputs[0].tolist() == [0.0, 0.5]
+
+    def test_reading_is_refused_while_instances_are_lost(self, make_pool, faulty):
+        pool = make_pool(2)
+        set_up(pool, faulty, ["crash", "none"], at=1)
+        step(pool)
+        with pytest.raises(SimulationError, match="SIGSEGV"):
+            pool.read((FMU(faulty).variable("y"),))
+
+    @posix_only
+    def test_an_interrupted_call(self, faulty):
+        """A reply that comes late must not be taken for that of the next call.
+
+        In a process of its own: an exception out of a signal handler leaves coverage's lock locked.
+        """
+        done = run_python("-c", INTERRUPTED, str(faulty))
+        assert done.stdout.splitlines() == ["True", "[0.5, 0.5]"], done.stderr
+
+    @posix_only
+    @pytest.mark.parametrize("when", ["before", "after"])
+    def test_without_a_working_directory(self, make_pool, faulty, monkeypatch, tmp_path, when):
+        """Workers start although theirs was removed before, or after the pool was made."""
+        directory = tmp_path / "away"
+        directory.mkdir()
+        monkeypatch.chdir(directory)
+        if when == "before":
+            directory.rmdir()
+        pool = make_pool()
+        if when == "after":
+            directory.rmdir()
+        os.kill(pool.processes()[0], signal.SIGKILL)
+        step(pool)
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[0][0].tolist() == [0.5]
+
+    def test_after_close(self, make_pool):
+        pool = make_pool()
+        pids = pool.processes()
+        pool.close()
+        assert not any(map(is_alive, pids))
+        with pytest.raises(SimulationError, match="the pool is closed"):
+            pool.step_own()
+
+    def test_several_at_once(self, make_pool, faulty):
+        first, second = make_pool(2), make_pool(3)
+        set_up(first, faulty, ["none"] * 2)
+        set_up(second, faulty, ["none", "none", "crash"], at=1)
+        step(second)
+        assert step(first)[0][0].tolist() == [0.5, 0.5]
+        first.close()
+        set_up(second, faulty, ["none"] * 3)
+        assert step(second)[0][0].tolist() == [0.5] * 3
+
+    def test_without_its_guard(self, make_pool, faulty):
+        pool = make_pool()
+        set_up(pool, faulty, ["none"])
+        os.kill(_guard().pid, signal.SIGKILL)
+        wait_until(lambda: not any(map(is_alive, pool.processes())))
+        assert step(pool)[1].tolist() == [Status.FATAL]
+        set_up(pool, faulty, ["none"])
+        assert step(pool)[1].tolist() == [Status.OK]
+
+    @linux_only
+    def test_deaths_leave_nothing(self, make_pool, faulty, temp_root):
+        pool = make_pool()
+
+        def die():
+            set_up(pool, faulty, ["crash"], at=1)
+            step(pool)
+            return len(os.listdir("/proc/self/fd")), len(list(temp_root.iterdir()))
+
+        gc.collect()  # pools of other tests
+        first = [die() for _ in range(3)][-1]
+        assert [die() for _ in range(10)] == [first] * 10
+
+
+@posix_only
+def test_a_worker_does_as_a_pool_in_this_process(make_pool, faulty):
+    here = make_pool(3, isolation="none")
+    pool = make_pool(3)
+    with pytest.raises(SimulationError):
+        pool.save()  # before the first reset
+    for one in (here, pool):
+        set_up(one, faulty, ["none"] * 3)
+        step(one, 1.0)
+        snapshot = one.save()
+        step(one, 2.0, skip=np.array([False, True, False]))
+        one.restore(snapshot, np.array([False, False, True]))
+        one.inputs[:] = 4.0
+        assert one.step_own() == 0
+        del snapshot
+        step(one, np.inf)
+    np.testing.assert_array_equal(pool.outputs, here.outputs)
+    np.testing.assert_array_equal(pool.statuses, here.statuses)
+    np.testing.assert_array_equal(pool.observations, here.observations)
+    assert all(pool.failure(index).endswith("u = inf") for index in range(3))
+    variables = (FMU(faulty).variable("u"), FMU(faulty).variable("y"))
+    np.testing.assert_array_equal(pool.read(variables), here.read(variables))
+
+
+class TestChoice:
+    """An FMU whose second instance fails, though it has a copy of the library."""
+
+    def test_one_process_for_each_instance(self, make_pool, tmp_path, caplog):
+        path = faulty_fmu(tmp_path, "{lonely}")
+        pool = make_pool(3, path, isolation=None, workers=None)
+        assert isinstance(pool, ProcessPool)
+        assert len(pool.processes()) == 3
+        assert "each gets a process" in caplog.text
+
+    def test_by_its_own_word(self, make_pool, tmp_path, caplog):
+        flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
+        alone = faulty_fmu(tmp_path / "1", "{lonely}", flag)
+        assert isinstance(make_pool(2, alone, isolation=None, workers=None), ProcessPool)
+        path = faulty_fmu(tmp_path / "2", capabilities=flag)
+        pool = make_pool(2, path, isolation=None, workers=None)
+        assert len(pool.processes()) == 2
+        assert "a process may have one instance of" in caplog.text
+        assert not isinstance(make_pool(1, path, isolation=None, workers=None), ProcessPool)
+
+    def test_unless_the_caller_insists(self, make_pool, tmp_path):
+        flag = 'canBeInstantiatedOnlyOncePerProcess="true"'
+        path = faulty_fmu(tmp_path, capabilities=flag)
+        assert not isinstance(make_pool(2, path, isolation="none", workers=None), ProcessPool)
+        options = {"isolation": None, "workers": None, "private_libraries": True}
+        assert not isinstance(make_pool(2, path, **options), ProcessPool)
+
+    def test_with_isolation_asked_for(self, make_pool, tmp_path):
+        path = faulty_fmu(tmp_path, "{lonely}")
+        assert len(make_pool(2, path, workers=None).processes()) == 2
+
+
+def test_the_bundled_fmus_run_in_processes(opened):
+    """With what a user passes to a single environment of a class of his own."""
+
+    class Pole(fmugym.FMI2CSEnv):
+        def __init__(self):
+            config = {
+                "model_input_names": "f",
+                "model_output_names": ["x", "theta"],
+                "time_step": 0.02,
+                "isolation": "process",
+            }
+            super().__init__(bundled_fmu("CartPole"), config)
+
+        def _is_done(self):
+            return abs(self.state[1]) > 1.0
+
+    env = opened(Pole())
+    env.reset()
+    assert env.step([1.0])[0].shape == (2,)
+    assert env.read_variables("x").keys() == {"x"}

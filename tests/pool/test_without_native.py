@@ -1,0 +1,60 @@
+"""Without the C extension FMPy steps FMUs, and what needs the extension says so."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PROGRAM = """
+import logging, sys
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+sys.modules["fmugym._native"] = None  # as if it had not been built
+import gymnasium, fmugym, numpy
+env = gymnasium.make("fmugym/CartPole-v0")
+env.reset(seed=1)
+single = [env.step(1)[0].tolist() for _ in range(5)]
+envs = gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2)
+envs.reset(seed=1)
+vector = [envs.step(numpy.array([1, 1]))[0][0].tolist() for _ in range(5)]
+assert single == vector
+for refused in (
+    lambda: gymnasium.make_vec("fmugym/CartPole-v0", num_envs=2, backend="native"),
+    lambda: gymnasium.make("fmugym/CartPole-v0", isolation="process"),
+    env.unwrapped.save_state,
+):
+    try:
+        refused()
+    except fmugym.FMUGymError as error:
+        print("refused:", error)
+"""
+
+
+def test_the_slow_path_works_and_says_so_once():
+    result = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.count("FMUs are stepped by FMPy, which is slow") == 1
+    assert "Python's headers were missing. Install them" in result.stdout
+    refusals = [line for line in result.stdout.splitlines() if line.startswith("refused: ")]
+    assert len(refusals) == 3
+    assert all("C extension" in line for line in refusals)
+
+
+def test_without_the_headers_of_python_a_wheel_is_built(tmp_path):
+    copy = tmp_path / "source"
+    copy.mkdir()
+    for name in ("build_backend.py", "pyproject.toml", "setup.py", "README.md", "LICENSE"):
+        (copy / name).write_bytes((ROOT / name).read_bytes())
+    for folder in ("fmugym", "native", "resources"):
+        (copy / folder).symlink_to(ROOT / folder)
+    script = "import sysconfig; sysconfig.get_config_vars()['installed_base'] = '/nowhere'\n"
+    script += "import build_backend\nassert build_backend.get_requires_for_build_wheel() == []\n"
+    script += f"build_backend.build_wheel({str(tmp_path)!r})"
+    command = [sys.executable, "-c", script]
+    result = subprocess.run(command, cwd=copy, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    (wheel,) = tmp_path.glob("*-none-any.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "fmugym/pool/backend/by_fmpy.py" in names
+    assert not any(name.startswith("fmugym/_native.") and name[-1] != "i" for name in names)

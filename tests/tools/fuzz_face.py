@@ -1,0 +1,618 @@
+"""Odd values by the thousand: nothing but the package's own errors may come of them.
+
+    python tests/tools/fuzz_face.py --count 10000 --seed 0
+
+Each case is a call of the public face with one to three odd values: in the config, as arguments of
+constructors, as seeds, options and actions, in distributions, as attributes, and as results of
+hooks. Either the value is accepted and the environment works with it, or it is refused with an
+error of ``FMUGymError``. Then it works as before. See ``fuzz_driver.py``.
+"""
+
+import contextlib
+import datetime
+import decimal
+import enum
+import fractions
+import math
+import pathlib
+import sys
+
+import gymnasium
+import numpy as np
+from fuzz_driver import Case, describe, main
+from odd_values import circular, hostile
+
+import fmugym
+from fmugym import Choice, FMUVectorEnv, LogUniform, Normal, Uniform, testing
+from fmugym.archive import ArchiveLimits
+from fmugym.checks import integer_of
+from fmugym.config import EnvConfig
+from fmugym.pool import Paced
+
+
+class Sampled:
+    """A distribution that draws an odd value."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def sample(self, rng):
+        return self.value
+
+
+class Frozen:
+    """The same in the form of ``scipy.stats``."""
+
+    def __init__(self, value):
+        self.value = value
+
+    def rvs(self, random_state=None):
+        return self.value
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+class Whole(int):
+    pass
+
+
+class Text(str):
+    __slots__ = ()
+
+
+NUMBERS = (
+    *(0, 1, -1, 2, 3, 7, 2**31 - 1, 2**31, -(2**31) - 1, 2**53 + 1, 2**63, 2**64, 10**400),
+    *(-(10**400), 10**5000, 0.0, -0.0, 0.1, 0.5, -0.5, 1.5, 2.0, 1e-320, 1e-9, 1e300, 1e308),
+    *(-1e308, math.nan, math.inf, -math.inf, True, False, 1j, complex(math.nan, 0)),
+    *(np.float32(0.1), np.float64(0.1), np.float32(math.inf), np.float64(math.nan), np.float16(1)),
+    *(np.int8(1), np.int64(2), np.int64(-1), np.uint64(2**63), np.bool_(True), np.complex64(1)),
+    *(np.longdouble(0.1), np.longdouble("1e4000"), Whole(2), decimal.Decimal("0.1")),
+    *(decimal.Decimal("NaN"), decimal.Decimal("sNaN"), decimal.Decimal("1e9999")),
+    *(fractions.Fraction(1, 3), fractions.Fraction(10**400)),
+)
+TEXTS = (
+    *("", " ", "q", "0.1", "nan", "inf", "1", "None", "a\0b", "\ud800", "\u00e4\u4e2d", "x" * 9000),
+    *("tau", "q_0", "rk4", "python", "native", "process", "none", "human", "rgb_array", "%s{0}"),
+    *(b"q", b"", bytearray(b"1"), memoryview(b"1"), Text("q"), pathlib.Path("q.fmu"), Colour.RED),
+)
+MAKERS = (
+    list,
+    dict,
+    set,
+    object,
+    circular,
+    lambda: [None],
+    lambda: [1],
+    lambda: [1.0, 2.0],
+    lambda: [[0.1]],
+    lambda: [[1.0], [2.0, 3.0]],
+    lambda: ["q", 1],
+    lambda: ("q", "q"),
+    lambda: (0.5,),
+    lambda: (1, 2, 3),
+    lambda: {"q": 1},
+    lambda: {1: 2},
+    lambda: {"q_0": None},
+    lambda: {"q_0": [1.0]},
+    lambda: {"q_0": 10**400},
+    lambda: {"q_0": {}},
+    lambda: {None: 1},
+    lambda: frozenset("q"),
+    lambda: range(3),
+    lambda: iter([1.0]),
+    lambda: (x for x in "q"),
+    lambda: float,
+    lambda: Uniform,
+    lambda: math.sin,
+    lambda: NotImplemented,
+    lambda: ...,
+    lambda: ValueError("q"),
+    lambda: datetime.timedelta(1),
+    lambda: slice(1, 2),
+    lambda: math,
+    lambda: np.array(0.1),
+    lambda: np.array([0.1]),
+    lambda: np.ones((2, 2)),
+    lambda: np.ones(0),
+    lambda: np.array([math.nan]),
+    lambda: np.array(["q"]),
+    lambda: np.array([None]),
+    lambda: np.array([1, "q", None], object),
+    lambda: np.array([1e39]),
+    lambda: np.ones(3, bool),
+    lambda: np.array([True, False]),
+    lambda: np.array([1, 0]),
+    lambda: np.array([1j]),
+    lambda: np.datetime64("2020-01-01"),
+    lambda: np.timedelta64(1, "s"),
+    lambda: np.ma.masked,
+    lambda: np.zeros(2, "i4,f4"),
+    lambda: np.ma.array([1.0], mask=[True]),
+    lambda: np.str_("q"),
+    lambda: Uniform(0, 1),
+    lambda: Normal(0, 1),
+    lambda: Choice([1, 2]),
+    lambda: Choice(["q"]),
+    lambda: Sampled(None),
+    lambda: Sampled("q"),
+    lambda: Sampled(math.nan),
+    lambda: Sampled(1),
+    lambda: Sampled([1.0]),
+    lambda: Sampled(np.ones(2)),
+    lambda: Sampled(10**400),
+    lambda: Sampled(np.float32(0.5)),
+    lambda: Frozen(None),
+    lambda: Frozen(np.array([1.0])),
+    lambda: Frozen("q"),
+    lambda: Frozen(0.5),
+    lambda: hostile("sample"),
+    lambda: hostile("rvs"),
+    lambda: {"distribution": "uniform"},
+    lambda: {"distribution": []},
+    lambda: {"distribution": "normal", "mean": "q"},
+    lambda: {"distribution": "choice"},
+    lambda: {"distribution": "uniform", "low": 0, "high": 1},
+    lambda: hostile("__repr__"),
+    lambda: hostile("__repr__", "__str__"),
+    lambda: hostile(),
+    lambda: hostile("__float__"),
+    lambda: hostile("__index__"),
+    lambda: hostile("__int__"),
+    lambda: hostile("__array__"),
+    lambda: hostile("__eq__"),
+    lambda: hostile("__bool__"),
+    lambda: hostile("__hash__"),
+    lambda: hostile("__len__"),
+    lambda: hostile("__iter__"),
+    lambda: hostile("__getattr__"),
+    lambda: hostile("__getitem__", "__len__"),
+    lambda: hostile("__fspath__"),
+    lambda: hostile("__deepcopy__"),
+    lambda: hostile("__eq__", "__bool__", "__repr__", "__array__", "__float__", "__len__"),
+    lambda: hostile("__repr__", base=float),
+    lambda: hostile("__float__", base=float),
+    lambda: hostile("__repr__", "__eq__", "__index__", "__float__", base=int),
+    lambda: hostile("__iter__", "__len__", base=list),
+    lambda: hostile("keys", base=dict),
+    lambda: hostile("__iter__", "items", base=dict),
+    lambda: hostile("__hash__", base=str),
+)
+
+
+def odd(rng):
+    """Draw a value of which few calls can make use."""
+    kind = rng.randrange(4)
+    if kind == 0:
+        return rng.choice(NUMBERS)
+    return rng.choice(TEXTS) if kind == 1 else rng.choice(MAKERS)()
+
+
+# Environments
+
+
+def is_small(config):
+    """Whether steps and resets take no time to speak of."""
+    step = config.time_step or 0.02
+    return config.substeps < 1000 and not 1000 < config.warm_up / step < math.inf
+
+
+class Swing(fmugym.FMUEnv):
+    """A pendulum whose config may be changed at will."""
+
+    def __init__(self, changes=None, **options):
+        config = swing_config()
+        config.update(changes or {})
+        super().__init__(options.pop("fmu_path", fmugym.bundled_fmu("Pendulum")), config, **options)
+
+    def _is_done(self):
+        return abs(self.state[0]) > 50.0
+
+
+class Tracking(Swing):
+    """One with episode variables, and attributes that hooks read."""
+
+    def __init__(self, changes=None, **options):
+        self.weight = 1.0
+        variables = {"target": Uniform(-1.0, 1.0), "integral": 0.0}
+        super().__init__({"episode_variables": variables} | (changes or {}), **options)
+
+    def _update(self):
+        error = self.state[0] - self.variables["target"]
+        self.variables["integral"] = self.variables["integral"] + 0.02 * error
+
+    def _reward_policy(self):
+        return -self.weight * abs(self.variables["integral"])
+
+
+def swing_config():
+    return {
+        "model_input_names": ["tau"],
+        "model_output_names": ["q", "q_dot"],
+        "model_parameters": {"q_0": 1.0, "max_step": 1.0},
+        "time_step": 0.02,
+        "bounds": {"tau": (-1.0, 1.0)},
+    }
+
+
+KEYS = (
+    *("model_input_names", "model_output_names", "model_parameters", "time_step"),
+    *("positive_reward", "negative_reward", "max_episode_steps", "start_time", "stop_time"),
+    *("tolerance", "substeps", "warm_up", "monitor_names", "episode_variables", "bounds"),
+    *("on_fault", "fault_retries", "fault_reward", "leak_limit", "archive_limits", "preload"),
+    *("probe_timeout", "isolation", "call_timeout"),
+)
+
+
+def use(env, seed=0):
+    """Run an environment for some steps."""
+    space = getattr(env, "action_space", None)
+    env.reset(seed=seed)
+    space.seed(0)
+    for _ in range(3):
+        *_, terminated, truncated, _ = env.step(space.sample())
+        if np.any(terminated) or np.any(truncated):
+            env.reset()
+
+
+@contextlib.contextmanager
+def closing(env):
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+def make_and_use(make):
+    with closing(make()) as env:
+        if is_small(env.config) and env.config.isolation is None:
+            use(env)
+
+
+def pick(rng, names, count=None):
+    return rng.sample(names, count or rng.choice((1, 1, 1, 2, 3)))
+
+
+# Kinds of cases: each returns the odd values, and a function to be called with them.
+
+
+def in_config(rng):
+    changes = {key: odd(rng) for key in pick(rng, KEYS)}
+    if rng.random() < 0.05:
+        changes[rng.choice(("timestep", 1, None, "", ("a",)))] = 1
+    return changes, lambda: make_and_use(lambda: Swing(changes))
+
+
+def nested_in_config(rng):
+    value = odd(rng)
+    place = rng.choice(("model_parameters", "episode_variables", "bounds"))
+    name = rng.choice(("q_0", "m", "solver", "max_step", "tau", "target", "q"))
+    inner = rng.choice((value, [value], (value, 1.0), (0.0, value)))
+    changes = {place: {**swing_config().get(place, {}), name: inner}}
+    return changes, lambda: make_and_use(lambda: Tracking(changes))
+
+
+def as_config(rng):
+    value = odd(rng)
+    return value, lambda: make_and_use(lambda: fmugym_env(value))
+
+
+def fmugym_env(config):
+    class Plain(fmugym.FMUEnv):
+        def _is_done(self):
+            return False
+
+    return Plain(fmugym.bundled_fmu("Pendulum"), config)
+
+
+def as_argument(rng):
+    names = ("log_level", "render_mode", "backend", "isolation", "fmu_path", "isolatoin")
+    arguments = {name: odd(rng) for name in pick(rng, names)}
+    arguments = {name: v for name, v in arguments.items() if not is_left_out(name, v)}
+    return arguments, lambda: make_and_use(lambda: Swing(**arguments))
+
+
+BUNDLED = {
+    "CartPole": ("sutton_barto_reward", "fmi_version", "model_parameters", "render_mode", "lo"),
+    "Pendulum": ("g", "fmi_version", "model_parameters", "log_level", "gg"),
+    "ModelicaCartPole": (
+        *("m_cart", "m_pole", "theta_0", "theta_dot_0", "time_step", "positive_reward"),
+        *("negative_reward", "force", "log_level", "fmu_path", "fmi_version", "x"),
+    ),
+    "CloudPendulum": (
+        *("torque_limit", "backend", "model_parameters", "user_token", "gym_token", "gym_time"),
+        *("session_time", "fmi_version", "render_mode"),
+    ),
+}
+
+
+def of_bundled(rng):
+    name = rng.choice(list(BUNDLED))
+    arguments = {key: odd(rng) for key in pick(rng, BUNDLED[name])}
+    arguments = {name: v for name, v in arguments.items() if not is_left_out(name, v)}
+    cls = getattr(fmugym.envs, f"{name}Env")
+    return (name, arguments), lambda: make_and_use(lambda: cls(**arguments))
+
+
+class Stage:
+    """Environments that serve many cases: a refused value must leave them as good as new."""
+
+    _CASES = 50
+
+    def __init__(self):
+        self._envs = {}
+        self._cases = 0
+
+    def begin_case(self):
+        """Make the environments anew now and then."""
+        self._cases += 1
+        if self._cases % self._CASES == 0:
+            self.close()
+
+    def single(self, cls=Tracking):
+        if cls not in self._envs:
+            self._envs[cls] = cls()
+        return self._envs[cls]
+
+    def vector(self, hooks, cls=Tracking, mode="next_step"):
+        key = cls, hooks, mode
+        if key not in self._envs:
+            self._envs[key] = FMUVectorEnv(cls, 3, hooks=hooks, autoreset_mode=mode)
+        return self._envs[key]
+
+    def forget(self, env):
+        self._envs = {key: one for key, one in self._envs.items() if one is not env}
+        env.close()
+
+    def close(self):
+        for env in self._envs.values():
+            env.close()
+        self._envs = {}
+
+
+def tried(env, call):
+    """Try a call on an environment that has begun, and show that it works afterwards."""
+    env.reset(seed=1)
+    try:
+        call()
+    finally:
+        use(env)
+
+
+def of_seed(rng, stage):
+    seed = odd(rng)
+    env = stage.single()
+    return seed, lambda: tried(env, lambda: env.reset(seed=seed))
+
+
+def of_options(rng, stage):
+    cls = rng.choice((Tracking, fmugym.envs.CartPoleEnv, fmugym.envs.PendulumEnv))
+    names = (*cls.reset_options, "odd")
+    options = {name: odd(rng) for name in pick(rng, names, 1)}
+    if rng.random() < 0.4:
+        options = {"model_parameters": {rng.choice(("q_0", "m", "theta_0", "solver")): odd(rng)}}
+    options = rng.choice((options, options, options, odd(rng)))
+    env = stage.single(cls)
+    return options, lambda: tried(env, lambda: env.reset(options=options))
+
+
+def of_action(rng, stage):
+    cls = rng.choice((Tracking, fmugym.envs.CartPoleEnv, fmugym.envs.PendulumEnv))
+    action = odd(rng)
+    env = stage.single(cls)
+    return action, lambda: tried(env, lambda: env.step(action))
+
+
+def of_reading(rng, stage):
+    env, name, value = stage.single(), odd(rng), odd(rng)
+    calls = (
+        lambda: env.read_variables(name),
+        lambda: env.out[name],
+        lambda: env.out.get(name),
+        lambda: name in env.out,
+        lambda: env.variables.__setitem__(name, value),
+        lambda: env.variables.update(name),
+        lambda: env.fmu.variable(name),
+        lambda: fmugym.bundled_fmu(name, value),
+        lambda: fmugym.bundled_fmu("Pendulum", value),
+    )
+    call = rng.choice(calls)
+    return (calls.index(call), name, value), lambda: tried(env, call)
+
+
+def of_distribution(rng):
+    cls = rng.choice((Uniform, LogUniform, Normal, Choice))
+    count = {Normal: rng.choice((2, 3, 4)), Choice: rng.choice((1, 2))}.get(cls, 2)
+    arguments = [rng.choice((0.5, 1, 2.0)) for _ in range(count)]
+    arguments[rng.randrange(count)] = odd(rng)
+    if cls is Choice:
+        arguments[0] = rng.choice((arguments[0], [odd(rng), 1.0], [1, 2]))
+
+    def call():
+        value = cls(*arguments)
+        changes = {
+            "model_parameters": {"q_0": value, "max_step": 1.0},
+            "episode_variables": {"target": value},
+        }
+        make_and_use(lambda: Swing(changes))
+
+    return (cls.__name__, arguments), call
+
+
+VECTOR_ARGUMENTS = (
+    *("num_envs", "max_episode_steps", "autoreset_mode", "hooks", "backend", "threads"),
+    *("private_libraries", "isolation", "workers", "call_timeout", "thread"),
+)
+
+
+def is_left_out(name, value):
+    """Whether a sound value would take too much of the machine, or is a function of the caller's.
+
+    What such a function raises is the caller's own.
+    """
+    if name == "backend" and callable(value):
+        return True
+    if name == "num_envs":
+        return 100 < (integer_of(value) or 0) < 2**62
+    return is_text(value, "process", "human")
+
+
+def is_text(value, *texts):
+    return type(value) is str and value in texts
+
+
+def as_vector_argument(rng):
+    arguments = {name: odd(rng) for name in pick(rng, VECTOR_ARGUMENTS)}
+    arguments = {name: v for name, v in arguments.items() if not is_left_out(name, v)}
+    other = odd(rng)
+    make = rng.choice((Swing, Swing, Swing, Swing if callable(other) else other))
+
+    def call():
+        with closing(FMUVectorEnv(make, **{"num_envs": 2, **arguments})) as env:
+            use(env)
+
+    return (describe(make), arguments), call
+
+
+HOOKS = ("auto", "array", "per_env")
+
+
+def of_vector(rng, stage):
+    env = stage.vector(rng.choice(HOOKS), rng.choice((Tracking, fmugym.envs.CartPoleEnv)))
+    value = odd(rng)
+    name = rng.choice(("weight", "q_0", "m", "state", "logger", "pool", "config", "np_random"))
+    calls = {
+        "seed": lambda: env.reset(seed=value),
+        "seeds": lambda: env.reset(seed=[value, 1, 2]),
+        "mask": lambda: env.reset(options={"reset_mask": value}),
+        "options": lambda: env.reset(options=value),
+        "parameters": lambda: env.reset(options={"model_parameters": {"m": value}}),
+        "actions": lambda: env.step(value),
+        "action": lambda: env.step([value, value, value]),
+        "get_attr": lambda: env.get_attr(value),
+        "call": lambda: env.call(value),
+    }
+    kind = rng.choice(list(calls))
+    return (kind, name, value), lambda: tried(env, calls[kind])
+
+
+def of_attribute(rng, stage):
+    """Attributes stay, and so does what they break: the environment is not used again."""
+    env = stage.vector(rng.choice(HOOKS))
+    value = odd(rng)
+    name = rng.choice(("weight", "q_0", "m", "weigth", value))
+    values = rng.choice((value, [value, value, value], [value]))
+
+    def call():
+        try:
+            env.reset(seed=1)
+            env.set_attr(name, values)
+            if not is_text(name, "weight"):
+                use(env)
+        finally:
+            stage.forget(env)
+
+    return (name, values), call
+
+
+def of_functions(rng):
+    value, other = odd(rng), odd(rng)
+    calls = {
+        "FMU": lambda: fmugym.FMU(value).close(),
+        "limits": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), limits=value).close(),
+        "preload": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), preload=value).close(),
+        "timeout": lambda: fmugym.FMU(fmugym.bundled_fmu("Pendulum"), probe_timeout=value).close(),
+        "ArchiveLimits": lambda: ArchiveLimits(max_ratio=value),
+        "EnvConfig": lambda: EnvConfig.from_dict(value),
+        "Paced": lambda: Paced(other, hold_after=value),
+        "check_fmu_env": lambda: testing.check_fmu_env(value),
+        "check_hooks": lambda: callable(value) or testing.check_hooks(value),
+        "register": lambda: register(rng.choice((value, "fuzz/Odd-v0")), other),
+    }
+    kind = rng.choice(list(calls))
+    return (kind, value, other), calls[kind]
+
+
+def register(env_id, env):
+    try:
+        fmugym.register(env_id, env)
+    finally:
+        gymnasium.registry.pop("fuzz/Odd-v0", None)
+
+
+HOOK_NAMES = (
+    *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
+    *("_get_observation", "_get_info", "_goal_reward", "_get_episode_parameters"),
+    *("_get_action_space", "_get_observation_space"),
+)
+
+
+def odd_class(rng):
+    """A class of which one hook returns an odd value, in all steps or in some."""
+    name, value, late = rng.choice(HOOK_NAMES), odd(rng), rng.random() < 0.5
+    original = getattr(Tracking, name)
+
+    def hook(self, *arguments):
+        if late and not np.all(self.step_count == 2):
+            return original(self, *arguments)
+        return value
+
+    return (name, value, late), type("Odd", (Tracking,), {name: hook})
+
+
+def of_hook(rng):
+    values, cls = odd_class(rng)
+
+    def call():
+        with closing(cls()) as env:
+            use(env)
+            env.reset(options={"model_parameters": {}})
+
+    return values, call
+
+
+def of_vector_hook(rng):
+    values, cls = odd_class(rng)
+    way = rng.choice(HOOKS)
+
+    def call():
+        with closing(FMUVectorEnv(cls, 2, hooks=way)) as env:
+            use(env)
+
+    return (way, *values), call
+
+
+WHOLE = {
+    in_config: 6,
+    nested_in_config: 3,
+    as_config: 1,
+    as_argument: 2,
+    of_bundled: 4,
+    of_distribution: 3,
+    as_vector_argument: 4,
+    of_functions: 2,
+    of_hook: 4,
+    of_vector_hook: 3,
+}
+STAGED = {of_seed: 1, of_options: 2, of_action: 3, of_reading: 1, of_vector: 4, of_attribute: 1}
+KINDS = WHOLE | STAGED
+
+
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``."""
+    stage = Stage()
+
+    def make(rng, folder):
+        stage.begin_case()
+        kind = rng.choices(list(KINDS), list(KINDS.values()))[0]
+        values, call = kind(rng, stage) if kind in STAGED else kind(rng)
+        return Case(call, kind.__name__, values, keeps=kind in STAGED)
+
+    with contextlib.closing(stage):
+        yield make
+
+
+if __name__ == "__main__":
+    sys.exit(main(program, __doc__, 10_000))

@@ -1,0 +1,95 @@
+"""Odd arguments of ``fmugym.identification``: each call ends well or in an error of the package.
+
+    python tests/tools/fuzz_identification.py --count 2000 --seed 0
+
+A case calls one public function, class or method with one or two arguments of a wrong type, range
+or shape. See ``fuzz_driver.py``.
+"""
+
+import contextlib
+import functools
+import sys
+
+import numpy as np
+from fuzz_driver import Case, main
+from odd_values import odd, spoil
+
+from fmugym import bundled_fmu
+from fmugym.identification import Trajectory, fit_parameters, plot_comparison
+
+TIME = np.arange(0.0, 0.4, 0.02)
+SWING = {"q": np.cos(9.9 * TIME), "q_dot": -9.9 * np.sin(9.9 * TIME)}
+FIT = {
+    "fmu": str(bundled_fmu("Pendulum")),
+    "parameters": {"l": (0.05, 0.2)},
+    "trajectories": [Trajectory(TIME, SWING)] * 3,
+    "initial_states": {"q_0": "q"},
+    "fit_initial_states": False,
+    "fixed": {"g": 9.81},
+    "scales": {"q": 1.0},
+    "time_step": 0.02,
+    "wash_in": 0.1,
+    "candidates": 1,
+    "drop_repeats": True,
+    "max_evaluations": 2,
+    "backend": "auto",
+}
+INSIDE = ("parameters", "initial_states", "fixed", "scales")
+
+
+@functools.cache
+def fitted():
+    return fit_parameters(**FIT)
+
+
+def fit(rng):
+    """Fit with odd arguments, or with odd values in a dict of them."""
+    arguments = spoil(rng, FIT)
+    if rng.random() < 0.5:
+        name = rng.choice(INSIDE)
+        arguments = FIT | {name: {rng.choice(("l", "m", "q", "q_0", "zzz")): odd(rng)}}
+    return lambda: fit_parameters(**arguments)
+
+
+def trajectory(rng):
+    arguments = {"time": TIME, "outputs": SWING, "inputs": {"tau": 0.0}, "label": "x"}
+    if rng.random() < 0.5:
+        name = rng.choice(("outputs", "inputs"))
+        return lambda: Trajectory(**arguments | {name: {"q": odd(rng)}})
+    spoiled = spoil(rng, arguments)
+    return lambda: Trajectory(**spoiled)
+
+
+def method(rng):
+    """Call a method of a result or of a trajectory with one odd argument."""
+    made, value = FIT["trajectories"][0], odd(rng)
+    calls = (
+        *(made.select, made.windows, lambda x: made.between(x, 1.0), fitted().confidence_intervals),
+        *(lambda x: made.between(0.0, x), fitted().rms, fitted().predict, fitted().rows),
+        *(lambda x: fitted().predict([made], lead_in=x), fitted().comparison.residuals),
+        *(lambda x: fitted().predict([made], refit_initial_states=x), fitted().distributions),
+        *(lambda x: fitted().comparison.rms_interval("q", x),),
+        *(lambda x: fitted().comparison.rms_interval("q", seed=x), plot_comparison),
+        *(lambda x: plot_comparison(fitted().comparison, x),),
+        *(lambda x: plot_comparison(fitted().comparison, labels=x),),
+    )
+    call = rng.choice(calls)
+    return lambda: call(value)
+
+
+KINDS = (fit, trajectory, method, method)
+
+
+@contextlib.contextmanager
+def program():
+    """See ``fuzz_driver.run``."""
+
+    def make(rng, folder):
+        kind = rng.choice(KINDS)
+        return Case(kind(rng), kind.__name__)
+
+    yield make
+
+
+if __name__ == "__main__":
+    sys.exit(main(program, __doc__, 2000))

@@ -1,0 +1,102 @@
+"""An FMU that notes illegal calls (``lawful.c``), and the file where it notes them."""
+
+import mmap
+import struct
+from pathlib import Path
+
+import building
+import fmu_tools
+
+CALLS = (
+    *("instantiate", "setup", "enter", "exit", "set", "step", "get", "reset"),
+    *("get_state", "set_state", "free_state", "terminate", "get_status"),
+)
+"""Those that may fail, in the order of ``enum call``."""
+
+WARNING, DISCARD, ERROR, FATAL, NOT_A_NUMBER, STOP = range(1, 7)
+_SIZE, _PLAN, _FIRST = 4096, 16, 16 + 8 * 16
+_PREFIXES = {1: "Lawful_fmi", 2: "fmi2", 3: "fmi3"}
+_SOURCE = "sources/lawful.c"
+
+
+class Record:
+    """The file; FMUs that are instantiated while it stands in the environment use it.
+
+    Args:
+        folder: Where to put it.
+    """
+
+    def __init__(self, folder):
+        self.path = Path(folder) / "record"
+        self.path.write_bytes(bytes(_SIZE))
+        with self.path.open("r+b") as file:
+            self._map = mmap.mmap(file.fileno(), _SIZE)
+
+    def clear(self):
+        """Begin anew."""
+        self._map[:] = bytes(_SIZE)
+
+    def plan(self, call, countdown, code):
+        """Let a call, from now on the ``countdown``-th, return a status."""
+        place = _PLAN + 8 * CALLS.index(call)
+        self._map[place : place + 8] = struct.pack("ii", countdown, code)
+
+    @property
+    def illegal(self):
+        """The first illegal call; empty if there was none."""
+        return self._map[_FIRST : _FIRST + 128].split(b"\0")[0].decode()
+
+
+def library(version):
+    """The compiled library."""
+    stubs = fmu_tools.stubs(version, _PREFIXES[version], building.HERE / _SOURCE)
+    return building.library(_SOURCE, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+
+
+_PARAMETER = 'causality="parameter" variability="fixed"'
+_VARIABLES = {
+    "u": ('causality="input" variability="continuous"', 'start="0"'),
+    "y": ('causality="output" variability="continuous"', ""),
+    "k": (_PARAMETER, 'start="1"'),
+    "longest": (_PARAMETER, 'start="0"'),
+    "leak": (_PARAMETER, 'start="0"'),
+    "step_leak": (_PARAMETER, 'start="0"'),
+}
+_FLAGS = 'canHandleVariableCommunicationStepSize="true"'
+_CO_SIMULATION = f'<CoSimulation modelIdentifier="Lawful" {_FLAGS} '
+_BEFORE = {
+    1: 'guid="{lawful}" modelIdentifier="Lawful" numberOfContinuousStates="0" '
+    'numberOfEventIndicators="0">',
+    2: f'guid="{{lawful}}">{_CO_SIMULATION} canGetAndSetFMUstate="true"/>',
+    3: f'instantiationToken="{{lawful}}">{_CO_SIMULATION} canGetAndSetFMUState="true"/>',
+}
+_BEHIND = {
+    1: "<Implementation><CoSimulation_StandAlone><Capabilities "
+    f"{_FLAGS}/></CoSimulation_StandAlone></Implementation>",
+    2: "<ModelStructure/>",
+    3: "<ModelStructure/>",
+}
+
+
+def _variable(version, reference, name):
+    kind, start = _VARIABLES[name]
+    common = f'name="{name}" valueReference="{reference}" {kind}'
+    if version == 3:
+        return f"<Float64 {common} {start}/>"
+    if version == 1:
+        common = common.replace("parameter", "internal", 1).replace("fixed", "parameter")
+    return f"<ScalarVariable {common}><Real {start}/></ScalarVariable>"
+
+
+def lawful_fmu(folder, version):
+    """Write the FMU, whose variables are all real: an input u, an output y, and parameters."""
+    variables = "".join(_variable(version, i, name) for i, name in enumerate(_VARIABLES))
+    xml = (
+        f'<fmiModelDescription fmiVersion="{version}.0" modelName="Lawful" {_BEFORE[version]}'
+        f"<ModelVariables>{variables}</ModelVariables>{_BEHIND[version]}</fmiModelDescription>"
+    )
+    files = {
+        "modelDescription.xml": xml,
+        fmu_tools.library_name(version, "Lawful"): library(version),
+    }
+    return fmu_tools.write_fmu(Path(folder) / "Lawful.fmu", files)

@@ -1,0 +1,187 @@
+"""An FMU that harms its process (``faulty.c``), and an environment over it."""
+
+import contextlib
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import building
+import fmu_tools
+import pytest
+
+import fmugym
+
+FAULTS = {
+    "none": 0,
+    "crash": 1,
+    "abort": 2,
+    "exit": 3,
+    "hang": 4,
+    "close": 5,
+    "pause": 6,
+    "leak": 7,
+}
+STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
+
+VARIABLES = {
+    "u": 'causality="input"><Real start="0"/>',
+    "y": 'causality="output"><Real/>',
+    "fault": 'causality="parameter" variability="fixed"><Real start="0"/>',
+    "stage": 'causality="parameter" variability="fixed"><Real start="0"/>',
+    "at": 'causality="parameter" variability="fixed"><Real start="0"/>',
+}
+
+
+INTERRUPTIBLE = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+"""
+"""The begin of a program that obeys Ctrl-C although its parent ignores it, as in the background."""
+
+
+def run_python(*command, timeout=100):
+    """Run Python in a process of its own."""
+    path = os.pathsep.join(filter(None, [building.PATH, os.environ.get("PYTHONPATH")]))
+    environment = os.environ | {"PYTHONPATH": path, "MALLOC_PERTURB_": "85"}
+    return subprocess.run(
+        [sys.executable, *command],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
+    """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
+    variables = "".join(
+        f'<ScalarVariable name="{name}" valueReference="{index}" {rest}</ScalarVariable>'
+        for index, (name, rest) in enumerate(VARIABLES.items())
+    )
+    xml = (
+        f'<fmiModelDescription fmiVersion="2.0" modelName="Faulty" guid="{token}"><CoSimulation '
+        f'modelIdentifier="Faulty" canHandleVariableCommunicationStepSize="true" '
+        f'canGetAndSetFMUstate="true" {capabilities}/>'
+        f"<ModelVariables>{variables}</ModelVariables><ModelStructure/></fmiModelDescription>"
+    )
+    files = {
+        "modelDescription.xml": xml,
+        fmu_tools.library_name(2, "Faulty"): building.library("sources/faulty.c"),
+    }
+    return fmu_tools.write_fmu(Path(folder) / "Faulty.fmu", files)
+
+
+def start_values(fault="none", stage="step", at=2):
+    """The parameters that ask for a fault."""
+    return {"fault": FAULTS[fault], "stage": STAGES[stage], "at": at}
+
+
+class FaultyEnv(fmugym.FMI2CSEnv):
+    """Integrates its action until the FMU does what its parameters say."""
+
+    def __init__(self, path, fault="none", stage="step", at=2, **config):
+        config = {
+            "model_input_names": "u",
+            "model_output_names": "y",
+            "model_parameters": start_values(fault, stage, at),
+            "time_step": 0.5,
+            "bounds": {"u": (-1, 1)},
+            "isolation": "process",
+        } | config
+        super().__init__(path, fmu_tools.grouped(config))
+
+    def _is_done(self):
+        return self.state[0] < -1e9
+
+
+def processes_with(folder):
+    """The numbers of the processes, other than this one, that have a file of a folder mapped."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit() and int(process.name) != os.getpid():
+            try:
+                maps = (process / "maps").read_text()
+            except OSError:  # it has ended, or is another user's
+                continue
+            found += [int(process.name)] if str(folder) in maps else []
+    return found
+
+
+def processes_of_session(leader):
+    """The numbers of the processes that live, or wait for their parent, in a session."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):  # it has ended
+                fields = (process / "stat").read_text().rpartition(")")[2].split()
+                found += [int(process.name)] if int(fields[3]) == leader else []
+    return found
+
+
+def processes_told_of(folder):
+    """The numbers of the processes that live and whose environment variables name a folder."""
+    found = []
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):  # it has ended, or is another user's
+                told = os.fsencode(folder) in (process / "environ").read_bytes()
+                found += [int(process.name)] if told else []
+    return found
+
+
+@contextlib.contextmanager
+def no_descriptors_left(left=0):
+    """Let this process open no files, sockets or pipes, or only a few."""
+    import resource  # not on Windows
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(256, hard), hard))
+    taken = []
+    try:
+        with contextlib.suppress(OSError):
+            while True:
+                taken.append(os.open(os.devnull, os.O_RDONLY))
+        for _ in range(left):
+            os.close(taken.pop())
+        yield
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+posix_only = pytest.mark.skipif(os.name != "posix", reason="needs signals and forks")
+
+
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+@pytest.fixture(name="faulty", scope="module")
+def fixture_faulty(tmp_path_factory):
+    """The FMU of ``faulty.c``."""
+    return faulty_fmu(tmp_path_factory.mktemp("faulty"))
+
+
+@pytest.fixture(name="opened")
+def fixture_opened():
+    """Closes what is entered into it."""
+    with contextlib.ExitStack() as stack:
+        yield lambda closable: stack.enter_context(contextlib.closing(closable))
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_until(condition, seconds=20.0):
+    """Wait for what is bound to happen soon."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)

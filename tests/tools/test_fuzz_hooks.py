@@ -1,0 +1,26 @@
+"""A short form of ``python tests/tools/fuzz_hooks.py``."""
+
+import fuzz_driver
+import fuzz_hooks
+
+from fmugym.vector.engines.batch import BatchEngine
+
+
+def test_odd_hooks_raise_nothing_but_our_own_errors():
+    tally = fuzz_driver.run(fuzz_hooks.program, 500, seed="tests")
+    assert tally.failures == []
+    for way in fuzz_hooks.WAYS:
+        assert tally.counts[way, "refused"] > 20
+    assert tally.counts["array", "accepted"] > 10
+    assert tally.total("the caller's own") > 10
+
+
+def test_a_failure_is_reported(monkeypatch):
+    """The fuzzing is able to fail: with an exception, and with a reward that is passed on."""
+    monkeypatch.setattr(BatchEngine, "_completed", lambda *given: 1 / 0)
+    failures = fuzz_driver.run(fuzz_hooks.program, 60, seed="tests").failures
+    assert any("ZeroDivisionError: division by zero" in failure for failure in failures)
+    monkeypatch.undo()
+    monkeypatch.setattr(BatchEngine, "_handle_faults", lambda *given: None)
+    failures = fuzz_driver.run(fuzz_hooks.program, 200, seed="tests").failures
+    assert any(": rewards" in failure for failure in failures)

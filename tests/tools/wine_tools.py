@@ -1,0 +1,94 @@
+"""FMUs that have only libraries for Windows."""
+
+import contextlib
+import functools
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import building
+import exchange_tools
+import fmu_tools
+import pytest
+
+from fmugym import FMU
+from fmugym.wine.installation import can_run_windows, obstacle_to_wine
+
+FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
+PREFIXES = {1: "Model_fmi", 2: "fmi2", 3: "fmi3"}
+
+
+def why_not():
+    """Why Windows libraries cannot run here; "" if they can."""
+    if not can_run_windows():
+        return "Windows libraries run in Wine on Linux on x86_64 only"
+    obstacle = obstacle_to_wine()
+    return f"Windows libraries run here in Wine: {obstacle}" if obstacle else ""
+
+
+def for_windows(path, folder):
+    """Copy an FMU with a library for Windows only: its own, or one built of a test's source."""
+    files = fmu_tools.read_fmu(path)
+    kept = {
+        name: data
+        for name, data in files.items()
+        if not name.startswith("binaries/") or name.endswith(".dll")
+    }
+    if not any(name.endswith(".dll") for name in kept):
+        description = FMU(path).description
+        kept |= _library(description.model_identifier, description.fmi_major_version)
+    return fmu_tools.write_fmu(Path(folder) / f"Windows{Path(path).name}", kept)
+
+
+def _library(model, version):
+    data = windows_library(f"sources/{model.lower()}.c", flags=(f"-DFMI_VERSION={version}",))
+    return {f"binaries/{FOLDERS[version]}/{model}.dll": data}
+
+
+@functools.cache
+def windows_library(*sources, flags=(), stubs=""):
+    """The bytes of a library for Windows; the arguments are those of ``building.library``."""
+    key = sources, flags, stubs or ""
+    return building.once(key, ".dll", lambda path: _compile(path, *key))
+
+
+def _compile(path, sources, flags, stubs):
+    """Compile elsewhere and move the result, for another process may do the same.
+
+    The name that the library is compiled under becomes a part of it.
+    """
+    command = [sys.executable, "-m", "ziglang", "cc", "-target", "x86_64-windows-gnu"]
+    command += ["-shared", "-O1", "-g0", "-ffp-contract=off", '-DSTUBS="stubs.h"', "-I.", *flags]
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        (Path(folder) / "stubs.h").write_text(stubs)
+        target = Path(folder) / "made.dll"
+        files = [building.HERE / source for source in sources]
+        subprocess.run([*command, *files, "-o", target], check=True, cwd=folder)
+        target.replace(path)
+
+
+@contextlib.contextmanager
+def building_for_windows():
+    """Let all tools that write FMUs give them a library for Windows only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "library", windows_library)
+        patch.setattr(
+            fmu_tools,
+            "library_name",
+            lambda version, identifier="Probe": f"binaries/{FOLDERS[version]}/{identifier}.dll",
+        )
+        yield
+
+
+def exchange_fmu(path, model, version, interfaces=("ModelExchange",), flags=""):
+    """Write an FMU as ``exchange_tools`` does, with a library for Windows only."""
+    shim = f"exchange/fmi{version}.c"
+    stubs = fmu_tools.stubs(version, PREFIXES[version], building.HERE / shim)
+    sources = [*(f"exchange/{name}.c" for name in ("core", "usual", model)), shim]
+    data = windows_library(*sources, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
+    files = {
+        "modelDescription.xml": exchange_tools.describe(model, version, interfaces, flags),
+        f"binaries/{FOLDERS[version]}/Model.dll": data,
+    }
+    return fmu_tools.write_fmu(Path(path), files)
