@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent
 NOT_SOURCES = shutil.ignore_patterns(
     *(".*", "__pycache__", "*.egg-info", "*.py[cod]", "*.so", "build", "dist", "results")
 )
-STEP_EVERY_ENV = ROOT / "tests" / "step_every_env.py"
+STEP_EVERY_ENV = ROOT / "tests" / "tools" / "step_every_env.py"
 HAS_BUILD_BACKEND = int(version("setuptools").split(".")[0]) >= 77
 
 
