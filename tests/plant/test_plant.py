@@ -12,12 +12,10 @@ pytest.importorskip("pymodbus", reason="needs pymodbus, of the extra plant")
 from plant_tools import (
     STEP,
     Line,
-    LockStep,
     changed,
     functions_in,
     held_by,
     house,
-    nothing_left,
     watched,
 )
 from pymodbus.client import ModbusTcpClient
@@ -33,17 +31,6 @@ from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
-
-
-@pytest.fixture(autouse=True)
-def _nothing_left():
-    with nothing_left():
-        yield
-
-
-@pytest.fixture
-def clock():
-    return LockStep()
 
 
 @pytest.fixture

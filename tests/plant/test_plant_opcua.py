@@ -13,11 +13,9 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from plant_tools import (
     STEP,
     Line,
-    LockStep,
     changed,
     held_by,
     house,
-    nothing_left,
     watched,
 )
 
@@ -26,17 +24,6 @@ from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
 
 URI = "urn:fmugym:test"
-
-
-@pytest.fixture(autouse=True)
-def _nothing_left():
-    with nothing_left():
-        yield
-
-
-@pytest.fixture
-def clock():
-    return LockStep()
 
 
 @pytest.fixture
