@@ -381,7 +381,7 @@ class TestFiles:
         with pytest.raises(ConfigError, match="nowhere"):
             write_c(agent, tmp_path / "nowhere")
 
-    @pytest.mark.parametrize("name", ["math", "fmi2", "a-b", "ä", "2a", ""])
+    @pytest.mark.parametrize("name", ["math", "agent_fmi2", "a-b", "ä", "2a", ""])
     def test_names_that_are_none(self, name):
         env = made("CartPole")
         with pytest.raises(ConfigError, match="name"):

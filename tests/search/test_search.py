@@ -754,8 +754,8 @@ class Noisy:
 
 @pytest.mark.parametrize(
     ("noise", "expected"),
-    [(0.0, 4), (np.sqrt(8), 4), (np.sqrt(24), 8), (1e9, 64)],
-    ids=["none", "correlations of 0.2", "correlations of 0.08", "noise only"],
+    [(0.0, 4), (np.sqrt(2), 4), (np.sqrt(6), 8), (np.sqrt(24), 32), (1e9, 64)],
+    ids=["none", *(f"correlations of {one}" for one in (0.5, 0.25, 0.08)), "noise only"],
 )
 def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noise, expected):
     """The means of two episodes correlate by 1 / (1 + variance / 2), those of four by more."""
