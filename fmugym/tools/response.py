@@ -37,6 +37,9 @@ _TIME_CONSTANTS: Final = 3
 _MANY: Final = 2000
 """Steps of an episode for which longer ones are recommended."""
 
+_LONG: Final = 800
+"""At least so many steps those then take, as actions may follow what is faster."""
+
 
 def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
     """Tell outputs that never change, and recommend longer episodes where outputs are slow.
@@ -59,7 +62,7 @@ def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
     why = f"{name} follows with a time constant of {seconds:.3g} s: an episode ends before"
     needed = _TIME_CONSTANTS * seconds
     if needed > _MANY * time_step:
-        time_step = rounded_down(needed / _STEPS)
+        time_step = rounded_down(needed / _LONG)
         yield Advice("", "time_step", time_step, why)
     value = float(f"{math.ceil(needed / time_step) * time_step:.12g}")
     yield Advice("", "episode_length", value, why)

@@ -140,7 +140,7 @@ class TestEpisodeLength:
         )
         advice, _ = advised(house)
         assert 1 <= advice["episode_length"] / 3 / 86400 <= 2
-        assert 100 <= advice["episode_length"] / advice["time_step"] <= 2000
+        assert 800 <= advice["episode_length"] / advice["time_step"] <= 2000
         top = {key: advice[key] for key in ("time_step", "episode_length")}
         load({**house.document, **top}).close()
 
