@@ -64,12 +64,14 @@ class _Episode:
     Attributes:
         observations: Shape (n + 1, k).
         rewards: Shape (n,).
+        terminated: Whether the task has ended.
         fault: The reason of a fault; None if there was none.
         reset_time, step_time: Seconds of real time of the reset, and of a step.
     """
 
     observations: FloatArray
     rewards: FloatArray
+    terminated: bool
     fault: str | None
     reset_time: float
     step_time: float
@@ -196,7 +198,7 @@ def _play(
     after_reset = time.perf_counter()
     observations: list[Any] = [_flat(observation)]
     rewards: list[float] = []
-    fault = None
+    fault, terminated = None, False
     while choose is not None and len(rewards) < most_steps:
         observation, reward, terminated, truncated, info = env.step(choose())
         observations.append(_flat(observation))
@@ -206,7 +208,7 @@ def _play(
             break
     took = (time.perf_counter() - after_reset) / max(1, len(rewards))
     arrays = np.array(observations), np.array(rewards, np.float64)
-    return _Episode(*arrays, fault, after_reset - begin, took)
+    return _Episode(*arrays, terminated, fault, after_reset - begin, took)
 
 
 def _flat(observation: Any) -> FloatArray:
@@ -401,6 +403,9 @@ def _of_reward(first: _Episode, others: Sequence[_Episode]) -> Finding:
     ):
         text = f"the same in {len(rewards)} steps, whatever the actions"
         cure = "let it depend on what the actions change"
+    elif first.terminated and high < 0.0 and rewards[-1] > 2.0 * rewards[:-1].min(initial=0.0):
+        text = f"from {low:.4g} to {high:.4g} until the task ends: never positive, so an end pays"
+        cure = "that is fine if the end is a goal; otherwise take off much where 'done' is true"
     elif factor := _factor_of(rewards):
         text = f"from {low:.4g} to {high:.4g} with random actions, a difference of {high - low:.2g}"
         cure = f"multiply what differs by {factor:g}; only --algorithm minds"

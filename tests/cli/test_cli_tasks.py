@@ -88,6 +88,10 @@ DEFECTS = {
         {"reward": "-1 - 1e-11 * abs(q - 1)"},
         ("warning", "reward", "from -1 to -1 with random actions, a difference of"),
     ),
+    "an end that pays": (
+        {"terminated": "step == 20"},
+        ("warning", "reward", "until the task ends: never positive"),
+    ),
     "constant reward": ({"reward": 1}, ("warning", "reward", "always 1")),
     "no limit": ({"episode_length": None}, ("warning", "length", "no limit")),
     "outside": (
