@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final, TypeVar
@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.declared.entries import Entry, gathered
+from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
@@ -28,7 +28,7 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import Series, read_data
 from fmugym.declared.setpoints import Deviation, SetPoints, Steps
-from fmugym.declared.variables import Record, Records, fitted_value, start_value
+from fmugym.declared.variables import NAMING, Record, Records, fitted_value, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
@@ -63,6 +63,7 @@ class Declarations:
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
         observed: The names that the agent sees, and where they stand.
+        remembered: The names of which it sees the history.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
         deviations: What the names of deviations from set points stand for.
@@ -81,6 +82,7 @@ class Declarations:
     actions: list[Record] = field(init=False)
     inputs: dict[str, tuple[Record, Expression]] = field(init=False)
     observed: list[tuple[Entry, str]] = field(init=False)
+    remembered: list[str] = field(init=False)
     rewards: dict[str, Term] = field(init=False)
     costs: dict[str, Term] = field(init=False)
     flags: dict[str, Expression] = field(init=False)
@@ -92,11 +94,7 @@ class Declarations:
     def read(
         cls, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> Declarations:
-        """Read all sections.
-
-        Raises:
-            ConfigError: If one has a mistake, or does not fit the FMU. The text says where.
-        """
+        """Read all sections, and note their mistakes, and what does not fit the FMU."""
         declared = cls(root, Records(root, description), is_physical)
         _check_names(root)
         declared.memory = _read(root, "memory", read_memory)
@@ -105,10 +103,13 @@ class Declarations:
         declared._read_setpoints()
         declared.parameters = declared._with_fitted(_read(root, "parameters", declared._parameter))
         declared.actions = declared._read_actions()
-        declared.inputs = dict(declared._read_inputs())
-        observed = declared._listed("observations")
-        gathered(declared._check_observed, observed)
-        declared.observed = [(entry, entry.value) for entry in observed]
+        declared.inputs = declared._read_inputs()
+        declared.observed = []
+        for entry in declared._listed("observations"):
+            with entry.noting():
+                declared._check_observed(entry)
+                declared.observed.append((entry, entry.value))
+        declared.remembered = declared._read_remembered()
         declared.warm_up = read_warm_up(root, declared.actions, declared._controlled())
         reward = root.child("reward")
         if isinstance(reward.value, Expression):
@@ -137,17 +138,19 @@ class Declarations:
         of_actions = [record.alias for record in self.actions if record.variable is not None]
         return of_actions + list(self.inputs)
 
-    @property
-    def remembered(self) -> list[str]:
-        """The names of which the agent sees the history."""
-        history = self.root.child("agent").child("history")
-        if history.value is None:
-            return []
-        entries = history.child("of").elements()
-        for entry in entries:
-            if entry.value not in self.own_names:
-                self.records.find(entry, entry.value, "variable", self.own_names)
-        return [entry.value for entry in entries]
+    def _read_remembered(self) -> list[str]:
+        found = []
+        for entry in self.root.child("agent").child("history").child("of").elements():
+            with entry.noting():
+                self._find(entry, "variable")
+                found.append(entry.value)
+        return found
+
+    def _find(self, entry: Entry, role: str) -> Record | None:
+        """The record of a name; None for a name that is not that of a variable."""
+        if entry.value in self.own_names:
+            return None
+        return self.records.find(entry, entry.value, role, self.own_names)
 
     @property
     def measured(self) -> list[str]:
@@ -241,21 +244,25 @@ class Declarations:
 
     def _read_setpoints(self) -> None:
         points, section = SetPoints(), self.root.child("setpoints").items()
-        gathered(points.add, section.values())
+        for entry in section.values():
+            with entry.noting():
+                points.add(entry)
         own = section.keys()
         for name in {*points.memory, *points.derived} - own:
             if name in {*self.memory, *self.derived, *self.series}:
-                raise self.root.child("setpoints").error(
-                    f"{name!r} is a name that a set point brings with it; rename the other one"
-                )
+                entry = self.root.child("setpoints")
+                text = f"{name!r} is a name that a set point brings with it; rename the other one"
+                entry.note(entry.error(text))
         self.memory |= points.memory
         self.series |= points.series
         self.derived |= points.derived
-        self.steps, self.deviations = points.steps, points.deviations
-        for deviation in self.deviations.values():
-            entry = self.root.child("setpoints").child(deviation.setpoint).child("of")
-            if deviation.of not in self.own_names:
-                self.records.find(entry, deviation.of, "variable", self.own_names)
+        self.steps, self.deviations = points.steps, dict(points.deviations)
+        for name, deviation in points.deviations.items():
+            of = self.root.child("setpoints").child(deviation.setpoint).child("of")
+            with of.noting():
+                self._find(of, "variable")
+            if self.root.mistakes.explain(of.keys):
+                del self.derived[name], self.deviations[name]
 
     def _controlled(self) -> list[tuple[str, str]]:
         """What is measured and its set point, in pairs, as far as the task tells.
@@ -270,14 +277,16 @@ class Declarations:
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""
-        entry = self.agent(key)
+        entry = self.root.child("agent").child(key)
         names = entry.elements()
-        if not names:
-            raise entry.error(f"{key} must name at least one variable")
         texts = [name.value for name in names]
-        for text in texts:
-            if texts.count(text) > 1:
-                raise entry.error(f"{text!r} is named twice")
+        with entry.noting():
+            if not names:
+                self.root.required("agent")
+                raise entry.lack(f"{key} must name at least one variable")
+            for text in texts:
+                if texts.count(text) > 1:
+                    raise entry.error(f"{text!r} is named twice")
         return names
 
     def _with_fitted(
@@ -289,9 +298,10 @@ class Declarations:
             return parameters
         aliases = {record.fmu_variable.name: alias for alias, (record, _) in parameters.items()}
         fitted: dict[str, tuple[Record, Any]] = {}
-        for name, column in read_fitted(entry).items():
-            record = self.records.find(entry, aliases.get(name, name), "variable")
-            fitted[record.alias] = record, fitted_value(record, entry, column)
+        with entry.noting():
+            for name, column in read_fitted(entry).items():
+                record = self.records.find(entry, aliases.get(name, name), "variable")
+                fitted[record.alias] = record, fitted_value(record, entry, column)
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
     def _parameter(self, entry: Entry) -> tuple[Record, Any]:
@@ -299,46 +309,64 @@ class Declarations:
         return record, start_value(record, entry)
 
     def _read_actions(self) -> list[Record]:
-        entry = self.agent("actions")
-        names = self._listed("actions")
-        actions = gathered(lambda one: self.records.find(one, one.value, "action"), names)
-        for record in actions:
-            self.records.check_input(entry, record)
-            if record.variable is None and not record.is_direct:
-                raise record.entry.error(
-                    f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
-                    f"{', '.join(map(repr, DEVICE))} are for inputs"
-                )
+        actions: list[Record] = []
+        for entry in self._listed("actions"):
+            with entry.noting():
+                record = self.records.find(entry, entry.value, "action")
+                actions.append(record)
+                self.records.check_input(entry, record)
+                _check_action(record)
+        entry = self.root.child("agent").child("actions")
         if len({bool(record.levels) for record in actions}) > 1:
-            raise entry.error("either all actions have levels, or none has")
-        for record in actions:
-            if not record.levels and not record.is_bounded:
-                raise record.entry.error(
-                    f"the action {record.alias!r} needs limits, which the FMU does not give: "
-                    "give it 'min' and 'max', or 'levels'"
-                )
+            entry.note(entry.error("either all actions have levels, or none has"))
         return actions
 
-    def _read_inputs(self) -> Iterator[tuple[str, tuple[Record, Expression]]]:
+    @property
+    def knows_actions(self) -> bool:
+        """Whether no mistake hides an action."""
+        return not self.root.mistakes.explain(("agent", "actions"))
+
+    def _read_inputs(self) -> dict[str, tuple[Record, Expression]]:
+        found = {}
         for name, series in self.series.items():
             target = series.entry.child("input")
-            if target.value is not None:
-                record = self.records.input_of(target, series.unit)
-                _require_plain_input(record)
-                yield record.alias, (record, Expression.parse(name))
-        for entry in self.root.child("inputs").items().values():
-            record = self.records.find(entry, entry.name, "input")
-            if record in self.actions and record.variable is not None:
-                raise entry.error(f"{entry.name!r} is an action already")
-            self.records.check_input(entry, record)
-            _require_plain_input(record)
-            yield entry.name, (record, entry.value)
+            with target.noting():
+                if target.value is not None:
+                    record = self.records.input_of(target, series.unit)
+                    _require_plain_input(record)
+                    found[record.alias] = record, Expression.parse(name)
+        return found | _read(self.root, "inputs", self._input)
+
+    def _input(self, entry: Entry) -> tuple[Record, Expression]:
+        record = self.records.find(entry, entry.name, "input")
+        if record in self.actions and record.variable is not None:
+            raise entry.error(f"{entry.name!r} is an action already")
+        self.records.check_input(entry, record)
+        _require_plain_input(record)
+        if entry.value is None:
+            raise entry.lack("an input needs an expression")
+        return record, entry.value
 
     def _check_observed(self, entry: Entry) -> None:
-        if entry.value not in self.own_names:
-            record = self.records.find(entry, entry.value, "observation", self.own_names)
-            if record not in self.actions:
-                self.records.check_output(entry, entry.value)
+        record = self._find(entry, "observation")
+        if record is not None and record not in self.actions:
+            if not self.knows_actions and record.fmu_variable.causality == "input":
+                return
+            self.records.check_output(entry, entry.value)
+
+
+def _check_action(record: Record) -> None:
+    if record.variable is None and not record.is_direct:
+        raise record.entry.error(
+            f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+            f"{', '.join(map(repr, DEVICE))} are for inputs"
+        )
+    if not record.levels and not record.is_bounded:
+        raise record.entry.lack(
+            f"the action {record.alias!r} needs limits, which the FMU does not give: "
+            "give it 'min' and 'max', or 'levels'",
+            *("min", "max", "levels"),
+        )
 
 
 def _require_plain_input(record: Record) -> None:
@@ -353,21 +381,29 @@ def _require_plain_input(record: Record) -> None:
 def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
     seen: set[str] = set()
-    for section in ("variables", "memory", "expressions", "data", "setpoints"):
+    for section in NAMING:
         for entry in root.child(section).items().values():
-            if entry.name in seen:
-                raise entry.error(f"the name {entry.name!r} is given twice")
-            if is_reserved(entry.name):
-                raise entry.error(f"{entry.name!r} has a meaning of its own in expressions")
-            if not entry.name.isidentifier():
-                raise entry.error(
-                    f"{entry.name!r} cannot be used in expressions; choose a name of letters, "
-                    "digits and _"
-                )
+            with entry.noting():
+                _check_name(entry, seen)
             seen.add(entry.name)
 
 
+def _check_name(entry: Entry, seen: Collection[str]) -> None:
+    name = entry.name
+    if name in seen:
+        raise entry.error(f"the name {name!r} is given twice")
+    if is_reserved(name):
+        raise entry.error(f"{name!r} has a meaning of its own in expressions")
+    if not name.isidentifier():
+        raise entry.error(
+            f"{name!r} cannot be used in expressions; choose a name of letters, digits and _"
+        )
+
+
 def _read(root: Entry, section: str, read: Callable[[Entry], _Read]) -> dict[str, _Read]:
-    """Read the entries of a section by name."""
-    entries = root.child(section).items()
-    return dict(zip(entries, gathered(read, entries.values()), strict=True))
+    """Read the entries of a section by name, as far as they have no mistakes."""
+    found = {}
+    for name, entry in root.child(section).items().items():
+        with entry.noting():
+            found[name] = read(entry)
+    return found

@@ -18,8 +18,9 @@ from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import clip, maximum
-from fmugym.declared.quantities import steps_in
-from fmugym.declared.variables import Record, converted
+from fmugym.declared.mistakes import ConsequenceError
+from fmugym.declared.quantities import nearest_steps, steps_in
+from fmugym.declared.variables import NAMING, Record, converted
 from fmugym.errors import unknown_name
 from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
@@ -90,7 +91,7 @@ class Naming:
         self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
-        self._derived: dict[tuple[str, Moment, float], Value] = {}
+        self._derived: dict[tuple[str, Moment, float], Value | None] = {}
         self.graph = Graph()
         self.lookups: dict[str, Lookup] = {}
         self.outputs, self.monitors = self._read_names()
@@ -107,24 +108,23 @@ class Naming:
         wanted = {name: None for name in wanted if self._is_first(name)}
         others = [name for name in others if self._is_first(name)]
         if not wanted and not others:
-            raise declared.agent("observations").error("the task reads no variable of the FMU")
+            text = "the task reads no variable of the FMU"
+            raise declared.agent("observations").lack(text)
         return (list(wanted), others) if wanted else (others, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:
         """Where the values of names are: several may stand for one variable of the FMU.
 
-        Raises:
-            ConfigError: If they are sampled in different ways: a step gives one value of each.
+        They must be sampled in one way: a step gives one value of each.
         """
         records, first = self._declared.records, dict[str, str]()
         variables = {name: records[name].fmu_variable for name in names}
         for name, variable in variables.items():
             known = first.setdefault(variable.name, name)
             if variables[known].sampling != variable.sampling:
-                raise records[name].entry.error(
-                    f"{known!r} and {name!r} are both {variable.name!r} of the FMU, which has one "
-                    "'sample' only"
-                )
+                entry = records[name].entry
+                text = f"{known!r} and {name!r} are both {variable.name!r} of the FMU, which has "
+                entry.note(entry.error(f"{text}one 'sample' only"))
         order = list(first.values())
         return {name: order.index(first[one.name]) for name, one in variables.items()}
 
@@ -183,7 +183,12 @@ class Naming:
 
     def _names(self, moment: Moment, others: Mapping[str, Value]) -> Names:
         def find(name: str) -> Value | None:
-            return others[name] if name in others else self.value_of(name, moment)
+            if name in others:
+                return others[name]
+            value = self.value_of(name, moment)
+            if value is None:
+                self._declared.records.require_unhidden(name)
+            return value
 
         return Names(
             self.graph,
@@ -194,7 +199,9 @@ class Naming:
 
     def _known(self) -> list[str]:
         declared = self._declared
-        return [*declared.own_names, *declared.parameters, *BUILT_IN, *declared.records.names()]
+        named = [name for section in NAMING for name in declared.root.child(section).items()]
+        own = dict.fromkeys([*named, *declared.own_names, *declared.parameters])
+        return [*own, *BUILT_IN, *declared.records.names()]
 
     def value_of(self, name: str, moment: Moment) -> Value | None:
         """The value of a name; None if there is no such name, or it has none at this moment."""
@@ -229,6 +236,8 @@ class Naming:
         finally:
             self._ahead = 0.0
         if value is None or value.constant is not None:
+            if value is None:
+                self._declared.records.require_unhidden(name)
             if name not in (known := self._known()):
                 raise entry.error(unknown_name("name to forecast", name, known))
             raise entry.error(_no_forecast(name))
@@ -259,7 +268,7 @@ class Naming:
         """The random value now; after a step, that of the step."""
         steps = self._declared.steps[name]
         count = steps_in(steps.entry, steps.every, self._time_step)
-        shift = round(self._ahead / self._time_step) - (moment in _OVER)
+        shift = nearest_steps(self._ahead, self._time_step) - (moment in _OVER)
         passed = maximum(self.step_count + float(shift), 0.0)
         low, high = steps.limits
         return low + (high - low) * chance_in(np.floor(passed / float(count)), steps.channel)
@@ -302,9 +311,13 @@ class Naming:
         if name in self._open:
             raise derived.entry.error(f"{name!r} depends on itself")
         if key not in self._derived:  # many may read it
-            with self._opened(name):
+            self._derived[key] = None
+            with derived.entry.noting(), self._opened(name):
                 self._derived[key] = self.value(derived.entry, derived.expression, moment)
-        return self._derived[key]
+        value = self._derived[key]
+        if value is None:
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
+        return value
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[None]:
@@ -336,6 +349,8 @@ class Naming:
         if record is not None and record in declared.actions:
             return self.action(record, "previous_action") if record.is_direct else None
         if record is None or not self._is_output(name):
+            if not declared.knows_actions:
+                raise ConsequenceError(f"{name!r} may be an action")
             return None
         return converted(record.conversion, self.read("previous_state", self._places[name]))
 

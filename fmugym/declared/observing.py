@@ -15,7 +15,7 @@ from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
-from fmugym.declared.quantities import steps_in
+from fmugym.declared.quantities import nearest_steps, steps_in
 from fmugym.declared.variables import Record
 
 __all__ = [
@@ -103,29 +103,38 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     """The histories that the agent sees, of values that no function of time gives.
 
     The history of a variable holds its values before the present one. That of an action begins with
-    the action of the step that has just ended.
-
-    Raises:
-        ConfigError: If a name has no value before the step.
+    the action of the step that has just ended. A name without a value before the step is noted as a
+    mistake.
     """
     entry = declared.root.child("agent").child("history")
-    length = _kept_steps(declared, time_step) if declared.remembered else 0
-    lengths = dict.fromkeys(declared.remembered, length)
+    lengths = dict.fromkeys(declared.remembered, _kept_steps(declared, time_step))
     for name in declared.measured:
         record = _sensor_of(declared, name)
-        late = 0 if record is None else naming.delay_of(record) + record.device.remembers
-        if late or name in lengths:
-            lengths[name] = lengths.get(name, 0) + late
-    of_variables = {name: n for name, n in lengths.items() if name not in declared.series}
-    kept = [_history(entry, naming, name, count) for name, count in of_variables.items()]
-    late_ones = [record for record in declared.actions if record.device.delay]
-    return [*kept, *(_queue(naming, record) for record in late_ones)]
+        if record is None:
+            continue
+        with record.entry.noting():
+            late = naming.delay_of(record) + record.device.remembers
+            if late or name in lengths:
+                lengths[name] = lengths.get(name, 0) + late
+    kept: list[History] = []
+    for name, count in lengths.items():
+        with entry.noting():
+            if name not in declared.series:
+                kept.append(_history(entry, naming, name, count))
+    for record in declared.actions:
+        with record.entry.noting():
+            if record.device.delay:
+                kept.append(_queue(naming, record))
+    return kept
 
 
 def _kept_steps(declared: Declarations, time_step: float) -> int:
     """How many values of a name the agent sees that are of the past."""
-    entry = declared.root.child("agent").child("history").child("length")
-    return steps_in(entry, entry.value, time_step, _MOST_VALUES)
+    entry, steps = declared.root.child("agent").child("history").child("length"), 0
+    with entry.noting():
+        if entry.value is not None:
+            steps = steps_in(entry, entry.value, time_step, _MOST_VALUES)
+    return steps
 
 
 def _queue(naming: Naming, record: Record) -> History:
@@ -166,8 +175,7 @@ def observed_values(
         time_step: Length of a step in seconds.
         are_filled: Whether a warm-up has filled the histories when an episode begins.
 
-    Raises:
-        ConfigError: If one is a constant, or there is no forecast or history of it.
+    Constants, and names without a forecast or history, are noted as mistakes.
     """
     _check_sensors(declared)
     past = _Past(declared, naming, kept, time_step, are_filled)
@@ -181,14 +189,17 @@ def observed_values(
 
 def _check_sensors(declared: Declarations) -> None:
     """Refuse a sensor of what the agent does not observe: it would do nothing."""
-    seen = set(declared.measured)
+    seen, mistakes = set(declared.measured), declared.root.mistakes
+    if any(mistakes.explain(("agent", key)) for key in ("actions", "observations", "history")):
+        return
     for record in declared.records.declared():
         is_used = record.alias in seen or record in declared.actions
         if not record.device.is_ideal and not is_used:
-            raise record.entry.error(
+            text = (
                 f"{', '.join(map(repr, DEVICE))} are for actions and for what the agent "
                 f"observes, and {record.alias!r} is not in its observations"
             )
+            record.entry.note(record.entry.error(text))
 
 
 class _Past:
@@ -268,24 +279,27 @@ class _Past:
 
 def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
     for entry, name in declared.observed:
-        yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
+        with entry.noting():
+            yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
 
 
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
     for entry in _forecasts_in(declared):
-        step = entry.value.get("step", time_step)
-        horizon = entry.child("horizon")
-        count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
+        step, count = entry.value.get("step", time_step), 1
+        with entry.child("horizon").noting():
+            horizon = entry.required("horizon")
+            count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
         error = _error_of(entry.child("error").value)
         for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
-            name = one.value
-            for index in range(1, count + 1):
-                ahead = index * step
-                value = naming.forecast(one, name, ahead)
-                if error is not None:
-                    later = naming.step_count + round(ahead / time_step)
-                    value = error.added(value, index / count, later, channel)
-                yield Seen(one, name, value, *declared.limits_of(name), f"[+{ahead:g} s]")
+            with one.noting():
+                for index in range(1, count + 1):
+                    ahead = index * step
+                    value = naming.forecast(one, one.value, ahead)
+                    if error is not None:
+                        later = naming.step_count + nearest_steps(ahead, time_step)
+                        value = error.added(value, index / count, later, channel)
+                    limits = declared.limits_of(one.value)
+                    yield Seen(one, one.value, value, *limits, f"[+{ahead:g} s]")
 
 
 class ForecastError(NamedTuple):

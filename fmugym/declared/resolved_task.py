@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property, partial, reduce
@@ -22,8 +23,9 @@ from fmugym.declared.configuring import (
 )
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
-from fmugym.declared.entries import gathered
-from fmugym.declared.kpis import kpi_name
+from fmugym.declared.entries import Entry
+from fmugym.declared.expressions import Expression
+from fmugym.declared.kpis import Kpi, kpi_name
 from fmugym.declared.mathematics import minimum
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
@@ -65,6 +67,7 @@ class ResolvedTask:
 
     Args:
         task: The task.
+        root: The table of all its keys, with the mistakes that are known already.
         description: The model description of its FMU.
         needs_reward: Whether the task must say a reward; a class may have one of its own.
 
@@ -79,24 +82,35 @@ class ResolvedTask:
         unphysical_keys: The keys for which observations or actions are not in the task's units.
 
     Raises:
-        ConfigError: If the task does not fit the FMU, or contradicts itself. The text says where.
+        ConfigError: If the task has mistakes, does not fit the FMU, or contradicts itself. The text
+            tells all of that, and says where.
     """
 
     def __init__(
-        self, task: Task, description: ModelDescription, needs_reward: bool = True
+        self, task: Task, root: Entry, description: ModelDescription, needs_reward: bool = True
     ) -> None:
-        self._task, self._root = task, task.root
-        self._declared = declared = Declarations.read(task.root, description, task.is_physical)
-        if needs_reward and not declared.rewards:
-            raise task.root.error('the task has no reward; say one, for example: reward = "1"')
-        self._time_step = time_step_of(task.root, description)
-        self._warm_steps = self._steps_of_warm_up()
-        self._naming = Naming(declared, self._time_step, self._warm_steps)
-        gathered(lambda make: make(), self._makers())
-        self._kept = histories(declared, self._naming, self._time_step)
-        self._seen, self._sensors = observed_values(
-            declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
-        )
+        self._task, self._root, self._time_step, self._warm_steps = task, root, math.nan, 0
+        self._declared = declared = Declarations.read(root, description, task.is_physical)
+        with root.child("reward").noting():
+            if needs_reward and not declared.rewards:
+                text = 'the task has no reward; say one, for example: reward = "1"'
+                raise root.lack(text, "reward")
+        with root.child("time_step").noting():
+            self._time_step = time_step_of(root, description)
+        with declared.warm_up.entry.noting():
+            self._warm_steps = self._steps_of_warm_up()
+        with root.noting():
+            self._naming = Naming(declared, self._time_step, self._warm_steps)
+            self._read_observations()
+            self._find_mistakes()
+        root.mistakes.require_none()
+        with root.noting():
+            self._make()
+        root.mistakes.require_none()
+
+    def _make(self) -> None:
+        """Make what the attributes are."""
+        declared = self._declared
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
@@ -128,15 +142,48 @@ class ResolvedTask:
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
-    def _makers(self) -> Iterator[Callable[[], Any]]:
-        """Functions that evaluate each expression, so that one error tells all mistakes."""
+    def _read_observations(self) -> None:
+        self._kept = histories(self._declared, self._naming, self._time_step)
+        self._seen, self._sensors = observed_values(
+            self._declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
+        )
+
+    def _find_mistakes(self) -> None:
+        """Evaluate everything once, so that one error tells all mistakes."""
+        for entry, make in self._makers():
+            with entry.noting():
+                make()
+
+    def _makers(self) -> Iterator[tuple[Entry, Callable[[], Any]]]:
         declared = self._declared
-        for name in declared.derived:
-            yield partial(self._naming.value_of, name, Moment.JUDGED)
-        for name, term in {**declared.costs, **declared.rewards}.items():
-            yield partial(self._terms, {name: term})
+        for entry, expression, moment in self._plain_expressions():
+            yield entry, partial(self._naming.value, entry, expression, moment)
+        for name, one in declared.derived.items():
+            yield one.entry, partial(self._naming.value_of, name, Moment.JUDGED)
+        for term in (*declared.rewards.values(), *declared.costs.values()):
+            yield term.entry, partial(self._terms, {"": term})
         for name in declared.flags:
-            yield partial(self._condition, name)
+            yield self._root.child(name), partial(self._condition, name)
+        for kpi in declared.kpis.values():
+            yield kpi.entry, partial(self._kpi_value, kpi)
+        yield self._root, partial(times_of, declared, self._time_step)
+        yield (
+            self._root.child("clock"),
+            partial(clock_of, declared, self._time_step, self._warm_steps),
+        )
+        for seen in self._seen:
+            yield seen.entry, partial(self._in_form, seen)
+
+    def _plain_expressions(self) -> Iterator[tuple[Entry, Expression, Moment]]:
+        """Expressions that are used as they are, where they stand, and when they are evaluated."""
+        for memory in self._declared.memory.values():
+            if memory.update is not None:
+                yield memory.entry, memory.update, Moment.AFTER
+        for name, (_, expression) in self._declared.inputs.items():
+            yield self._root.child("inputs").child(name), expression, Moment.BEFORE
+        for name in self._declared.warm_up.signals():
+            entry = self._declared.warm_up.entry.child("controller")
+            yield entry, Expression.parse(name), Moment.SEEN
 
     # The warm-up.
 
@@ -313,13 +360,15 @@ class ResolvedTask:
     @cached_property
     def _normalized(self) -> list[Seen]:
         """What the agent observes, in the form of its observations."""
-        declared = self._declared
-        match declared.normalization:
+        return [self._in_form(seen) for seen in self._seen]
+
+    def _in_form(self, seen: Seen) -> Seen:
+        match self._declared.normalization:
             case "limits":
-                return [scaled(seen) for seen in self._seen]
+                return scaled(seen)
             case "nominal":
-                return [normalized(seen, declared.nominal_of(seen.name)) for seen in self._seen]
-        return self._seen
+                return normalized(seen, self._declared.nominal_of(seen.name))
+        return seen
 
     def _observation(self) -> Hook:
         values = function_of([seen.value for seen in self._normalized])
@@ -378,32 +427,43 @@ class ResolvedTask:
         return self._assignments({WORST: minimum(worst, reward)})
 
     def _updates_of_kpis(self) -> list[Hook]:
-        terms, values = self._term_values(Moment.UPDATED), dict[str, Value]()
-        for name, kpi in self._declared.kpis.items():
-            if kpi.how is not None:
-                value = self._naming.value(kpi.entry, kpi.expression, Moment.UPDATED, terms)
-                values[kpi_name(name)] = kpi.updated(value.number, self._naming.step_count)
-        return self._assignments(values)
+        step_count, kpis = self._naming.step_count, self._declared.kpis.items()
+        updated = {
+            kpi_name(name): kpi.updated(self._kpi_value(kpi), step_count)
+            for name, kpi in kpis
+            if kpi.how is not None
+        }
+        return self._assignments(updated)
+
+    def _kpi_value(self, kpi: Kpi) -> Value:
+        """What a figure is made of in a step."""
+        moment = Moment.JUDGED if kpi.how is None else Moment.UPDATED
+        names = self._term_values(moment) | (self._known_kpis() if kpi.how is None else {})
+        return self._naming.value(kpi.entry, kpi.expression, moment, names).number
+
+    def _known_kpis(self) -> dict[str, Value]:
+        """The figures that are no expressions of others, by name."""
+        kpis, step_count = self._declared.kpis, self._naming.step_count
+        return {n: kpi.present(step_count) for n, kpi in kpis.items() if kpi.how is not None}
 
     def _kpi_values(self) -> dict[str, Value]:
         """The figures of the episode until now."""
-        kpis, step_count = self._declared.kpis, self._naming.step_count
-        known = {name: kpi.present(step_count) for name, kpi in kpis.items() if kpi.how is not None}
-        names = self._term_values(Moment.JUDGED) | known
-        others = {
-            name: self._naming.value(kpi.entry, kpi.expression, Moment.JUDGED, names).number
-            for name, kpi in kpis.items()
-            if kpi.how is None
+        known = self._known_kpis()
+        return {
+            name: known[name] if name in known else self._kpi_value(kpi)
+            for name, kpi in self._declared.kpis.items()
         }
-        return {name: (known | others)[name] for name in kpis}
 
     def _term_values(self, moment: Moment) -> dict[str, Value]:
         """Rewards and costs by their names, for the figures that use them."""
         declared = self._declared
         if not declared.kpis:
             return {}
-        terms = {**declared.rewards, **declared.costs}
-        return {name: value for name, value in self._terms(terms, moment).items() if name}
+        values: dict[str, Value] = {}
+        for name, term in {**declared.rewards, **declared.costs}.items():
+            with term.entry.noting():
+                values |= self._terms({name: term}, moment) if name else {}
+        return values
 
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""

@@ -113,7 +113,8 @@ def read_data(entry: Entry) -> Series:
     """
     table = entry.value
     if ("file" in table) == ("values" in table):
-        raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
+        text = "give either 'file' and 'column', or 'values' and 'step'"
+        raise entry.lack(text, "file", "values")
     is_stepped = table["interpolation"] == "previous"
     rows = _rows_of_list(entry) if "values" in table else _rows_of_file(entry, is_stepped)
     times, values, period = rows
@@ -144,7 +145,8 @@ def _rows_of_list(entry: Entry) -> _Rows:
     if not len(values):
         raise entry.error("expected at least one value")
     if (times is None) == (step is None):
-        raise entry.error("give either the 'step' between the values, or their 'times'")
+        text = "give either the 'step' between the values, or their 'times'"
+        raise entry.lack(text, "step", "times")
     if times is None:
         return _even_times(step, len(values)), values, None
     if len(times) != len(values):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
@@ -12,7 +13,8 @@ from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.declared.computed import Value
 from fmugym.declared.devices import IDEAL, Device, read_device
-from fmugym.declared.entries import Entry, gathered
+from fmugym.declared.entries import Entry
+from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -21,6 +23,7 @@ from fmugym.task.roles import input_variable, output_variable
 from fmugym.task.starting import checked, spread
 
 __all__ = [
+    "NAMING",
     "Record",
     "Records",
     "converted",
@@ -31,6 +34,9 @@ __all__ = [
 
 _PLAIN: Final = ("levels", "delta", "min_on", "min_off")
 """Keys of a variable that are attributes of its record as they are."""
+
+NAMING: Final = ("variables", "memory", "expressions", "data", "setpoints")
+"""The sections whose keys are names in expressions."""
 
 
 @dataclass(frozen=True)
@@ -112,9 +118,11 @@ class Records:
 
     def __init__(self, root: Entry, description: ModelDescription) -> None:
         self._root, self._description = root, description
-        declared = root.child("variables").items()
-        read = gathered(self._declared, declared.values())
-        self._records = dict(zip(declared, read, strict=True))
+        self._entries = root.child("variables").items()
+        self._records: dict[str, Record] = {}
+        for name, entry in self._entries.items():
+            with entry.noting():
+                self._records[name] = self._declared(entry)
 
     def declared(self) -> list[Record]:
         """The variables that the task declares or has used."""
@@ -122,7 +130,8 @@ class Records:
 
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
-        return list(dict.fromkeys([*self._records, *self._description.variables]))
+        known = [*self._entries, *self._records, *self._description.variables]
+        return list(dict.fromkeys(known))
 
     def names_in_fmu(self, aliases: Sequence[str]) -> list[str]:
         """The FMU's names of variables."""
@@ -130,7 +139,8 @@ class Records:
 
     def get(self, alias: str) -> Record | None:
         """The record of an alias or of a variable of the FMU; None if there is none."""
-        variable = None if alias in self._records else self._description.find(alias)
+        known = self._records.keys() | self._entries.keys()
+        variable = None if alias in known else self._description.find(alias)
         if variable is not None:
             entry = Entry(None, ("variables", alias), self._root.sources)
             self._records[alias] = self._record(alias, entry, variable)
@@ -139,8 +149,30 @@ class Records:
     def __getitem__(self, alias: str) -> Record:
         record = self.get(alias)
         if record is None:
+            self.require_unhidden(alias)
             raise unknown_name("variable", alias, self.names())
         return record
+
+    def require_unhidden(self, name: str) -> None:
+        """Check that no mistake that is known already may be why there is no such name.
+
+        Raises:
+            ConsequenceError: If one may be. It is where the name is declared.
+        """
+        mistakes, sources = self._root.mistakes, self._root.sources
+        sections = filter(partial(self._may_declare, name), (*NAMING, "reward", "costs", "kpis"))
+        places = [(section, name) for section in sections]
+        setpoints = self._root.child("setpoints").items()
+        places += [("setpoints", one) for one in setpoints if name.startswith(f"{one}_")]
+        misspelt = [s.document.get(key) for key in mistakes.unknown_sections for s in sources]
+        is_misspelt = any(isinstance(one, Mapping) and name in one for one in misspelt)
+        is_hidden = not mistakes.hidden.isdisjoint((name, name.partition(".")[0]))
+        if is_hidden or is_misspelt or any(map(mistakes.explain, places)):
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
+
+    def _may_declare(self, name: str, section: str) -> bool:
+        value = self._root.child(section).value
+        return value is None or (isinstance(value, Mapping) and name in value)
 
     def find(self, entry: Entry, name: str, role: str, others: Sequence[str] = ()) -> Record:
         """The record of a name.
@@ -156,6 +188,7 @@ class Records:
         """
         record = self.get(name)
         if record is None:
+            self.require_unhidden(name)
             error = unknown_name(role, name, [*others, *self.names()])
             raise entry.error(f"{error}{self._dotted(name, entry.value)}")
         return record
@@ -214,6 +247,8 @@ class Records:
         name = entry.child("name")
         if name.value is None:
             return self._record(entry.name, entry, self._description.find(entry.name))
+        if self._description.find(name.value) is None:
+            self.require_unhidden(name.value)
         with name.placing():
             return self._record(entry.name, entry, self._description.variable(name.value))
 
@@ -247,7 +282,7 @@ def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> 
     given, (low, high) = entry.value or {}, _own_limits(variable, conversion)
     low, high = given.get("min", low), given.get("max", high)
     if not low < high and given.keys() & {"min", "max"}:
-        raise entry.error(f"min must be below max, got {low} and {high}")
+        raise entry.error(f"min must be below max, got {low:g} and {high:g}")
     return low, high
 
 
