@@ -82,12 +82,12 @@ def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[
 def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
     """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
     names = (*naming.outputs, *naming.monitors)
-    found = [declared.records[name].fmu_variable for name in names]
+    found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
 def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
     """The limits that the task gives of what it writes, observes and lets episodes start with."""
     names = (*declared.written, *naming.outputs, *declared.parameters)
-    found = [declared.records[name].fmu_variable for name in names]
+    found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.bounds for one in found if one.bounds is not None}

@@ -28,7 +28,7 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import Series, read_data
 from fmugym.declared.setpoints import Deviation, SetPoints, Steps
-from fmugym.declared.variables import NAMING, Record, Records, fitted_value, start_value
+from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, fitted_value, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
@@ -52,11 +52,11 @@ class Declarations:
 
     Attributes:
         root: The table of all keys.
-        records: The variables.
+        variables: The variables.
         is_physical: Whether observations and actions are in the units of the task; see
             ``Task.physical``.
-        parameters: Parameters and start values by alias: the record, and a value or distribution in
-            the unit of the FMU.
+        parameters: Parameters and start values by alias: the variable, and a value or distribution
+            in the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
         series: Data and schedules by name.
         steps: Set points that jump, by name.
@@ -72,15 +72,15 @@ class Declarations:
     """
 
     root: Entry
-    records: Records
+    variables: TaskVariables
     is_physical: bool = False
-    parameters: dict[str, tuple[Record, Any]] = field(init=False)
+    parameters: dict[str, tuple[TaskVariable, Any]] = field(init=False)
     memory: dict[str, Memory] = field(init=False)
     derived: dict[str, Derived] = field(init=False)
     series: dict[str, Series] = field(init=False)
     steps: dict[str, Steps] = field(init=False)
-    actions: list[Record] = field(init=False)
-    inputs: dict[str, tuple[Record, Expression]] = field(init=False)
+    actions: list[TaskVariable] = field(init=False)
+    inputs: dict[str, tuple[TaskVariable, Expression]] = field(init=False)
     observed: list[tuple[Entry, str]] = field(init=False)
     remembered: list[str] = field(init=False)
     rewards: dict[str, Term] = field(init=False)
@@ -95,7 +95,7 @@ class Declarations:
         cls, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> Declarations:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
-        declared = cls(root, Records(root, description), is_physical)
+        declared = cls(root, TaskVariables(root, description), is_physical)
         _check_names(root)
         declared.memory = _read(root, "memory", read_memory)
         declared.derived = _read(root, "expressions", read_derived)
@@ -135,7 +135,7 @@ class Declarations:
     @property
     def written(self) -> list[str]:
         """The aliases of the FMU's inputs, in their order."""
-        of_actions = [record.alias for record in self.actions if record.variable is not None]
+        of_actions = [variable.alias for variable in self.actions if variable.in_fmu is not None]
         return of_actions + list(self.inputs)
 
     def _read_remembered(self) -> list[str]:
@@ -146,11 +146,11 @@ class Declarations:
                 found.append(entry.value)
         return found
 
-    def _find(self, entry: Entry, role: str) -> Record | None:
-        """The record of a name; None for a name that is not that of a variable."""
+    def _find(self, entry: Entry, role: str) -> TaskVariable | None:
+        """The variable of a name; None for a name that is not that of a variable."""
         if entry.value in self.own_names:
             return None
-        return self.records.find(entry, entry.value, role, self.own_names)
+        return self.variables.find(entry, entry.value, role, self.own_names)
 
     @property
     def measured(self) -> list[str]:
@@ -177,8 +177,8 @@ class Declarations:
         """Whether a name stands for a value that is read from the FMU after each step."""
         if name in {*self.own_names, *self.parameters, *_RESERVED, *self.written}:
             return False
-        record = self.records.get(name)
-        return record is not None and record not in self.actions
+        variable = self.variables.get(name)
+        return variable is not None and variable not in self.actions
 
     def limits_of(self, name: str) -> Limits:
         """The limits of something that the agent observes."""
@@ -194,8 +194,8 @@ class Declarations:
             return self.memory[name].limits
         if name in self.derived:
             return self.derived[name].limits
-        record = self.records[name]
-        return record.low, record.high
+        variable = self.variables[name]
+        return variable.low, variable.high
 
     def agent(self, key: str) -> Entry:
         """The entry of a key of the agent.
@@ -226,8 +226,8 @@ class Declarations:
         given = {
             "normalize": self.normalization is not None,
             "rescale": self.rescales,
-            "levels": any(record.levels for record in self.actions),
-            "delta": any(record.delta for record in self.actions),
+            "levels": any(variable.levels for variable in self.actions),
+            "delta": any(variable.delta for variable in self.actions),
         }
         return tuple(key for key, is_given in given.items() if is_given)
 
@@ -236,9 +236,9 @@ class Declarations:
 
         That is the larger one of its limits where no nominal value is given.
         """
-        record = None if name in self.own_names else self.records[name]
-        if record is not None and record.nominal is not None:
-            return record.nominal
+        variable = None if name in self.own_names else self.variables[name]
+        if variable is not None and variable.nominal is not None:
+            return variable.nominal
         size = max(map(abs, self.limits_of(name)))
         return size if 0 < size < np.inf else None
 
@@ -271,7 +271,7 @@ class Declarations:
         """
         if self.deviations:
             return [(one.of, one.setpoint) for one in self.deviations.values()]
-        written = {*self.own_names, *(record.alias for record in self.actions)}
+        written = {*self.own_names, *(variable.alias for variable in self.actions)}
         measured = [name for _, name in self.observed if name not in written]
         return list(product(measured, self.root.child("setpoints").items()))
 
@@ -290,34 +290,34 @@ class Declarations:
         return names
 
     def _with_fitted(
-        self, parameters: dict[str, tuple[Record, Any]]
-    ) -> dict[str, tuple[Record, Any]]:
+        self, parameters: dict[str, tuple[TaskVariable, Any]]
+    ) -> dict[str, tuple[TaskVariable, Any]]:
         """Parameters, and after them what a fit has found, which takes their place."""
         entry = self.root.child("fitted")
         if entry.value is None:
             return parameters
-        aliases = {record.fmu_variable.name: alias for alias, (record, _) in parameters.items()}
-        fitted: dict[str, tuple[Record, Any]] = {}
+        aliases = {variable.fmu_variable.name: alias for alias, (variable, _) in parameters.items()}
+        fitted: dict[str, tuple[TaskVariable, Any]] = {}
         with entry.noting():
             for name, column in read_fitted(entry).items():
-                record = self.records.find(entry, aliases.get(name, name), "variable")
-                fitted[record.alias] = record, fitted_value(record, entry, column)
+                variable = self.variables.find(entry, aliases.get(name, name), "variable")
+                fitted[variable.alias] = variable, fitted_value(variable, entry, column)
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
-    def _parameter(self, entry: Entry) -> tuple[Record, Any]:
-        record = self.records.find(entry, entry.name, "variable")
-        return record, start_value(record, entry)
+    def _parameter(self, entry: Entry) -> tuple[TaskVariable, Any]:
+        variable = self.variables.find(entry, entry.name, "variable")
+        return variable, start_value(variable, entry)
 
-    def _read_actions(self) -> list[Record]:
-        actions: list[Record] = []
+    def _read_actions(self) -> list[TaskVariable]:
+        actions: list[TaskVariable] = []
         for entry in self._listed("actions"):
             with entry.noting():
-                record = self.records.find(entry, entry.value, "action")
-                actions.append(record)
-                self.records.check_input(entry, record)
-                _check_action(record)
+                variable = self.variables.find(entry, entry.value, "action")
+                actions.append(variable)
+                self.variables.check_input(entry, variable)
+                _check_action(variable)
         entry = self.root.child("agent").child("actions")
-        if len({bool(record.levels) for record in actions}) > 1:
+        if len({bool(variable.levels) for variable in actions}) > 1:
             entry.note(entry.error("either all actions have levels, or none has"))
         return actions
 
@@ -326,55 +326,55 @@ class Declarations:
         """Whether no mistake hides an action."""
         return not self.root.mistakes.explain(("agent", "actions"))
 
-    def _read_inputs(self) -> dict[str, tuple[Record, Expression]]:
+    def _read_inputs(self) -> dict[str, tuple[TaskVariable, Expression]]:
         found = {}
         for name, series in self.series.items():
             target = series.entry.child("input")
             with target.noting():
                 if target.value is not None:
-                    record = self.records.input_of(target, series.unit)
-                    _require_plain_input(record)
-                    found[record.alias] = record, Expression.parse(name)
+                    variable = self.variables.input_of(target, series.unit)
+                    _require_plain_input(variable)
+                    found[variable.alias] = variable, Expression.parse(name)
         return found | _read(self.root, "inputs", self._input)
 
-    def _input(self, entry: Entry) -> tuple[Record, Expression]:
-        record = self.records.find(entry, entry.name, "input")
-        if record in self.actions and record.variable is not None:
+    def _input(self, entry: Entry) -> tuple[TaskVariable, Expression]:
+        variable = self.variables.find(entry, entry.name, "input")
+        if variable in self.actions and variable.in_fmu is not None:
             raise entry.error(f"{entry.name!r} is an action already")
-        self.records.check_input(entry, record)
-        _require_plain_input(record)
+        self.variables.check_input(entry, variable)
+        _require_plain_input(variable)
         if entry.value is None:
             raise entry.lack("an input needs an expression")
-        return record, entry.value
+        return variable, entry.value
 
     def _check_observed(self, entry: Entry) -> None:
-        record = self._find(entry, "observation")
-        if record is not None and record not in self.actions:
-            if not self.knows_actions and record.fmu_variable.causality == "input":
+        variable = self._find(entry, "observation")
+        if variable is not None and variable not in self.actions:
+            if not self.knows_actions and variable.fmu_variable.causality == "input":
                 return
-            self.records.check_output(entry, entry.value)
+            self.variables.check_output(entry, entry.value)
 
 
-def _check_action(record: Record) -> None:
-    if record.variable is None and not record.is_direct:
-        raise record.entry.error(
-            f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+def _check_action(variable: TaskVariable) -> None:
+    if variable.in_fmu is None and not variable.is_direct:
+        raise variable.entry.error(
+            f"{variable.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
             f"{', '.join(map(repr, DEVICE))} are for inputs"
         )
-    if not record.levels and not record.is_bounded:
-        raise record.entry.lack(
-            f"the action {record.alias!r} needs limits, which the FMU does not give: "
+    if not variable.levels and not variable.is_bounded:
+        raise variable.entry.lack(
+            f"the action {variable.alias!r} needs limits, which the FMU does not give: "
             "give it 'min' and 'max', or 'levels'",
             *("min", "max", "levels"),
         )
 
 
-def _require_plain_input(record: Record) -> None:
+def _require_plain_input(variable: TaskVariable) -> None:
     """Refuse keys of actuators for an input that no action writes: they would do nothing."""
-    if not record.is_direct or record.levels:
-        raise record.entry.error(
-            f"{record.alias!r} is written by an expression, not by an action: only 'name', 'unit', "
-            "'min' and 'max' are for it"
+    if not variable.is_direct or variable.levels:
+        raise variable.entry.error(
+            f"{variable.alias!r} is written by an expression, not by an action: only 'name', "
+            "'unit', 'min' and 'max' are for it"
         )
 
 

@@ -16,7 +16,7 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
 from fmugym.declared.quantities import nearest_steps, steps_in
-from fmugym.declared.variables import Record
+from fmugym.declared.variables import TaskVariable
 
 __all__ = [
     "History",
@@ -109,11 +109,11 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     entry = declared.root.child("agent").child("history")
     lengths = dict.fromkeys(declared.remembered, _kept_steps(declared, time_step))
     for name in declared.measured:
-        record = _sensor_of(declared, name)
-        if record is None:
+        variable = _sensor_of(declared, name)
+        if variable is None:
             continue
-        with record.entry.noting():
-            late = naming.delay_of(record) + record.device.remembers
+        with variable.entry.noting():
+            late = naming.delay_of(variable) + variable.device.remembers
             if late or name in lengths:
                 lengths[name] = lengths.get(name, 0) + late
     kept: list[History] = []
@@ -121,10 +121,10 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
         with entry.noting():
             if name not in declared.series:
                 kept.append(_history(entry, naming, name, count))
-    for record in declared.actions:
-        with record.entry.noting():
-            if record.device.delay:
-                kept.append(_queue(naming, record))
+    for variable in declared.actions:
+        with variable.entry.noting():
+            if variable.device.delay:
+                kept.append(_queue(naming, variable))
     return kept
 
 
@@ -137,11 +137,11 @@ def _kept_steps(declared: Declarations, time_step: float) -> int:
     return steps
 
 
-def _queue(naming: Naming, record: Record) -> History:
+def _queue(naming: Naming, variable: TaskVariable) -> History:
     """What the agent has chosen for an action with a delay."""
-    name, start = queue_name(record), naming.start(record)
-    chosen = naming.action(record, "action")
-    return History(name, name, naming.delay_of(record), chosen, start, start)
+    name, start = queue_name(variable), naming.start(variable)
+    chosen = naming.action(variable, "action")
+    return History(name, name, naming.delay_of(variable), chosen, start, start)
 
 
 def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
@@ -154,9 +154,9 @@ def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
     return History(name, f"history of {name}", length, *values, present)
 
 
-def _sensor_of(declared: Declarations, name: str) -> Record | None:
-    """The record of what is measured; None for what the agent knows without a sensor."""
-    return declared.records.get(name) if declared.is_output(name) else None
+def _sensor_of(declared: Declarations, name: str) -> TaskVariable | None:
+    """The variable of what is measured; None for what the agent knows without a sensor."""
+    return declared.variables.get(name) if declared.is_output(name) else None
 
 
 def observed_values(
@@ -192,14 +192,14 @@ def _check_sensors(declared: Declarations) -> None:
     seen, mistakes = set(declared.measured), declared.root.mistakes
     if any(mistakes.explain(("agent", key)) for key in ("actions", "observations", "history")):
         return
-    for record in declared.records.declared():
-        is_used = record.alias in seen or record in declared.actions
-        if not record.device.is_ideal and not is_used:
+    for variable in declared.variables.declared():
+        is_used = variable.alias in seen or variable in declared.actions
+        if not variable.device.is_ideal and not is_used:
             text = (
                 f"{', '.join(map(repr, DEVICE))} are for actions and for what the agent "
-                f"observes, and {record.alias!r} is not in its observations"
+                f"observes, and {variable.alias!r} is not in its observations"
             )
-            record.entry.note(record.entry.error(text))
+            variable.entry.note(variable.entry.error(text))
 
 
 class _Past:
@@ -220,44 +220,44 @@ class _Past:
 
     def measured(self, entry: Entry, name: str, ago: int) -> Value:
         """What the agent measured some steps ago."""
-        record = _sensor_of(self._declared, name)
+        variable = _sensor_of(self._declared, name)
         deviation = self._declared.deviations.get(name)
         if deviation is not None:
             setpoint, of = (self.measured(entry, one, ago) for one in deviation)
             return setpoint - of
-        if record is None:
+        if variable is None:
             return self._true(entry, name, ago)
-        fresh = self._fresh(entry, record, ago)
-        if not record.device.remembers:
+        fresh = self._fresh(entry, variable, ago)
+        if not variable.device.remembers:
             return fresh
-        past = self._naming.read("variables", self._kept(entry, record, ago), ago)
+        past = self._naming.read("variables", self._kept(entry, variable, ago), ago)
         return self._unless_first(fresh, past)
 
     def _unless_first(self, first: Value, past: Value) -> Value:
         """A value of the past; another one at the beginning of an episode, which has no past."""
         return past if self._are_filled else where(self._naming.step_count == 0, first, past)
 
-    def _fresh(self, entry: Entry, record: Record, ago: int) -> Value:
+    def _fresh(self, entry: Entry, variable: TaskVariable, ago: int) -> Value:
         """A measurement, whatever was measured before."""
-        name, device = record.alias, record.device
-        value = self._true(entry, name, ago + self._naming.delay_of(record))
+        name, device = variable.alias, variable.device
+        value = self._true(entry, name, ago + self._naming.delay_of(variable))
         return device.distorted(value, self._naming.step_count - ago, self._channel(name))
 
     def _channel(self, name: str) -> int:
         return self._naming.channel_of(name)
 
-    def _kept(self, entry: Entry, record: Record, ago: int) -> str:
+    def _kept(self, entry: Entry, variable: TaskVariable, ago: int) -> str:
         """The variable with what a sensor with a memory has given, the latest first."""
-        name, variable = record.alias, f"measured {record.alias}"
-        naming, fill = self._naming, self._fresh(entry, record, 1)
+        name, kept = variable.alias, f"measured {variable.alias}"
+        naming, fill = self._naming, self._fresh(entry, variable, 1)
         length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
-        first = self._fresh(entry, record, 0)
+        first = self._fresh(entry, variable, 0)
         is_first = naming.step_count == naming.first_step
-        before = where(is_first, fill, naming.read("variables", variable, 0))
+        before = where(is_first, fill, naming.read("variables", kept, 0))
         channel = self._channel(name)
-        now = record.device.following(first, before, naming.step_count, channel, self._time_step)
-        self._measured[name] = History(name, variable, length, now, fill, first)
-        return variable
+        now = variable.device.following(first, before, naming.step_count, channel, self._time_step)
+        self._measured[name] = History(name, kept, length, now, fill, first)
+        return kept
 
     @property
     def memories(self) -> list[History]:

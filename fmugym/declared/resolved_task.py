@@ -45,7 +45,7 @@ from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
-from fmugym.declared.variables import Record, inverted, is_plain
+from fmugym.declared.variables import TaskVariable, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.task.future import Future
@@ -208,16 +208,17 @@ class ResolvedTask:
     # The config.
 
     def _make_config(self) -> dict[str, Any]:
-        declared, records = self._declared, self._declared.records
+        declared, variables = self._declared, self._declared.variables
         return {
             **(self._root.child("config").value or {}),
             "foreign": self._root.child("foreign").value or {},
             **times_of(declared, self._time_step),
-            "model_input_names": records.names_in_fmu(declared.written),
-            "model_output_names": records.names_in_fmu(self._naming.outputs),
-            "monitor_names": records.names_in_fmu(self._naming.monitors),
+            "model_input_names": variables.names_in_fmu(declared.written),
+            "model_output_names": variables.names_in_fmu(self._naming.outputs),
+            "monitor_names": variables.names_in_fmu(self._naming.monitors),
             "model_parameters": {
-                record.fmu_variable.name: value for record, value in declared.parameters.values()
+                variable.fmu_variable.name: value
+                for variable, value in declared.parameters.values()
             },
             "episode_variables": self._variables(),
             "bounds": bounds_of(declared, self._naming),
@@ -229,9 +230,9 @@ class ResolvedTask:
         kept = [*self._kept, *self._sensors]
         histories = {one.variable: np.zeros(one.length) for one in kept}
         switches: dict[str, float] = {}
-        for record in self._switched_actions:
-            state, since = switch_names(record)
-            switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
+        for variable in self._switched_actions:
+            state, since = switch_names(variable)
+            switches |= {state: self._is_on_at_start(variable), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
         kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
         variables = (
@@ -246,7 +247,7 @@ class ResolvedTask:
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
         """The key of noise, which is drawn last."""
-        devices = [record.device for record in self._declared.records.declared()]
+        devices = [variable.device for variable in self._declared.variables.declared()]
         is_noisy = any(one.is_random for one in devices) or has_errors(self._declared)
         if not is_noisy and not self._declared.steps:
             return {}
@@ -256,15 +257,15 @@ class ResolvedTask:
         return {NOISE: NoiseKey(draws=not draws)}
 
     @property
-    def _switched_actions(self) -> list[Record]:
+    def _switched_actions(self) -> list[TaskVariable]:
         """The actions with a least time on or off."""
-        return [record for record in self._declared.actions if record.is_switched]
+        return [variable for variable in self._declared.actions if variable.is_switched]
 
-    def _is_on_at_start(self, record: Record) -> float:
-        own = 0.0 if record.variable is None else record.variable.start_number
-        _, start = self._declared.parameters.get(record.alias, (record, own))
+    def _is_on_at_start(self, variable: TaskVariable) -> float:
+        own = 0.0 if variable.in_fmu is None else variable.in_fmu.start_number
+        _, start = self._declared.parameters.get(variable.alias, (variable, own))
         if is_distribution(start):
-            raise record.entry.error(f"the start value of {record.alias!r} must not be drawn")
+            raise variable.entry.error(f"the start value of {variable.alias!r} must not be drawn")
         return float(start != 0)
 
     @cached_property
@@ -291,17 +292,19 @@ class ResolvedTask:
 
     def _action_space(self) -> spaces.Space[Any] | None:
         """The action space; None if it is that of the inputs as they are."""
-        records = self._declared.actions
-        are_inputs = all(r.variable is not None and is_plain(r) for r in records)
+        variables = self._declared.actions
+        are_inputs = all(
+            variable.in_fmu is not None and is_plain(variable) for variable in variables
+        )
         rescales = self._declared.rescales
         if are_inputs and not self._declared.inputs and not rescales:
             return None
         if self._declared.is_physical:
-            return _box([record.range for record in records])
-        if not records[0].levels:
-            limits = [(-r.delta, r.delta) if r.delta else r.range for r in records]
-            return _box([(-1.0, 1.0)] * len(records) if rescales else limits)
-        counts = [len(record.levels) for record in records]
+            return _box([variable.range for variable in variables])
+        if not variables[0].levels:
+            limits = [(-r.delta, r.delta) if r.delta else r.range for r in variables]
+            return _box([(-1.0, 1.0)] * len(variables) if rescales else limits)
+        counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 
     def _inputs(self) -> Hook:
@@ -317,16 +320,16 @@ class ResolvedTask:
                 for all.
         """
         declared, values = self._declared, list[Value]()
-        for record in declared.actions:
-            if record.variable is None:
+        for variable in declared.actions:
+            if variable.in_fmu is None:
                 continue
-            value = inverted(record.conversion, self._naming.input(record))
-            is_kept = acting is not None and record.alias not in acting
+            value = inverted(variable.conversion, self._naming.input(variable))
+            is_kept = acting is not None and variable.alias not in acting
             values.append(self._naming.read("inputs", len(values)) if is_kept else value)
-        for name, (record, expression) in declared.inputs.items():
+        for name, (variable, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
             value = self._naming.value(entry, expression, Moment.BEFORE).number
-            values.append(inverted(record.conversion, value))
+            values.append(inverted(variable.conversion, value))
         if not values:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
@@ -335,11 +338,11 @@ class ResolvedTask:
 
     def _action_masks(self) -> Hook | None:
         naming, values = self._naming, list[Value]()
-        for record in self._declared.actions:
-            for level in map(naming.constant, record.levels):
-                is_switched = record.is_switched
+        for variable in self._declared.actions:
+            for level in map(naming.constant, variable.levels):
+                is_switched = variable.is_switched
                 values.append(
-                    naming.blocked(record, level) ^ True if is_switched else naming.constant(True)
+                    naming.blocked(variable, level) ^ True if is_switched else naming.constant(True)
                 )
         if not values:
             return None
@@ -348,11 +351,11 @@ class ResolvedTask:
 
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
-        names, records = [seen.name for seen in self._seen], self._declared.records
+        names, variables = [seen.name for seen in self._seen], self._declared.variables
         if (
             self._declared.normalization is None
             and names == self._naming.outputs
-            and all(is_plain(records[name]) for name in names)
+            and all(is_plain(variables[name]) for name in names)
         ):
             return None
         return _box([(seen.low, seen.high) for seen in self._normalized])
@@ -415,8 +418,8 @@ class ResolvedTask:
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""
         values: dict[str, Value] = {}
-        for record in self._switched_actions:
-            values |= zip(switch_names(record), self._naming.switched(record), strict=True)
+        for variable in self._switched_actions:
+            values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
         return values
 
     def _updates_of_worst(self) -> list[Hook]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from fmugym.checks import check_text
 from fmugym.declared.entries import Entry
 from fmugym.declared.mistakes import ConsequenceError
-from fmugym.declared.variables import Record
+from fmugym.declared.variables import TaskVariable
 from fmugym.errors import shown, unknown_name
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def signals_of(controller: Controller) -> list[str]:
 
 
 def read_warm_up(
-    root: Entry, actions: Sequence[Record], controlled: Sequence[tuple[str, str]]
+    root: Entry, actions: Sequence[TaskVariable], controlled: Sequence[tuple[str, str]]
 ) -> WarmUpTable:
     """Read the warm-up of a task, and note its mistakes, such as a controller of no action.
 
@@ -66,9 +66,9 @@ def read_warm_up(
     controllers: dict[str, Controller] = {}
     for name, one in _by_action(entry.child("controller"), actions).items():
         with one.noting():
-            record = _record_of(one, name, actions)
+            variable = _action_of(one, name, actions)
             controllers[name] = (
-                _thermostat(one, record, controlled)
+                _thermostat(one, variable, controlled)
                 if _is_bare_thermostat(one, known)
                 else _acting(one, known)
             )
@@ -95,7 +95,9 @@ def _is_bare_thermostat(entry: Entry, known: Mapping[str, Entry]) -> bool:
     return entry.value in THERMOSTATS and entry.value not in known
 
 
-def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, str]]) -> Controller:
+def _thermostat(
+    entry: Entry, variable: TaskVariable, controlled: Sequence[tuple[str, str]]
+) -> Controller:
     """A thermostat whose arguments the task tells: it heats with the highest action.
 
     Raises:
@@ -104,7 +106,7 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
     """
     from fmugym.baselines import Hysteresis
 
-    low, high = record.range
+    low, high = variable.range
     if len(controlled) == 1:
         (of, setpoint), *_ = controlled
         with entry.placing():
@@ -119,10 +121,10 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
     )
 
 
-def _by_action(entry: Entry, actions: Sequence[Record]) -> dict[str, Entry]:
+def _by_action(entry: Entry, actions: Sequence[TaskVariable]) -> dict[str, Entry]:
     if entry.value is None or isinstance(entry.value, Mapping):
         return entry.items()
-    names = [record.alias for record in actions]
+    names = [variable.alias for variable in actions]
     with entry.noting():
         _require_actions(entry)
         if len(names) > 1:
@@ -135,12 +137,12 @@ def _require_actions(entry: Entry) -> None:
         raise ConsequenceError("the actions are not known")
 
 
-def _record_of(entry: Entry, name: str, actions: Sequence[Record]) -> Record:
-    for record in actions:
-        if record.alias == name:
-            return record
+def _action_of(entry: Entry, name: str, actions: Sequence[TaskVariable]) -> TaskVariable:
+    for variable in actions:
+        if variable.alias == name:
+            return variable
     _require_actions(entry)
-    raise unknown_name("action", name, [record.alias for record in actions])
+    raise unknown_name("action", name, [variable.alias for variable in actions])
 
 
 def _acting(entry: Entry, known: Mapping[str, Entry]) -> Controller:
