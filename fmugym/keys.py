@@ -208,8 +208,8 @@ class _Reading(NamedTuple):
             case Listed():
                 return self._note(keys, f"{keys[-1]} must be a list, got {shown(value)}")
             case Entries():
-                items = self._items(keys, value) or {}
-                return {
+                items = self._items(keys, value)
+                return items and {
                     name: self.read(kind.kind, (*keys, name), one) for name, one in items.items()
                 }
         return self._table(kind, keys, value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final, TypeVar
@@ -89,6 +89,7 @@ class Declarations:
     deviations: dict[str, Deviation] = field(init=False)
     kpis: dict[str, Kpi] = field(init=False)
     warm_up: WarmUpTable = field(init=False)
+    _declared: list[str] = field(init=False)
 
     @classmethod
     def read(
@@ -96,6 +97,7 @@ class Declarations:
     ) -> Declarations:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
         declared = cls(root, TaskVariables(root, description), is_physical)
+        declared._declared = [name for section in NAMING[1:] for name in _names(root, section)]
         _check_names(root)
         declared.memory = _read(root, "memory", read_memory)
         declared.derived = _read(root, "expressions", read_derived)
@@ -124,8 +126,8 @@ class Declarations:
 
     @property
     def own_names(self) -> list[str]:
-        """The names that are not those of variables."""
-        return [*self.memory, *self.derived, *self.series, *self.steps]
+        """The names that are not those of variables, also those that have mistakes."""
+        return [*self.memory, *self.derived, *self.series, *self.steps, *self._declared]
 
     @property
     def has_reward_terms(self) -> bool:
@@ -398,6 +400,11 @@ def _check_name(entry: Entry, seen: Collection[str]) -> None:
         raise entry.error(
             f"{name!r} cannot be used in expressions; choose a name of letters, digits and _"
         )
+
+
+def _names(root: Entry, section: str) -> Iterable[str]:
+    """The names that a section declares, also those that have mistakes."""
+    return root.child(section).value or ()
 
 
 def _read(root: Entry, section: str, read: Callable[[Entry], _Read]) -> dict[str, _Read]:

@@ -170,8 +170,8 @@ class Entry:
         return Entry(items.get(key), (*self.keys, key), self.sources, self.mistakes)
 
     def items(self) -> dict[str, Entry]:
-        """The values of this table by key; none if it is not given."""
-        return {key: self.child(key) for key in self.value or ()}
+        """The values of this table by key; none if it is not given, and none that are wrong."""
+        return {key: self.child(key) for key, one in (self.value or {}).items() if one is not None}
 
     def required(self, key: str) -> Entry:
         """The value under a key that must be there.

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.variable import Variable
 from fmugym.declared.computed import Value, where
 from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.devices import chance_in
@@ -20,7 +21,7 @@ from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import clip, maximum
 from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import nearest_steps, steps_in
-from fmugym.declared.variables import NAMING, TaskVariable, converted
+from fmugym.declared.variables import TaskVariable, converted
 from fmugym.errors import unknown_name
 from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
@@ -118,7 +119,12 @@ class Naming:
         They must be sampled in one way: a step gives one value of each.
         """
         variables, first = self._declared.variables, dict[str, str]()
-        originals = {name: variables[name].fmu_variable for name in names}
+        originals: dict[str, Variable] = {}
+        for name in names:
+            with variables[name].entry.noting():
+                if variables[name].in_fmu is None and not self._declared.knows_actions:
+                    raise ConsequenceError(f"{name!r} may be an action")
+                originals[name] = variables[name].fmu_variable
         for name, original in originals.items():
             known = first.setdefault(original.name, name)
             if originals[known].sampling != original.sampling:
@@ -129,8 +135,9 @@ class Naming:
         return {name: order.index(first[one.name]) for name, one in originals.items()}
 
     def _is_first(self, name: str) -> bool:
-        """Whether no name before stands for the same variable of the FMU."""
-        return name == next(n for n, p in self._places.items() if p == self._places[name])
+        """Whether a name stands for a variable of the FMU, and none before for the same one."""
+        place = self._places.get(name)
+        return name == next((n for n, p in self._places.items() if p == place), None)
 
     @property
     def read_names(self) -> list[str]:
@@ -199,9 +206,8 @@ class Naming:
 
     def _known(self) -> list[str]:
         declared = self._declared
-        named = [name for section in NAMING for name in declared.root.child(section).items()]
-        own = dict.fromkeys([*named, *declared.own_names, *declared.parameters])
-        return [*own, *BUILT_IN, *declared.variables.names()]
+        own = [*declared.own_names, *declared.parameters, *BUILT_IN]
+        return list(dict.fromkeys([*own, *declared.variables.names()]))
 
     def value_of(self, name: str, moment: Moment) -> Value | None:
         """The value of a name; None if there is no such name, or it has none at this moment."""
@@ -216,6 +222,8 @@ class Naming:
             return self._value_of_steps(name, moment)
         if name in declared.derived:
             return self._value_of_derived(name, moment)
+        if name in declared.own_names:
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
         variable = declared.variables.get(name)
         return None if variable is None else self._value_of_variable(name, variable, moment)
 
@@ -343,6 +351,8 @@ class Naming:
             return converted(
                 variable.conversion, self.read("parameters", variable.fmu_variable.name)
             )
+        if name not in self._places:
+            raise ConsequenceError(f"{name!r} is no variable of the FMU")
         value = self.read("inside.readings.values", self._places[name])
         return converted(variable.conversion, value)
 

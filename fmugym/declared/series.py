@@ -289,10 +289,8 @@ def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
     usual = next((known[word] for word in _NAMES_OF_TIME if word in known), None)
     column: str | None = usual if name.value is None else name.value
     if column is None:
-        raise entry.error(
-            "name the column with the times as 'time', or give the 'step' between rows; there are: "
-            + ", ".join(map(repr, rows))
-        )
+        text = "name the column with the times as 'time', or give the 'step' between rows"
+        raise entry.lack(f"{text}; there are: {', '.join(map(repr, rows))}", "time", "step")
     return _seconds(name, rows[column])
 
 
@@ -343,7 +341,7 @@ def read_schedule(point: Entry) -> Series:
     entry = point.child("schedule")
     rows = sorted((_time_of_day(one), one.value) for one in entry.items().values())
     if not rows:
-        raise entry.error('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
+        raise entry.lack('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
     if rows[0][0] > 0:  # what holds at midnight began on the day before
         rows.insert(0, (0.0, rows[-1][1]))
     times, values = np.array(rows).T

@@ -167,15 +167,55 @@ def test_what_is_missing_is_told_with_what_is_wrong(tmp_path):
 
 
 def test_what_may_be_missing_because_of_a_misspelt_key_is_not_told():
-    task = {"fmu": {"bundled": "Pendulum"}, "time_step": 0.1, "rewrd": "-abs(q)"}
-    agent = {"actions": "tau", "observations": "q"}
-    with pytest.raises(fmugym.TaskError, match=r"^rewrd: .*'reward'\?$"):
-        fmugym.load({**task, "variables": {"tau": {"min": -1, "max": 1}}, "agent": agent})
+    assert mistakes_of(pendulum(reward=None, rewrd="-abs(q)")) == ["rewrd"]
 
 
 def test_an_unreadable_fmu_is_told_with_the_mistakes_of_the_file():
-    task = {"fmu": "nowhere.fmu", "reward": "1 +", "time_step": 0.1}
+    assert mistakes_of(pendulum(fmu="nowhere.fmu", reward="1 +")) == ["fmu", "reward"]
+
+
+def pendulum(**changes):
+    variables = {"tau": {"min": -1, "max": 1}}
+    agent = {"actions": "tau", "observations": "q"}
+    task = {"fmu": {"bundled": "Pendulum"}, "time_step": 0.1, "reward": "-abs(q)"}
+    return {**task, "variables": variables, "agent": agent, **changes}
+
+
+def mistakes_of(task):
     with pytest.raises(fmugym.TaskError) as caught:
         fmugym.load(task)
-    assert "nowhere.fmu" in str(caught.value)
-    assert "too early" in str(caught.value)
+    return sorted(line.partition(":")[0] for line in str(caught.value).splitlines())
+
+
+def test_a_variable_that_the_fmu_lacks_hides_no_other_mistake():
+    variables = {"tau": {"min": -1, "max": 1}, "nowhere": {"min": 0}}
+    task = pendulum(variables=variables, reward="-nowhere", terminated="qq > 1")
+    assert mistakes_of(task) == ["terminated", "variables.nowhere"]
+
+
+CONSEQUENCES = {
+    "a section": ({"variables": 3, "reward": "-abs(angle)"}, ["variables"]),
+    "a misspelt section": ({"memry": {"m": 1}, "reward": "-m"}, ["memry"]),
+    "data named like a variable": (
+        {"data": {"q_dot": {"values": [1], "stepp": 1}}, "reward": "-q_dot"},
+        ["data.q_dot.stepp"],
+    ),
+    "the time step": ({"time_step": "1 parsec", "episode_length": "1d"}, ["time_step"]),
+    "a schedule": ({"setpoints": {"a": {"schedule": {"06:00": "x"}}}, "reward": "-a"}, None),
+    "a circle": (
+        {"expressions": {"a": "b + 1", "b": "c", "c": "a"}, "reward": "-a - b - c"},
+        ["expressions.a"],
+    ),
+    "a set point of something": (
+        {
+            "setpoints": {"goal": {"value": 0, "of": "qq"}},
+            "agent": {"actions": "tau", "observations": ["q", "goal_error"]},
+        },
+        ["setpoints.goal.of"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("changes", "told"), CONSEQUENCES.values(), ids=CONSEQUENCES)
+def test_what_follows_from_a_mistake_is_not_told(changes, told):
+    assert mistakes_of(pendulum(**changes)) == (told or ["setpoints.a.schedule.06"])
