@@ -159,8 +159,8 @@ class Entry:
         try:
             with self.placing():
                 yield
-        except ConsequenceError:
-            self.mistakes.note_consequence(self.keys)
+        except ConsequenceError as error:
+            self.mistakes.note_consequence(str(self.error(error)), self.keys)
         except TaskError as error:
             self.note(error)
 

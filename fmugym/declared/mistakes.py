@@ -26,7 +26,7 @@ class Mistakes:
     def __init__(self) -> None:
         self._found: dict[str, tuple[Keys, tuple[int, int]]] = {}
         self._unknown: set[Keys] = set()
-        self._consequences: set[Keys] = set()
+        self._consequences: dict[Keys, str] = {}
         self.hidden: set[str] = set()
 
     def note(self, text: str, keys: Keys, place: tuple[int, int], is_unknown: bool = False) -> None:
@@ -42,9 +42,9 @@ class Mistakes:
         if is_unknown:
             self._unknown.add(keys)
 
-    def note_consequence(self, keys: Keys) -> None:
+    def note_consequence(self, text: str, keys: Keys) -> None:
         """Note that a value under these keys cannot be had because of another mistake."""
-        self._consequences.add(keys)
+        self._consequences.setdefault(keys, text)
 
     @property
     def unknown_sections(self) -> list[str]:
@@ -68,5 +68,6 @@ class Mistakes:
         Raises:
             TaskError: If there are any.
         """
-        if self._found:
-            raise TaskError("\n".join(sorted(self._found, key=lambda text: self._found[text][1])))
+        told = sorted(self._found, key=lambda text: self._found[text][1])
+        if told or self._consequences:
+            raise TaskError("\n".join(told or self._consequences.values()))

@@ -142,7 +142,7 @@ class TaskVariables:
         known = self._variables.keys() | self._entries.keys()
         in_fmu = None if alias in known else self._description.find(alias)
         if in_fmu is not None:
-            entry = Entry(None, ("variables", alias), self._root.sources)
+            entry = self._root.child("variables").child(alias)
             self._variables[alias] = self._variable(alias, entry, in_fmu)
         return self._variables.get(alias)
 
