@@ -19,7 +19,7 @@ from fmugym.config import EnvConfig
 from fmugym.errors import (
     ConfigError,
     SimulationError,
-    shortened,
+    first_of,
     unknown_argument,
 )
 from fmugym.fmi.status import WARNING_CODE
@@ -164,8 +164,8 @@ class FMUEnv(Constructed):
             return object.__repr__(self)
         inputs, outputs = self.config.model_input_names, self.config.model_output_names
         return (
-            f"<{type(self).__name__} of {self.fmu.path.name}: {shortened(inputs)} -> "
-            f"{shortened(outputs)} every {self.inside.spec.time_step:g} s>"
+            f"<{type(self).__name__} of {self.fmu.path.name}: {first_of(inputs)} -> "
+            f"{first_of(outputs)} every {self.inside.spec.time_step:g} s>"
         )
 
     @alone

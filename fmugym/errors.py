@@ -36,11 +36,11 @@ __all__ = [
     "SimulationError",
     "TaskError",
     "UnknownParameterError",
+    "first_of",
     "nearest_name",
     "plain",
     "printable",
     "reason",
-    "shortened",
     "shown",
     "unknown_argument",
     "unknown_name",
@@ -52,6 +52,9 @@ _LONGEST: Final = 120
 
 _LONGEST_REASON: Final = 400
 """Characters of another error that an error quotes, at most."""
+
+_MOST_NAMES: Final = 5
+"""Names that a text lists, at most."""
 
 _warned: Final[set[str]] = set()
 
@@ -154,10 +157,11 @@ def shown(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
 
 
-def shortened(names: Sequence[str], most: int = 6) -> str:
-    """Return names as text; the first of many, and how many there are."""
-    more = f", ... ({len(names)} in all)" if len(names) > most else ""
-    return printable(", ".join(names[:most]) + more) or "nothing"
+def first_of(names: Sequence[str]) -> str:
+    """The first of some names for a message, which tells how many more there are."""
+    few = ", ".join(names[:_MOST_NAMES]) or "nothing"
+    more = len(names) - _MOST_NAMES
+    return printable(f"{few} and {more} more" if more > 0 else few)
 
 
 def reason(error: Exception) -> str:

@@ -147,10 +147,12 @@ class Mistake(NamedTuple):
     Attributes:
         keys: The keys that lead to it.
         text: What was expected, and what was given.
+        is_unknown: Whether there is no such key.
     """
 
     keys: Keys
     text: str
+    is_unknown: bool = False
 
 
 def checked(kind: AnyKind, value: Any) -> Any:
@@ -168,19 +170,19 @@ def checked(kind: AnyKind, value: Any) -> Any:
     return result
 
 
-def found_mistakes(kind: AnyKind, value: Any, keys: Keys = ()) -> tuple[Any, list[Mistake]]:
+def found_mistakes(kind: AnyKind, value: Any) -> tuple[Any, list[Mistake]]:
     """Check a value, and find everything that is wrong with it.
 
     Args:
         kind: What it may be.
         value: As the user gave it.
-        keys: Those that lead to it.
 
     Returns:
-        The value as in ``checked``, as far as it is right, and the mistakes.
+        The value as in ``checked``, as far as it is right, and the mistakes. A key of a table whose
+        value is wrong is not in it.
     """
     reading = _Reading([])
-    return reading.read(kind, keys, value), reading.mistakes
+    return reading.read(kind, (), value), reading.mistakes
 
 
 class _Reading(NamedTuple):
@@ -205,14 +207,14 @@ class _Reading(NamedTuple):
             case Listed():
                 return self._note(keys, f"{keys[-1]} must be a list, got {shown(value)}")
             case Entries():
-                items = self._items(keys, value) or {}
-                return {
+                items = self._items(keys, value)
+                return items and {
                     name: self.read(kind.kind, (*keys, name), one) for name, one in items.items()
                 }
         return self._table(kind, keys, value)
 
-    def _note(self, keys: Keys, text: object) -> None:
-        self.mistakes.append(Mistake(keys, str(text)))
+    def _note(self, keys: Keys, text: object, is_unknown: bool = False) -> None:
+        self.mistakes.append(Mistake(keys, str(text), is_unknown))
 
     def _items(self, keys: Keys, value: Any) -> dict[str, Any] | None:
         what = keys[-1] if keys else "a task"
@@ -227,21 +229,27 @@ class _Reading(NamedTuple):
         if table.make is not None and isinstance(value, table.make):
             return value
         before = len(self.mistakes)
-        if table.short and not _is_table(value):
-            given = {table.short: self.read(table.keys[table.short].kind, keys, value)}
-        else:
-            items = self._items(keys, value)
-            if items is None:
-                return None
-            items = without_retired(items)
-            given = {
-                name: self._value(table, name, (*keys, name), one) for name, one in items.items()
-            }
+        is_short = bool(table.short) and not _is_table(value)
+        items = {table.short: value} if is_short else self._items(keys, value)
+        if items is None:
+            return None
+        items = without_retired(items)
+        given = {
+            name: self._value(table, name, keys if is_short else (*keys, name), one)
+            for name, one in items.items()
+        }
         if given.keys() <= table.keys.keys():  # or else the missing key may be misspelt
             self._require(table, keys, given)
-        defaults = {n: one.default for n, one in table.keys.items() if one.default is not None}
+        defaults = {
+            n: one.default
+            for n, one in table.keys.items()
+            if one.default is not None and one.default is not REQUIRED
+        }
         is_made = table.make is not None and len(self.mistakes) == before
-        return table.make(**given) if table.make is not None and is_made else defaults | given
+        if table.make is not None and is_made:
+            return table.make(**given)
+        right = {n: one for n, one in given.items() if one is not None or items[n] is None}
+        return defaults | right
 
     def _value(self, table: Table, name: str, keys: Keys, value: Any) -> Any:
         if name in table.keys:
@@ -249,8 +257,8 @@ class _Reading(NamedTuple):
             is_unset = value is None and one.default is None
             return None if is_unset else self.read(one.kind, keys, value)
         if name in table.elsewhere:
-            return self._note(keys, f"{name!r} is no {table.what}{table.elsewhere[name]}")
-        return self._note(keys, unknown_name(table.what, name, table.keys))
+            return self._note(keys, f"{name!r} is no {table.what}{table.elsewhere[name]}", True)
+        return self._note(keys, unknown_name(table.what, name, table.keys), True)
 
     def _require(self, table: Table, keys: Keys, given: Mapping[str, Any]) -> None:
         for name, one in table.keys.items():

@@ -1,7 +1,6 @@
 """Keys are declared once: checks, documents and the schema of editors follow from that."""
 
 import importlib.util
-import re
 import shutil
 from pathlib import Path
 
@@ -9,33 +8,9 @@ import pytest
 
 import fmugym
 from fmugym.config import EnvConfig
-from fmugym.errors import TaskError
 from fmugym.tools.cli import main
 
 ROOT = Path(__file__).parent.parent
-
-WRONG = """\
-fmu = { bundled = "Pendulum" }
-time_stepp = "20ms"
-reward = "-abs(q"
-
-[variables]
-tau = { min = 0.01, max = -0.01, sample = "median" }
-
-[agent]
-actions = ["tau"]
-observations = ["q"]
-rescale = "yes"
-
-[setpoints]
-goal = { steps = { low = 0, high = 1 } }
-
-[config]
-on_fault = "rais"
-
-[foreign]
-probe_timeout = -1
-"""
 
 
 @pytest.fixture(scope="module")
@@ -56,81 +31,6 @@ def test_a_document_shows_each_table(pages):
     texts = [page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md")]
     shown = [name for text in texts for name in pages.shown_in(text)]
     assert sorted(shown) == sorted(pages.TABLES)
-
-
-def test_one_error_tells_all_mistakes_of_a_file(tmp_path):
-    file = tmp_path / "wrong.toml"
-    file.write_text(WRONG)
-    with pytest.raises(TaskError) as caught:
-        fmugym.load(file)
-    lines = str(caught.value).splitlines()
-    facts = [
-        (2, "time_stepp", "'time_step'"),
-        (3, "reward", "column"),
-        (6, "variables.tau.sample", "'median'.*'mean'"),
-        (6, "variables.tau", "0.01 and -0.01"),
-        (11, "agent.rescale", "'yes'"),
-        (14, "setpoints.goal.steps", "'every' is missing"),
-        (17, "config.on_fault", "'rais'.*'raise'"),
-        (20, "foreign.probe_timeout", "-1"),
-    ]
-    for line, keys, fact in facts:
-        told = [one for one in lines if one.startswith(f"wrong.toml, line {line}, {keys}: ")]
-        assert re.search(fact, "".join(told)), (line, keys, lines)
-    assert len(lines) == len(facts)
-
-
-def test_one_error_tells_all_that_does_not_fit_the_fmu(tmp_path):
-    file = tmp_path / "wrong.toml"
-    file.write_text(
-        """
-        fmu = { bundled = "Pendulum" }
-        [variables]
-        speed = { name = "q_dott" }
-        angle = { name = "q", unit = "kg" }
-        [agent]
-        actions = ["tau"]
-        observations = ["q"]
-        """
-    )
-    with pytest.raises(TaskError) as caught:
-        fmugym.load(file)
-    first, second = str(caught.value).splitlines()
-    assert first.startswith("wrong.toml, line 4, variables.speed.name: ")
-    assert "'q_dot'" in first
-    assert second.startswith("wrong.toml, line 5, variables.angle.unit: ")
-    assert "'kg'" in second
-
-
-def test_one_error_tells_all_mistakes_of_expressions(tmp_path):
-    file = tmp_path / "wrong.toml"
-    file.write_text(
-        """
-        fmu = { bundled = "Pendulum" }
-        terminated = "abs(q_dott) > 2"
-        reward = "-near"
-        [variables]
-        tau = { min = -1, max = 1 }
-        [agent]
-        actions = ["tau"]
-        observations = ["q"]
-        [expressions]
-        near = "abs(qq)"
-        [costs]
-        heat = "tauu**2"
-        """
-    )
-    with pytest.raises(TaskError) as caught:
-        fmugym.load(file)
-    told = sorted(str(caught.value).splitlines())
-    places = [re.match(r"wrong.toml, (line \d+, [\w.]+): ", line)[1] for line in told]
-    assert places == [
-        "line 11, expressions.near",
-        "line 13, costs.heat",
-        "line 3, terminated",
-    ]
-    for line, name in zip(told, ("'q'", "'tau'", "'q_dot'"), strict=True):
-        assert name in line
 
 
 def test_one_error_tells_all_mistakes_of_a_config():

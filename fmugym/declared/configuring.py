@@ -24,26 +24,26 @@ def time_step_of(root: Entry, description: ModelDescription) -> float:
     own: float | None = root.child("time_step").value
     step = description.step_size if own is None else own
     if step is None:
-        raise root.error("the key 'time_step' is missing, and the FMU has no default step size")
+        text = "the key 'time_step' is missing, and the FMU has no default step size"
+        raise root.lack(text, "time_step")
     return step
 
 
 def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
-    """The lengths and times of a config.
-
-    Raises:
-        ConfigError: If one is no time, or no multiple of the time step.
-    """
+    """The lengths and times of a config. If one is no multiple of the time step, it is noted."""
     root, times = declared.root, dict[str, Any](time_step=time_step)
     start, substeps, length = map(root.child, ("start_time", "substeps", "episode_length"))
     if declared.warm_up.period:
         times["warm_up"] = declared.warm_up.period
     if substeps.value is not None:
         times["substeps"] = substeps.value
-    if length.value is not None:
-        times["max_episode_steps"] = steps_in(length, length.value, time_step)
-    if start.value is not None:
-        times["start_time"] = _start_time(declared, times.get("max_episode_steps", 0) * time_step)
+    with length.noting():
+        if length.value is not None:
+            times["max_episode_steps"] = steps_in(length, length.value, time_step)
+    with start.noting():
+        if start.value is not None:
+            steps = times.get("max_episode_steps", 0)
+            times["start_time"] = _start_time(declared, steps * time_step)
     return times
 
 
@@ -82,12 +82,12 @@ def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[
 def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
     """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
     names = (*naming.outputs, *naming.monitors)
-    found = [declared.records[name].fmu_variable for name in names]
+    found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
 def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
     """The limits that the task gives of what it writes, observes and lets episodes start with."""
     names = (*declared.written, *naming.outputs, *declared.parameters)
-    found = [declared.records[name].fmu_variable for name in names]
+    found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.bounds for one in found if one.bounds is not None}

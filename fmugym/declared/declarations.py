@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import keyword
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final, TypeVar
@@ -11,7 +11,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from fmugym.archive.description import ModelDescription
-from fmugym.declared.entries import Entry, gathered
+from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
@@ -28,7 +28,7 @@ from fmugym.declared.parts import (
 )
 from fmugym.declared.series import Series, read_data
 from fmugym.declared.setpoints import Deviation, SetPoints, Steps
-from fmugym.declared.variables import Record, Records, fitted_value, start_value
+from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, fitted_value, start_value
 from fmugym.declared.warming import WarmUpTable, read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
@@ -52,17 +52,18 @@ class Declarations:
 
     Attributes:
         root: The table of all keys.
-        records: The variables.
+        variables: The variables.
         is_physical: Whether observations and actions are in the units of the task; see
             ``Task.physical``.
-        parameters: Parameters and start values by alias: the record, and a value or distribution in
-            the unit of the FMU.
+        parameters: Parameters and start values by alias: the variable, and a value or distribution
+            in the unit of the FMU.
         memory, derived: What the task remembers and names, by name.
         series: Data and schedules by name.
         steps: Set points that jump, by name.
         actions: The variables that the agent writes.
         inputs: Inputs that expressions write, by alias.
         observed: The names that the agent sees, and where they stand.
+        remembered: The names of which it sees the history.
         rewards, costs: By name; a reward without a table has the name ``""``.
         flags: The conditions ``terminated`` and ``truncated``, as far as the task has them.
         deviations: What the names of deviations from set points stand for.
@@ -71,33 +72,32 @@ class Declarations:
     """
 
     root: Entry
-    records: Records
+    variables: TaskVariables
     is_physical: bool = False
-    parameters: dict[str, tuple[Record, Any]] = field(init=False)
+    parameters: dict[str, tuple[TaskVariable, Any]] = field(init=False)
     memory: dict[str, Memory] = field(init=False)
     derived: dict[str, Derived] = field(init=False)
     series: dict[str, Series] = field(init=False)
     steps: dict[str, Steps] = field(init=False)
-    actions: list[Record] = field(init=False)
-    inputs: dict[str, tuple[Record, Expression]] = field(init=False)
+    actions: list[TaskVariable] = field(init=False)
+    inputs: dict[str, tuple[TaskVariable, Expression]] = field(init=False)
     observed: list[tuple[Entry, str]] = field(init=False)
+    remembered: list[str] = field(init=False)
     rewards: dict[str, Term] = field(init=False)
     costs: dict[str, Term] = field(init=False)
     flags: dict[str, Expression] = field(init=False)
     deviations: dict[str, Deviation] = field(init=False)
     kpis: dict[str, Kpi] = field(init=False)
     warm_up: WarmUpTable = field(init=False)
+    _declared: list[str] = field(init=False)
 
     @classmethod
     def read(
         cls, root: Entry, description: ModelDescription, is_physical: bool = False
     ) -> Declarations:
-        """Read all sections.
-
-        Raises:
-            ConfigError: If one has a mistake, or does not fit the FMU. The text says where.
-        """
-        declared = cls(root, Records(root, description), is_physical)
+        """Read all sections, and note their mistakes, and what does not fit the FMU."""
+        declared = cls(root, TaskVariables(root, description), is_physical)
+        declared._declared = [name for section in NAMING[1:] for name in _names(root, section)]
         _check_names(root)
         declared.memory = _read(root, "memory", read_memory)
         declared.derived = _read(root, "expressions", read_derived)
@@ -105,10 +105,13 @@ class Declarations:
         declared._read_setpoints()
         declared.parameters = declared._with_fitted(_read(root, "parameters", declared._parameter))
         declared.actions = declared._read_actions()
-        declared.inputs = dict(declared._read_inputs())
-        observed = declared._listed("observations")
-        gathered(declared._check_observed, observed)
-        declared.observed = [(entry, entry.value) for entry in observed]
+        declared.inputs = declared._read_inputs()
+        declared.observed = []
+        for entry in declared._listed("observations"):
+            with entry.noting():
+                declared._check_observed(entry)
+                declared.observed.append((entry, entry.value))
+        declared.remembered = declared._read_remembered()
         declared.warm_up = read_warm_up(root, declared.actions, declared._controlled())
         reward = root.child("reward")
         if isinstance(reward.value, Expression):
@@ -123,8 +126,8 @@ class Declarations:
 
     @property
     def own_names(self) -> list[str]:
-        """The names that are not those of variables."""
-        return [*self.memory, *self.derived, *self.series, *self.steps]
+        """The names that are not those of variables, also those that have mistakes."""
+        return [*self.memory, *self.derived, *self.series, *self.steps, *self._declared]
 
     @property
     def has_reward_terms(self) -> bool:
@@ -134,20 +137,22 @@ class Declarations:
     @property
     def written(self) -> list[str]:
         """The aliases of the FMU's inputs, in their order."""
-        of_actions = [record.alias for record in self.actions if record.variable is not None]
+        of_actions = [variable.alias for variable in self.actions if variable.in_fmu is not None]
         return of_actions + list(self.inputs)
 
-    @property
-    def remembered(self) -> list[str]:
-        """The names of which the agent sees the history."""
-        history = self.root.child("agent").child("history")
-        if history.value is None:
-            return []
-        entries = history.child("of").elements()
-        for entry in entries:
-            if entry.value not in self.own_names:
-                self.records.find(entry, entry.value, "variable", self.own_names)
-        return [entry.value for entry in entries]
+    def _read_remembered(self) -> list[str]:
+        found = []
+        for entry in self.root.child("agent").child("history").child("of").elements():
+            with entry.noting():
+                self._find(entry, "variable")
+                found.append(entry.value)
+        return found
+
+    def _find(self, entry: Entry, role: str) -> TaskVariable | None:
+        """The variable of a name; None for a name that is not that of a variable."""
+        if entry.value in self.own_names:
+            return None
+        return self.variables.find(entry, entry.value, role, self.own_names)
 
     @property
     def measured(self) -> list[str]:
@@ -174,8 +179,8 @@ class Declarations:
         """Whether a name stands for a value that is read from the FMU after each step."""
         if name in {*self.own_names, *self.parameters, *_RESERVED, *self.written}:
             return False
-        record = self.records.get(name)
-        return record is not None and record not in self.actions
+        variable = self.variables.get(name)
+        return variable is not None and variable not in self.actions
 
     def limits_of(self, name: str) -> Limits:
         """The limits of something that the agent observes."""
@@ -191,8 +196,8 @@ class Declarations:
             return self.memory[name].limits
         if name in self.derived:
             return self.derived[name].limits
-        record = self.records[name]
-        return record.low, record.high
+        variable = self.variables[name]
+        return variable.low, variable.high
 
     def agent(self, key: str) -> Entry:
         """The entry of a key of the agent.
@@ -223,8 +228,8 @@ class Declarations:
         given = {
             "normalize": self.normalization is not None,
             "rescale": self.rescales,
-            "levels": any(record.levels for record in self.actions),
-            "delta": any(record.delta for record in self.actions),
+            "levels": any(variable.levels for variable in self.actions),
+            "delta": any(variable.delta for variable in self.actions),
         }
         return tuple(key for key, is_given in given.items() if is_given)
 
@@ -233,29 +238,33 @@ class Declarations:
 
         That is the larger one of its limits where no nominal value is given.
         """
-        record = None if name in self.own_names else self.records[name]
-        if record is not None and record.nominal is not None:
-            return record.nominal
+        variable = None if name in self.own_names else self.variables[name]
+        if variable is not None and variable.nominal is not None:
+            return variable.nominal
         size = max(map(abs, self.limits_of(name)))
         return size if 0 < size < np.inf else None
 
     def _read_setpoints(self) -> None:
         points, section = SetPoints(), self.root.child("setpoints").items()
-        gathered(points.add, section.values())
+        for entry in section.values():
+            with entry.noting():
+                points.add(entry)
         own = section.keys()
         for name in {*points.memory, *points.derived} - own:
             if name in {*self.memory, *self.derived, *self.series}:
-                raise self.root.child("setpoints").error(
-                    f"{name!r} is a name that a set point brings with it; rename the other one"
-                )
+                entry = self.root.child("setpoints")
+                text = f"{name!r} is a name that a set point brings with it; rename the other one"
+                entry.note(entry.error(text))
         self.memory |= points.memory
         self.series |= points.series
         self.derived |= points.derived
-        self.steps, self.deviations = points.steps, points.deviations
-        for deviation in self.deviations.values():
-            entry = self.root.child("setpoints").child(deviation.setpoint).child("of")
-            if deviation.of not in self.own_names:
-                self.records.find(entry, deviation.of, "variable", self.own_names)
+        self.steps, self.deviations = points.steps, dict(points.deviations)
+        for name, deviation in points.deviations.items():
+            of = self.root.child("setpoints").child(deviation.setpoint).child("of")
+            with of.noting():
+                self._find(of, "variable")
+            if self.root.mistakes.explain(of.keys):
+                del self.derived[name], self.deviations[name]
 
     def _controlled(self) -> list[tuple[str, str]]:
         """What is measured and its set point, in pairs, as far as the task tells.
@@ -264,110 +273,144 @@ class Declarations:
         """
         if self.deviations:
             return [(one.of, one.setpoint) for one in self.deviations.values()]
-        written = {*self.own_names, *(record.alias for record in self.actions)}
+        written = {*self.own_names, *(variable.alias for variable in self.actions)}
         measured = [name for _, name in self.observed if name not in written]
         return list(product(measured, self.root.child("setpoints").items()))
 
     def _listed(self, key: str) -> list[Entry]:
         """The names in a list of the agent; a bare name stands for one."""
-        entry = self.agent(key)
+        entry = self.root.child("agent").child(key)
         names = entry.elements()
-        if not names:
-            raise entry.error(f"{key} must name at least one variable")
         texts = [name.value for name in names]
-        for text in texts:
-            if texts.count(text) > 1:
-                raise entry.error(f"{text!r} is named twice")
+        with entry.noting():
+            if not names:
+                self.root.required("agent")
+                raise entry.lack(f"{key} must name at least one variable")
+            for text in texts:
+                if texts.count(text) > 1:
+                    raise entry.error(f"{text!r} is named twice")
         return names
 
     def _with_fitted(
-        self, parameters: dict[str, tuple[Record, Any]]
-    ) -> dict[str, tuple[Record, Any]]:
+        self, parameters: dict[str, tuple[TaskVariable, Any]]
+    ) -> dict[str, tuple[TaskVariable, Any]]:
         """Parameters, and after them what a fit has found, which takes their place."""
         entry = self.root.child("fitted")
         if entry.value is None:
             return parameters
-        aliases = {record.fmu_variable.name: alias for alias, (record, _) in parameters.items()}
-        fitted: dict[str, tuple[Record, Any]] = {}
-        for name, column in read_fitted(entry).items():
-            record = self.records.find(entry, aliases.get(name, name), "variable")
-            fitted[record.alias] = record, fitted_value(record, entry, column)
+        aliases = {variable.fmu_variable.name: alias for alias, (variable, _) in parameters.items()}
+        fitted: dict[str, tuple[TaskVariable, Any]] = {}
+        with entry.noting():
+            for name, column in read_fitted(entry).items():
+                variable = self.variables.find(entry, aliases.get(name, name), "variable")
+                fitted[variable.alias] = variable, fitted_value(variable, entry, column)
         return {k: one for k, one in parameters.items() if k not in fitted} | fitted
 
-    def _parameter(self, entry: Entry) -> tuple[Record, Any]:
-        record = self.records.find(entry, entry.name, "variable")
-        return record, start_value(record, entry)
+    def _parameter(self, entry: Entry) -> tuple[TaskVariable, Any]:
+        variable = self.variables.find(entry, entry.name, "variable")
+        return variable, start_value(variable, entry)
 
-    def _read_actions(self) -> list[Record]:
-        entry = self.agent("actions")
-        names = self._listed("actions")
-        actions = gathered(lambda one: self.records.find(one, one.value, "action"), names)
-        for record in actions:
-            self.records.check_input(entry, record)
-            if record.variable is None and not record.is_direct:
-                raise record.entry.error(
-                    f"{record.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
-                    f"{', '.join(map(repr, DEVICE))} are for inputs"
-                )
-        if len({bool(record.levels) for record in actions}) > 1:
-            raise entry.error("either all actions have levels, or none has")
-        for record in actions:
-            if not record.levels and not record.is_bounded:
-                raise record.entry.error(
-                    f"the action {record.alias!r} needs limits, which the FMU does not give: "
-                    "give it 'min' and 'max', or 'levels'"
-                )
+    def _read_actions(self) -> list[TaskVariable]:
+        actions: list[TaskVariable] = []
+        for entry in self._listed("actions"):
+            with entry.noting():
+                variable = self.variables.find(entry, entry.value, "action")
+                actions.append(variable)
+                self.variables.check_input(entry, variable)
+                _check_action(variable)
+        entry = self.root.child("agent").child("actions")
+        if len({bool(variable.levels) for variable in actions}) > 1:
+            entry.note(entry.error("either all actions have levels, or none has"))
         return actions
 
-    def _read_inputs(self) -> Iterator[tuple[str, tuple[Record, Expression]]]:
+    @property
+    def knows_actions(self) -> bool:
+        """Whether no mistake hides an action."""
+        return not self.root.mistakes.explain(("agent", "actions"))
+
+    def _read_inputs(self) -> dict[str, tuple[TaskVariable, Expression]]:
+        found = {}
         for name, series in self.series.items():
             target = series.entry.child("input")
-            if target.value is not None:
-                record = self.records.input_of(target, series.unit)
-                _require_plain_input(record)
-                yield record.alias, (record, Expression.parse(name))
-        for entry in self.root.child("inputs").items().values():
-            record = self.records.find(entry, entry.name, "input")
-            if record in self.actions and record.variable is not None:
-                raise entry.error(f"{entry.name!r} is an action already")
-            self.records.check_input(entry, record)
-            _require_plain_input(record)
-            yield entry.name, (record, entry.value)
+            with target.noting():
+                if target.value is not None:
+                    variable = self.variables.input_of(target, series.unit)
+                    _require_plain_input(variable)
+                    found[variable.alias] = variable, Expression.parse(name)
+        return found | _read(self.root, "inputs", self._input)
+
+    def _input(self, entry: Entry) -> tuple[TaskVariable, Expression]:
+        variable = self.variables.find(entry, entry.name, "input")
+        if variable in self.actions and variable.in_fmu is not None:
+            raise entry.error(f"{entry.name!r} is an action already")
+        self.variables.check_input(entry, variable)
+        _require_plain_input(variable)
+        if entry.value is None:
+            raise entry.lack("an input needs an expression")
+        return variable, entry.value
 
     def _check_observed(self, entry: Entry) -> None:
-        if entry.value not in self.own_names:
-            record = self.records.find(entry, entry.value, "observation", self.own_names)
-            if record not in self.actions:
-                self.records.check_output(entry, entry.value)
+        variable = self._find(entry, "observation")
+        if variable is not None and variable not in self.actions:
+            if not self.knows_actions and variable.fmu_variable.causality == "input":
+                return
+            self.variables.check_output(entry, entry.value)
 
 
-def _require_plain_input(record: Record) -> None:
+def _check_action(variable: TaskVariable) -> None:
+    if variable.in_fmu is None and not variable.is_direct:
+        raise variable.entry.error(
+            f"{variable.alias!r} is no input of the FMU: 'delta', 'min_on', 'min_off' and "
+            f"{', '.join(map(repr, DEVICE))} are for inputs"
+        )
+    if not variable.levels and not variable.is_bounded:
+        raise variable.entry.lack(
+            f"the action {variable.alias!r} needs limits, which the FMU does not give: "
+            "give it 'min' and 'max', or 'levels'",
+            *("min", "max", "levels"),
+        )
+
+
+def _require_plain_input(variable: TaskVariable) -> None:
     """Refuse keys of actuators for an input that no action writes: they would do nothing."""
-    if not record.is_direct or record.levels:
-        raise record.entry.error(
-            f"{record.alias!r} is written by an expression, not by an action: only 'name', 'unit', "
-            "'min' and 'max' are for it"
+    if not variable.is_direct or variable.levels:
+        raise variable.entry.error(
+            f"{variable.alias!r} is written by an expression, not by an action: only 'name', "
+            "'unit', 'min' and 'max' are for it"
         )
 
 
 def _check_names(root: Entry) -> None:
     """A name must mean one thing. Aliases may hide names of the FMU."""
     seen: set[str] = set()
-    for section in ("variables", "memory", "expressions", "data", "setpoints"):
+    for section in NAMING:
         for entry in root.child(section).items().values():
-            if entry.name in seen:
-                raise entry.error(f"the name {entry.name!r} is given twice")
-            if is_reserved(entry.name):
-                raise entry.error(f"{entry.name!r} has a meaning of its own in expressions")
-            if not entry.name.isidentifier():
-                raise entry.error(
-                    f"{entry.name!r} cannot be used in expressions; choose a name of letters, "
-                    "digits and _"
-                )
+            with entry.noting():
+                _check_name(entry, seen)
             seen.add(entry.name)
 
 
+def _check_name(entry: Entry, seen: Collection[str]) -> None:
+    name = entry.name
+    if name in seen:
+        raise entry.error(f"the name {name!r} is given twice")
+    if is_reserved(name):
+        raise entry.error(f"{name!r} has a meaning of its own in expressions")
+    if not name.isidentifier():
+        raise entry.error(
+            f"{name!r} cannot be used in expressions; choose a name of letters, digits and _"
+        )
+
+
+def _names(root: Entry, section: str) -> Iterable[str]:
+    """The names that a section declares, also those that have mistakes."""
+    return root.child(section).value or ()
+
+
 def _read(root: Entry, section: str, read: Callable[[Entry], _Read]) -> dict[str, _Read]:
-    """Read the entries of a section by name."""
-    entries = root.child(section).items()
-    return dict(zip(entries, gathered(read, entries.values()), strict=True))
+    """Read the entries of a section by name, as far as they have no mistakes."""
+    found = {}
+    for name, entry in root.child(section).items().items():
+        with entry.noting():
+            found[name] = read(entry)
+    return found

@@ -136,5 +136,5 @@ def read_device(entry: Entry) -> Device:
     given = {key: one for key, one in (entry.value or {}).items() if key in DEVICE}
     drop_out = given.pop("drop_out", None)
     if drop_out is not None:
-        given |= {"drop_out": drop_out["probability"], "substitute": drop_out.get("value")}
+        given |= {"drop_out": drop_out.get("probability", 0.0), "substitute": drop_out.get("value")}
     return Device(**given)

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
+from fmugym.declared.mistakes import ConsequenceError, Mistakes
 from fmugym.errors import ConfigError, TaskError, printable
 
-__all__ = ["Entry", "Source", "gathered"]
-
-_Part = TypeVar("_Part")
-_Read = TypeVar("_Read")
+__all__ = ["Entry", "Source"]
 
 _KEY: Final = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
 _KEYS: Final = rf"{_KEY}(?:\s*\.\s*{_KEY})*"
@@ -47,22 +45,28 @@ class Source(NamedTuple):
             value = value[key]
         return True
 
-    def place(self, keys: Sequence[str]) -> str:
-        """Say where a value stands, as far as that is known."""
+    def place(self, keys: Sequence[str], element: str = "") -> str:
+        """Say where a value stands, or an element of a list, as far as that is known."""
         if self.path is None:
             return ".".join(keys)
-        line = self._line(keys)
+        line = self.line(keys, element)
         parts = [self.path.name, f"line {line}" if line else "", ".".join(keys)]
         return ", ".join(filter(None, parts))
 
-    def _line(self, keys: Sequence[str]) -> int | None:
-        """The first line that leads furthest along the keys."""
-        found: tuple[int, int | None] = (0, None)
+    def line(self, keys: Sequence[str], element: str = "") -> int:
+        """The first line that leads furthest along the keys; 0 if none does."""
+        found, first = 0, 0
         for number, path in _paths(self.text):
             shared = min(len(path), len(keys))
-            if shared > found[0] and list(path[:shared]) == list(keys[:shared]):
-                found = shared, number
-        return found[1]
+            if shared > found and list(path[:shared]) == list(keys[:shared]):
+                found, first = shared, number
+        lines = enumerate(self.text.splitlines()[first - 1 :], first) if first and element else ()
+        return next((number for number, line in lines if _quotes(line, element)), first)
+
+
+def _quotes(line: str, element: str) -> bool:
+    """Whether a line has an element of a list."""
+    return f'"{element}"' in line or f"'{element}'" in line
 
 
 def _paths(text: str) -> Iterator[tuple[int, tuple[str, ...]]]:
@@ -93,11 +97,15 @@ class Entry:
         value: The value.
         keys: The keys that lead to it.
         sources: The files that the task is made of; the first that has the value counts.
+        mistakes: Those that are known of the task.
+        element: The text of an element of a list, which tells its line.
     """
 
     value: Any
     keys: tuple[str, ...]
     sources: tuple[Source, ...]
+    mistakes: Mistakes = field(default_factory=Mistakes, compare=False)
+    element: str = ""
 
     @property
     def name(self) -> str:
@@ -115,8 +123,25 @@ class Entry:
 
     def error(self, text: object) -> TaskError:
         """Make an error that says where this value stands."""
-        place = self.source.place(self.keys)
+        place = self.source.place(self.keys, self.element)
         return TaskError(printable(f"{place}: {text}" if place else text))
+
+    def lack(self, text: str, *keys: str) -> TaskError:
+        """Make an error for values that are missing in this table, unless a mistake explains it.
+
+        Args:
+            text: What is missing.
+            keys: Their keys; none for this value itself.
+        """
+        places = [(*self.keys, key) for key in keys] or [self.keys]
+        is_known = any(map(self.mistakes.explain, places))
+        return ConsequenceError(text) if is_known else self.error(text)
+
+    def note(self, error: object, is_unknown: bool = False) -> None:
+        """Note a mistake in this value; see ``Mistakes.note``."""
+        source = self.source
+        place = self.sources.index(source), source.line(self.keys, self.element)
+        self.mistakes.note(str(error), self.keys, place, is_unknown)
 
     @contextmanager
     def placing(self) -> Iterator[None]:
@@ -128,14 +153,25 @@ class Entry:
         except ConfigError as error:
             raise self.error(error) from error
 
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """Note errors about this value, instead of raising them."""
+        try:
+            with self.placing():
+                yield
+        except ConsequenceError as error:
+            self.mistakes.note_consequence(str(self.error(error)), self.keys)
+        except TaskError as error:
+            self.note(error)
+
     def child(self, key: str) -> Entry:
         """The value under a key of this table; None if it is missing."""
         items = self.value if isinstance(self.value, Mapping) else {}
-        return Entry(items.get(key), (*self.keys, key), self.sources)
+        return Entry(items.get(key), (*self.keys, key), self.sources, self.mistakes)
 
     def items(self) -> dict[str, Entry]:
-        """The values of this table by key; none if it is not given."""
-        return {key: self.child(key) for key in self.value or ()}
+        """The values of this table by key; none if it is not given, and none that are wrong."""
+        return {key: self.child(key) for key, one in (self.value or {}).items() if one is not None}
 
     def required(self, key: str) -> Entry:
         """The value under a key that must be there.
@@ -145,31 +181,18 @@ class Entry:
         """
         entry = self.child(key)
         if entry.value is None:
-            raise self.error(f"the key {key!r} is missing")
+            raise self.lack(f"the key {key!r} is missing", key)
         return entry
 
     def elements(self) -> list[Entry]:
-        """The elements of a list, as entries with the place of the list."""
-        return [Entry(value, self.keys, self.sources) for value in self.value]
+        """The elements of a list; none if it is not given."""
+        return [
+            replace(self, value=one, element=one if isinstance(one, str) else "")
+            for one in self.value or ()
+            if one is not None
+        ]
 
     def path(self) -> Path:
         """The value as a path; a relative one is relative to the folder of its file."""
         path = Path(self.value).expanduser()
         return path if path.is_absolute() else self.source.folder / path
-
-
-def gathered(read: Callable[[_Part], _Read], parts: Iterable[_Part]) -> list[_Read]:
-    """Read parts one after the other, and raise one error for all that have mistakes.
-
-    Raises:
-        TaskError: If there are any.
-    """
-    found, errors = list[_Read](), list[str]()
-    for part in parts:
-        try:
-            found.append(read(part))
-        except TaskError as error:
-            errors.append(str(error))
-    if errors:
-        raise TaskError("\n".join(dict.fromkeys(errors)))
-    return found

@@ -24,6 +24,7 @@ import numpy as np
 
 from fmugym.declared.computed import Value, where
 from fmugym.declared.mathematics import FUNCTIONS
+from fmugym.declared.mistakes import ConsequenceError
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.vector.hooks.graph import Graph
 
@@ -228,6 +229,24 @@ class _Evaluation:
         value: Value = method(node)
         return value
 
+    def _evaluated(self, *nodes: ast.expr) -> list[Value]:
+        """The values of parts, or one error for all that are wrong in them."""
+        values, errors = list[Value](), dict[str, ConfigError]()
+        known: ConsequenceError | None = None
+        for node in nodes:
+            try:
+                values.append(self.evaluate(node))
+            except ConsequenceError as error:
+                known = error
+            except ConfigError as error:
+                errors.setdefault(str(error), error)
+        if len(errors) > 1:
+            raise ConfigError("; ".join(errors))
+        for one in (*errors.values(), known):
+            if one is not None:
+                raise one
+        return values
+
     def _error(self, node: ast.AST, text: object) -> ConfigError:
         offset = len(self._text.strip().encode()[: getattr(node, "col_offset", 0)].decode())
         return ConfigError(f"{text} (column {_column(self._text, offset)} of {shown(self._text)})")
@@ -274,11 +293,12 @@ class _Evaluation:
                 f"the operator in {what} is not allowed here; there are + - * / % ** (power) and "
                 "or not",
             )
-        first, second = self.evaluate(node.left), self.evaluate(node.right)
+        first, second = self._evaluated(node.left, node.right)
         return _applied(node.op, first.number, second.number)
 
     def _value_of_boolop(self, node: ast.BoolOp) -> Value:
-        flags = [self._flag(part, self.evaluate(part)) for part in node.values]
+        values = zip(node.values, self._evaluated(*node.values), strict=True)
+        flags = [self._flag(part, value) for part, value in values]
         return reduce(partial(_applied, node.op), flags)
 
     def _flag(self, node: ast.expr, value: Value) -> Value:
@@ -287,7 +307,7 @@ class _Evaluation:
         raise self._error(node, "expected a condition such as 'x > 1', got a number")
 
     def _value_of_compare(self, node: ast.Compare) -> Value:
-        operands = [self.evaluate(part).number for part in (node.left, *node.comparators)]
+        operands = [one.number for one in self._evaluated(node.left, *node.comparators)]
         parts = []
         for sign, first, second in zip(node.ops, operands, operands[1:], strict=False):
             if type(sign) not in _OPERATIONS:
@@ -296,8 +316,8 @@ class _Evaluation:
         return reduce(partial(_applied, ast.And()), parts)
 
     def _value_of_ifexp(self, node: ast.IfExp) -> Value:
-        condition = self._flag(node.test, self.evaluate(node.test))
-        first, second = self.evaluate(node.body), self.evaluate(node.orelse)
+        condition, first, second = self._evaluated(node.test, node.body, node.orelse)
+        condition = self._flag(node.test, condition)
         if first.is_flag and second.is_flag:
             return (condition & first) | ((condition ^ True) & second)
         return where(condition, first.number, second.number)
@@ -317,7 +337,7 @@ class _Evaluation:
         if count < function.fewest or (function.most is not None and count > function.most):
             few = f"at least {function.fewest}" if function.most is None else function.fewest
             raise self._error(node, f"{name} takes {few} arguments, got {count}")
-        arguments = [self.evaluate(argument).number for argument in node.args]
+        arguments = [one.number for one in self._evaluated(*node.args)]
         value: Value = function.call(*arguments)
         return value
 

@@ -61,5 +61,5 @@ def kpi_name(name: str) -> str:
 
 def read_kpi(entry: Entry) -> Kpi:
     """Read a figure."""
-    how = next(how for how in (*KPIS, "expr") if how in entry.value)
-    return Kpi(entry, entry.value[how], None if how == "expr" else how)
+    how = next((how for how in KPIS if how in entry.value), "expr")
+    return Kpi(entry, entry.required(how).value, None if how == "expr" else how)

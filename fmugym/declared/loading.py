@@ -42,26 +42,24 @@ def load(
     """
     if config is None:
         raise ArgumentError("give the argument 'config': the path of a task file, or a dict")
-    task = Task.of(config)
+    task = Task.draft(config)
     if scenario is not None:
         task = task.in_scenario(scenario)
     if check_flag("physical", physical):
         task = task.physical()
-    if task.root.child("class").value is None:
-        if task.root.child("arguments").value is not None:
-            raise task.root.child("arguments").error("'arguments' are for a task with a 'class'")
-        return TaskEnv(task, **arguments)
-    env_class = _class_of(task)
-    own = task.root.child("arguments")
-    given = {} if own.value is None else {k: entry.value for k, entry in own.items().items()}
+    root = task.begun()
+    own, is_plain = root.child("arguments"), root.child("class").value is None
+    if is_plain and own.value is not None:
+        raise own.error("'arguments' are for a task with a 'class'")
+    env_class = TaskEnv if is_plain else _class_of(root.child("class"))
+    given = {key: entry.value for key, entry in own.items().items()}
     if issubclass(env_class, TaskEnv):
         return env_class(task, **given, **arguments)
     _require_no_more(task, env_class)
     return env_class(**(given | arguments))
 
 
-def _class_of(task: Task) -> type[FMUEnv]:
-    entry = task.root.child("class")
+def _class_of(entry: Entry) -> type[FMUEnv]:
     found = _imported(entry) if isinstance(entry.value, str) else entry.value
     if not isinstance(found, type) or not issubclass(found, FMUEnv):
         raise entry.error(f"expected 'module:Class' of an environment, got {shown(found)}")

@@ -33,9 +33,9 @@ def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quan
 
 
 def _quantities(declared: Declarations, naming: Naming) -> Iterator[Quantity]:
-    actions = [record.alias for record in declared.actions]
+    actions = [variable.alias for variable in declared.actions]
     for alias in [*actions, *naming.read_names]:
-        yield _of_record(declared, alias, "action" if alias in actions else "output")
+        yield _of_variable(declared, alias, "action" if alias in actions else "output")
     setpoints = declared.root.child("setpoints").value or {}
     targets = _targets(declared)
     for name in setpoints:
@@ -48,14 +48,14 @@ def _quantities(declared: Declarations, naming: Naming) -> Iterator[Quantity]:
     for name in declared.root.child("expressions").value or {}:
         yield _of_name(declared, name, "expression")
     for alias in declared.inputs:
-        yield _of_record(declared, alias, "input")
+        yield _of_variable(declared, alias, "input")
     for alias in declared.parameters:
-        yield _of_record(declared, alias, "parameter")
+        yield _of_variable(declared, alias, "parameter")
 
 
-def _of_record(declared: Declarations, alias: str, kind: str) -> Quantity:
-    record = declared.records[alias]
-    return Quantity(alias, kind, _shown(record.unit), record.low, record.high)
+def _of_variable(declared: Declarations, alias: str, kind: str) -> Quantity:
+    variable = declared.variables[alias]
+    return Quantity(alias, kind, _shown(variable.unit), variable.low, variable.high)
 
 
 def _shown(unit: str | None) -> str:
@@ -68,7 +68,7 @@ def _of_name(declared: Declarations, name: str, kind: str, target: str = "") -> 
     series = declared.series.get(name)
     unit = "" if series is None else _shown(series.unit)
     if target and not unit:
-        unit = _shown(declared.records[target].unit)
+        unit = _shown(declared.variables[target].unit)
     holds = name in declared.steps or (series is not None and series.is_stepped)
     return Quantity(name, kind, unit, *declared.limits_of(name), holds, target)
 

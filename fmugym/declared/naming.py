@@ -12,14 +12,16 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from fmugym.archive.variable import Variable
 from fmugym.declared.computed import Value, where
 from fmugym.declared.declarations import BUILT_IN, Declarations
 from fmugym.declared.devices import chance_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression, Names
 from fmugym.declared.mathematics import clip, maximum
-from fmugym.declared.quantities import steps_in
-from fmugym.declared.variables import Record, converted
+from fmugym.declared.mistakes import ConsequenceError
+from fmugym.declared.quantities import nearest_steps, steps_in
+from fmugym.declared.variables import TaskVariable, converted
 from fmugym.errors import unknown_name
 from fmugym.task.future import Lookup
 from fmugym.vector.hooks.graph import Graph
@@ -59,14 +61,14 @@ _CHANNELS_OF_ACTUATORS: Final = 5_000
 _LONGEST_DELAY: Final = 2000
 
 
-def switch_names(record: Record) -> tuple[str, str]:
+def switch_names(variable: TaskVariable) -> tuple[str, str]:
     """The episode variables that know whether an action is on, and for how many steps."""
-    return f"{record.alias} is on", f"steps since {record.alias} was switched"
+    return f"{variable.alias} is on", f"steps since {variable.alias} was switched"
 
 
-def queue_name(record: Record) -> str:
+def queue_name(variable: TaskVariable) -> str:
     """The episode variable with the latest choices for an action with a delay."""
-    return f"choices of {record.alias}"
+    return f"choices of {variable.alias}"
 
 
 class Naming:
@@ -90,7 +92,7 @@ class Naming:
         self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
-        self._derived: dict[tuple[str, Moment, float], Value] = {}
+        self._derived: dict[tuple[str, Moment, float], Value | None] = {}
         self.graph = Graph()
         self.lookups: dict[str, Lookup] = {}
         self.outputs, self.monitors = self._read_names()
@@ -107,30 +109,35 @@ class Naming:
         wanted = {name: None for name in wanted if self._is_first(name)}
         others = [name for name in others if self._is_first(name)]
         if not wanted and not others:
-            raise declared.agent("observations").error("the task reads no variable of the FMU")
+            text = "the task reads no variable of the FMU"
+            raise declared.agent("observations").lack(text)
         return (list(wanted), others) if wanted else (others, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:
         """Where the values of names are: several may stand for one variable of the FMU.
 
-        Raises:
-            ConfigError: If they are sampled in different ways: a step gives one value of each.
+        They must be sampled in one way: a step gives one value of each.
         """
-        records, first = self._declared.records, dict[str, str]()
-        variables = {name: records[name].fmu_variable for name in names}
-        for name, variable in variables.items():
-            known = first.setdefault(variable.name, name)
-            if variables[known].sampling != variable.sampling:
-                raise records[name].entry.error(
-                    f"{known!r} and {name!r} are both {variable.name!r} of the FMU, which has one "
-                    "'sample' only"
-                )
+        variables, first = self._declared.variables, dict[str, str]()
+        originals: dict[str, Variable] = {}
+        for name in names:
+            with variables[name].entry.noting():
+                if variables[name].in_fmu is None and not self._declared.knows_actions:
+                    raise ConsequenceError(f"{name!r} may be an action")
+                originals[name] = variables[name].fmu_variable
+        for name, original in originals.items():
+            known = first.setdefault(original.name, name)
+            if originals[known].sampling != original.sampling:
+                entry = variables[name].entry
+                text = f"{known!r} and {name!r} are both {original.name!r} of the FMU, which has "
+                entry.note(entry.error(f"{text}one 'sample' only"))
         order = list(first.values())
-        return {name: order.index(first[one.name]) for name, one in variables.items()}
+        return {name: order.index(first[one.name]) for name, one in originals.items()}
 
     def _is_first(self, name: str) -> bool:
-        """Whether no name before stands for the same variable of the FMU."""
-        return name == next(n for n, p in self._places.items() if p == self._places[name])
+        """Whether a name stands for a variable of the FMU, and none before for the same one."""
+        place = self._places.get(name)
+        return name == next((n for n, p in self._places.items() if p == place), None)
 
     @property
     def read_names(self) -> list[str]:
@@ -183,7 +190,12 @@ class Naming:
 
     def _names(self, moment: Moment, others: Mapping[str, Value]) -> Names:
         def find(name: str) -> Value | None:
-            return others[name] if name in others else self.value_of(name, moment)
+            if name in others:
+                return others[name]
+            value = self.value_of(name, moment)
+            if value is None:
+                self._declared.variables.require_unhidden(name)
+            return value
 
         return Names(
             self.graph,
@@ -194,7 +206,8 @@ class Naming:
 
     def _known(self) -> list[str]:
         declared = self._declared
-        return [*declared.own_names, *declared.parameters, *BUILT_IN, *declared.records.names()]
+        own = [*declared.own_names, *declared.parameters, *BUILT_IN]
+        return list(dict.fromkeys([*own, *declared.variables.names()]))
 
     def value_of(self, name: str, moment: Moment) -> Value | None:
         """The value of a name; None if there is no such name, or it has none at this moment."""
@@ -209,8 +222,10 @@ class Naming:
             return self._value_of_steps(name, moment)
         if name in declared.derived:
             return self._value_of_derived(name, moment)
-        record = declared.records.get(name)
-        return None if record is None else self._value_of_record(name, record, moment)
+        if name in declared.own_names:
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
+        variable = declared.variables.get(name)
+        return None if variable is None else self._value_of_variable(name, variable, moment)
 
     def forecast(self, entry: Entry, name: str, ahead: float) -> Value:
         """The value of a name at another time.
@@ -229,6 +244,8 @@ class Naming:
         finally:
             self._ahead = 0.0
         if value is None or value.constant is not None:
+            if value is None:
+                self._declared.variables.require_unhidden(name)
             if name not in (known := self._known()):
                 raise entry.error(unknown_name("name to forecast", name, known))
             raise entry.error(_no_forecast(name))
@@ -259,7 +276,7 @@ class Naming:
         """The random value now; after a step, that of the step."""
         steps = self._declared.steps[name]
         count = steps_in(steps.entry, steps.every, self._time_step)
-        shift = round(self._ahead / self._time_step) - (moment in _OVER)
+        shift = nearest_steps(self._ahead, self._time_step) - (moment in _OVER)
         passed = maximum(self.step_count + float(shift), 0.0)
         low, high = steps.limits
         return low + (high - low) * chance_in(np.floor(passed / float(count)), steps.channel)
@@ -302,9 +319,13 @@ class Naming:
         if name in self._open:
             raise derived.entry.error(f"{name!r} depends on itself")
         if key not in self._derived:  # many may read it
-            with self._opened(name):
+            self._derived[key] = None
+            with derived.entry.noting(), self._opened(name):
                 self._derived[key] = self.value(derived.entry, derived.expression, moment)
-        return self._derived[key]
+        value = self._derived[key]
+        if value is None:
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
+        return value
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[None]:
@@ -314,151 +335,159 @@ class Naming:
         finally:
             self._open.pop()
 
-    def _value_of_record(self, name: str, record: Record, moment: Moment) -> Value:
+    def _value_of_variable(self, name: str, variable: TaskVariable, moment: Moment) -> Value:
         declared = self._declared
         if moment is Moment.FORECAST:
-            raise record.entry.error(_no_forecast(name))
-        if record in declared.actions and record.variable is None:
-            return self.action(record, "action")
-        if record in declared.actions and moment is Moment.BEFORE:
-            return self.input(record)
+            raise variable.entry.error(_no_forecast(name))
+        if variable in declared.actions and variable.in_fmu is None:
+            return self.action(variable, "action")
+        if variable in declared.actions and moment is Moment.BEFORE:
+            return self.input(variable)
         if name in declared.written:
-            return self.present(record)
+            return self.present(variable)
         if name in declared.parameters:
-            if record.variable is not None and record.variable.kind == "string":
-                raise record.entry.error(f"{name!r} is a String: expressions have numbers only")
-            return converted(record.conversion, self.read("parameters", record.fmu_variable.name))
+            if variable.in_fmu is not None and variable.in_fmu.kind == "string":
+                raise variable.entry.error(f"{name!r} is a String: expressions have numbers only")
+            return converted(
+                variable.conversion, self.read("parameters", variable.fmu_variable.name)
+            )
+        if name not in self._places:
+            raise ConsequenceError(f"{name!r} is no variable of the FMU")
         value = self.read("inside.readings.values", self._places[name])
-        return converted(record.conversion, value)
+        return converted(variable.conversion, value)
 
     def _previous_value_of(self, name: str) -> Value | None:
-        declared, record = self._declared, self._declared.records.get(name)
-        if record is not None and record in declared.actions:
-            return self.action(record, "previous_action") if record.is_direct else None
-        if record is None or not self._is_output(name):
+        declared, variable = self._declared, self._declared.variables.get(name)
+        if variable is not None and variable in declared.actions:
+            return self.action(variable, "previous_action") if variable.is_direct else None
+        if variable is None or not self._is_output(name):
+            if not declared.knows_actions:
+                raise ConsequenceError(f"{name!r} may be an action")
             return None
-        return converted(record.conversion, self.read("previous_state", self._places[name]))
+        return converted(variable.conversion, self.read("previous_state", self._places[name]))
 
-    def action(self, record: Record, attribute: str) -> Value:
+    def action(self, variable: TaskVariable, attribute: str) -> Value:
         """An action in the unit of the task.
 
         Args:
-            record: The variable that the agent writes.
+            variable: The variable that the agent writes.
             attribute: ``"action"`` or ``"previous_action"``.
         """
-        declared, place = self._declared, self._place_of(record)
-        if declared.is_physical or not record.levels:
+        declared, place = self._declared, self._place_of(variable)
+        if declared.is_physical or not variable.levels:
             element = self.read(attribute, place, dtype=np.float32).cast(np.float64)
-            if record.levels:
-                return self._nearest_level(record, element)
-            return self._rescaled(record, element) if declared.rescales else element
+            if variable.levels:
+                return self._nearest_level(variable, element)
+            return self._rescaled(variable, element) if declared.rescales else element
         keys = [] if len(declared.actions) == 1 else [place]
-        levels = self._table_of_levels(record, np.array(record.levels))
+        levels = self._table_of_levels(variable, np.array(variable.levels))
         return self.read(attribute, *keys, dtype=np.int64).taken(levels)
 
-    def _table_of_levels(self, record: Record, levels: npt.NDArray[Any]) -> str:
-        name = f"levels of {record.alias}"
+    def _table_of_levels(self, variable: TaskVariable, levels: npt.NDArray[Any]) -> str:
+        name = f"levels of {variable.alias}"
         self.graph.tables[name] = levels
         return name
 
-    def input(self, record: Record) -> Value:
+    def input(self, variable: TaskVariable) -> Value:
         """The value that an action gives an input, in the unit of the task."""
-        chosen = self.action(record, "action")
-        if record.is_direct:
+        chosen = self.action(variable, "action")
+        if variable.is_direct:
             return chosen
-        now = self.present(record)
-        if record.device.delay:
-            chosen = self._late(record)
-        if record.delta:
-            chosen = self._changed(record, chosen, now)
-        device, channel = record.device, _CHANNELS_OF_ACTUATORS + self._place_of(record)
+        now = self.present(variable)
+        if variable.device.delay:
+            chosen = self._late(variable)
+        if variable.delta:
+            chosen = self._changed(variable, chosen, now)
+        device, channel = variable.device, _CHANNELS_OF_ACTUATORS + self._place_of(variable)
         chosen = device.distorted(chosen, self.step_count, channel)
         chosen = device.following(chosen, now, self.step_count, channel, self._time_step)
-        if record.is_switched:
-            chosen = where(self.blocked(record, chosen), now, chosen)
+        if variable.is_switched:
+            chosen = where(self.blocked(variable, chosen), now, chosen)
         return chosen
 
-    def _changed(self, record: Record, chosen: Value, now: Value) -> Value:
+    def _changed(self, variable: TaskVariable, chosen: Value, now: Value) -> Value:
         """An input after a change; in the physical form, towards the chosen value."""
         value = now + chosen
         if self._declared.is_physical:
-            value = clip(chosen, now - record.delta, now + record.delta)
-        limited: Value = clip(value, record.low, record.high)
+            value = clip(chosen, now - variable.delta, now + variable.delta)
+        limited: Value = clip(value, variable.low, variable.high)
         return limited
 
-    def _place_of(self, record: Record) -> int:
-        return self._declared.actions.index(record)
+    def _place_of(self, variable: TaskVariable) -> int:
+        return self._declared.actions.index(variable)
 
-    def delay_of(self, record: Record) -> int:
+    def delay_of(self, variable: TaskVariable) -> int:
         """By how many steps a sensor or an actuator is late.
 
         Raises:
             ConfigError: If the delay is no multiple of the time step.
         """
-        delay, entry = record.device.delay, record.entry.child("delay")
+        delay, entry = variable.device.delay, variable.entry.child("delay")
         return steps_in(entry, delay, self._time_step, _LONGEST_DELAY) if delay else 0
 
-    def _late(self, record: Record) -> Value:
+    def _late(self, variable: TaskVariable) -> Value:
         """What the agent chose some steps ago."""
-        count = self.delay_of(record)
-        queued = self.read("variables", queue_name(record), count - 1)
+        count = self.delay_of(variable)
+        queued = self.read("variables", queue_name(variable), count - 1)
         is_first = self.step_count < float(count - self._warm_steps)
-        return where(is_first, self.start(record), queued)
+        return where(is_first, self.start(variable), queued)
 
-    def start(self, record: Record) -> Value:
+    def start(self, variable: TaskVariable) -> Value:
         """What counts as chosen before the first action; no change for changes."""
-        if record.delta and not self._declared.is_physical:
+        if variable.delta and not self._declared.is_physical:
             return self.step_count * 0.0
-        return self._start_of_input(record)
+        return self._start_of_input(variable)
 
-    def _start_of_input(self, record: Record) -> Value:
-        if record.variable is None:
+    def _start_of_input(self, variable: TaskVariable) -> Value:
+        if variable.in_fmu is None:
             return self.step_count * 0.0
-        if record.alias in self._declared.parameters:
-            start = self.read("parameters", record.fmu_variable.name)
+        if variable.alias in self._declared.parameters:
+            start = self.read("parameters", variable.fmu_variable.name)
         else:
-            start = self.step_count * 0.0 + record.variable.start_number
-        return converted(record.conversion, start)
+            start = self.step_count * 0.0 + variable.in_fmu.start_number
+        return converted(variable.conversion, start)
 
-    def present(self, record: Record) -> Value:
+    def present(self, variable: TaskVariable) -> Value:
         """The value that an input has now, in the unit of the task."""
-        return converted(record.conversion, self._written(record))
+        return converted(variable.conversion, self._written(variable))
 
-    def _written(self, record: Record) -> Value:
-        return self.read("inputs", self._declared.written.index(record.alias))
+    def _written(self, variable: TaskVariable) -> Value:
+        return self.read("inputs", self._declared.written.index(variable.alias))
 
-    def blocked(self, record: Record, chosen: Value) -> Value:
+    def blocked(self, variable: TaskVariable, chosen: Value) -> Value:
         """Whether it is too early to switch to a value.
 
         Args:
-            record: A variable with a least time on or off.
+            variable: A variable with a least time on or off.
             chosen: The value.
         """
-        state, since = (self.read("variables", name) for name in switch_names(record))
-        on, off = (np.ceil(t / self._time_step - _JUST) for t in (record.min_on, record.min_off))
+        state, since = (self.read("variables", name) for name in switch_names(variable))
+        on, off = (
+            np.ceil(t / self._time_step - _JUST) for t in (variable.min_on, variable.min_off)
+        )
         stays_on = (state > 0.5) & (chosen == 0.0) & (since < float(on))
         stays_off = (state < 0.5) & (chosen != 0.0) & (since < float(off))
         return stays_on | stays_off
 
-    def switched(self, record: Record) -> tuple[Value, Value]:
+    def switched(self, variable: TaskVariable) -> tuple[Value, Value]:
         """The new values of the variables that ``switch_names`` names."""
-        state, since = (self.read("variables", name) for name in switch_names(record))
-        is_on = (self._written(record) != 0.0) * 1.0
+        state, since = (self.read("variables", name) for name in switch_names(variable))
+        is_on = (self._written(variable) != 0.0) * 1.0
         return is_on, where(is_on == state, since + 1.0, 1.0)
 
-    def _rescaled(self, record: Record, element: Value) -> Value:
+    def _rescaled(self, variable: TaskVariable, element: Value) -> Value:
         """Turn an action from -1 to 1 into one from the lowest to the highest value."""
-        if record.delta:
-            return record.delta * element
-        middle, half = (record.low + record.high) / 2, (record.high - record.low) / 2
+        if variable.delta:
+            return variable.delta * element
+        middle, half = (variable.low + variable.high) / 2, (variable.high - variable.low) / 2
         return middle + half * element
 
-    def _nearest_level(self, record: Record, element: Value) -> Value:
+    def _nearest_level(self, variable: TaskVariable, element: Value) -> Value:
         """The level that is nearest to a value, the lower one of two."""
-        levels = np.sort(record.levels)
+        levels = np.sort(variable.levels)
         middles = ((levels[1:] + levels[:-1]) / 2).tolist()
         place: Value = reduce(operator.add, [(element > middle) * 1 for middle in middles])
-        return place.taken(self._table_of_levels(record, levels))
+        return place.taken(self._table_of_levels(variable, levels))
 
     def kept(self, name: str) -> tuple[Value, Value] | None:
         """What a history adds to a name's values in each step.
@@ -467,16 +496,16 @@ class Naming:
             The value to add, and the older values in the first step; None if there is no history of
             this name.
         """
-        declared, record = self._declared, self._declared.records.get(name)
-        if record is None or not (record in declared.actions or self._is_output(name)):
+        declared, variable = self._declared, self._declared.variables.get(name)
+        if variable is None or not (variable in declared.actions or self._is_output(name)):
             return None
-        if record not in declared.actions:
+        if variable not in declared.actions:
             before = self._previous_value_of(name)
             return None if before is None else (before, before)
-        now = self._value_of_record(name, record, Moment.AFTER)
-        if record.variable is None:
-            return now, self.action(record, "previous_action")
-        return now, self._start_of_input(record)
+        now = self._value_of_variable(name, variable, Moment.AFTER)
+        if variable.in_fmu is None:
+            return now, self.action(variable, "previous_action")
+        return now, self._start_of_input(variable)
 
 
 def _no_forecast(name: str) -> str:

@@ -15,8 +15,8 @@ from fmugym.declared.devices import first_step, noise_in
 from fmugym.declared.entries import Entry
 from fmugym.declared.format import DEVICE
 from fmugym.declared.naming import Moment, Naming, queue_name
-from fmugym.declared.quantities import steps_in
-from fmugym.declared.variables import Record
+from fmugym.declared.quantities import nearest_steps, steps_in
+from fmugym.declared.variables import TaskVariable
 
 __all__ = [
     "History",
@@ -103,36 +103,45 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     """The histories that the agent sees, of values that no function of time gives.
 
     The history of a variable holds its values before the present one. That of an action begins with
-    the action of the step that has just ended.
-
-    Raises:
-        ConfigError: If a name has no value before the step.
+    the action of the step that has just ended. A name without a value before the step is noted as a
+    mistake.
     """
     entry = declared.root.child("agent").child("history")
-    length = _kept_steps(declared, time_step) if declared.remembered else 0
-    lengths = dict.fromkeys(declared.remembered, length)
+    lengths = dict.fromkeys(declared.remembered, _kept_steps(declared, time_step))
     for name in declared.measured:
-        record = _sensor_of(declared, name)
-        late = 0 if record is None else naming.delay_of(record) + record.device.remembers
-        if late or name in lengths:
-            lengths[name] = lengths.get(name, 0) + late
-    of_variables = {name: n for name, n in lengths.items() if name not in declared.series}
-    kept = [_history(entry, naming, name, count) for name, count in of_variables.items()]
-    late_ones = [record for record in declared.actions if record.device.delay]
-    return [*kept, *(_queue(naming, record) for record in late_ones)]
+        variable = _sensor_of(declared, name)
+        if variable is None:
+            continue
+        with variable.entry.noting():
+            late = naming.delay_of(variable) + variable.device.remembers
+            if late or name in lengths:
+                lengths[name] = lengths.get(name, 0) + late
+    kept: list[History] = []
+    for name, count in lengths.items():
+        with entry.noting():
+            if name not in declared.series:
+                kept.append(_history(entry, naming, name, count))
+    for variable in declared.actions:
+        with variable.entry.noting():
+            if variable.device.delay:
+                kept.append(_queue(naming, variable))
+    return kept
 
 
 def _kept_steps(declared: Declarations, time_step: float) -> int:
     """How many values of a name the agent sees that are of the past."""
-    entry = declared.root.child("agent").child("history").child("length")
-    return steps_in(entry, entry.value, time_step, _MOST_VALUES)
+    entry, steps = declared.root.child("agent").child("history").child("length"), 0
+    with entry.noting():
+        if entry.value is not None:
+            steps = steps_in(entry, entry.value, time_step, _MOST_VALUES)
+    return steps
 
 
-def _queue(naming: Naming, record: Record) -> History:
+def _queue(naming: Naming, variable: TaskVariable) -> History:
     """What the agent has chosen for an action with a delay."""
-    name, start = queue_name(record), naming.start(record)
-    chosen = naming.action(record, "action")
-    return History(name, name, naming.delay_of(record), chosen, start, start)
+    name, start = queue_name(variable), naming.start(variable)
+    chosen = naming.action(variable, "action")
+    return History(name, name, naming.delay_of(variable), chosen, start, start)
 
 
 def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
@@ -145,9 +154,9 @@ def _history(entry: Entry, naming: Naming, name: str, length: int) -> History:
     return History(name, f"history of {name}", length, *values, present)
 
 
-def _sensor_of(declared: Declarations, name: str) -> Record | None:
-    """The record of what is measured; None for what the agent knows without a sensor."""
-    return declared.records.get(name) if declared.is_output(name) else None
+def _sensor_of(declared: Declarations, name: str) -> TaskVariable | None:
+    """The variable of what is measured; None for what the agent knows without a sensor."""
+    return declared.variables.get(name) if declared.is_output(name) else None
 
 
 def observed_values(
@@ -166,8 +175,7 @@ def observed_values(
         time_step: Length of a step in seconds.
         are_filled: Whether a warm-up has filled the histories when an episode begins.
 
-    Raises:
-        ConfigError: If one is a constant, or there is no forecast or history of it.
+    Constants, and names without a forecast or history, are noted as mistakes.
     """
     _check_sensors(declared)
     past = _Past(declared, naming, kept, time_step, are_filled)
@@ -181,14 +189,17 @@ def observed_values(
 
 def _check_sensors(declared: Declarations) -> None:
     """Refuse a sensor of what the agent does not observe: it would do nothing."""
-    seen = set(declared.measured)
-    for record in declared.records.declared():
-        is_used = record.alias in seen or record in declared.actions
-        if not record.device.is_ideal and not is_used:
-            raise record.entry.error(
+    seen, mistakes = set(declared.measured), declared.root.mistakes
+    if any(mistakes.explain(("agent", key)) for key in ("actions", "observations", "history")):
+        return
+    for variable in declared.variables.declared():
+        is_used = variable.alias in seen or variable in declared.actions
+        if not variable.device.is_ideal and not is_used:
+            text = (
                 f"{', '.join(map(repr, DEVICE))} are for actions and for what the agent "
-                f"observes, and {record.alias!r} is not in its observations"
+                f"observes, and {variable.alias!r} is not in its observations"
             )
+            variable.entry.note(variable.entry.error(text))
 
 
 class _Past:
@@ -209,44 +220,44 @@ class _Past:
 
     def measured(self, entry: Entry, name: str, ago: int) -> Value:
         """What the agent measured some steps ago."""
-        record = _sensor_of(self._declared, name)
+        variable = _sensor_of(self._declared, name)
         deviation = self._declared.deviations.get(name)
         if deviation is not None:
             setpoint, of = (self.measured(entry, one, ago) for one in deviation)
             return setpoint - of
-        if record is None:
+        if variable is None:
             return self._true(entry, name, ago)
-        fresh = self._fresh(entry, record, ago)
-        if not record.device.remembers:
+        fresh = self._fresh(entry, variable, ago)
+        if not variable.device.remembers:
             return fresh
-        past = self._naming.read("variables", self._kept(entry, record, ago), ago)
+        past = self._naming.read("variables", self._kept(entry, variable, ago), ago)
         return self._unless_first(fresh, past)
 
     def _unless_first(self, first: Value, past: Value) -> Value:
         """A value of the past; another one at the beginning of an episode, which has no past."""
         return past if self._are_filled else where(self._naming.step_count == 0, first, past)
 
-    def _fresh(self, entry: Entry, record: Record, ago: int) -> Value:
+    def _fresh(self, entry: Entry, variable: TaskVariable, ago: int) -> Value:
         """A measurement, whatever was measured before."""
-        name, device = record.alias, record.device
-        value = self._true(entry, name, ago + self._naming.delay_of(record))
+        name, device = variable.alias, variable.device
+        value = self._true(entry, name, ago + self._naming.delay_of(variable))
         return device.distorted(value, self._naming.step_count - ago, self._channel(name))
 
     def _channel(self, name: str) -> int:
         return self._naming.channel_of(name)
 
-    def _kept(self, entry: Entry, record: Record, ago: int) -> str:
+    def _kept(self, entry: Entry, variable: TaskVariable, ago: int) -> str:
         """The variable with what a sensor with a memory has given, the latest first."""
-        name, variable = record.alias, f"measured {record.alias}"
-        naming, fill = self._naming, self._fresh(entry, record, 1)
+        name, kept = variable.alias, f"measured {variable.alias}"
+        naming, fill = self._naming, self._fresh(entry, variable, 1)
         length = max(ago + 1, self._measured[name].length if name in self._measured else 0)
-        first = self._fresh(entry, record, 0)
+        first = self._fresh(entry, variable, 0)
         is_first = naming.step_count == naming.first_step
-        before = where(is_first, fill, naming.read("variables", variable, 0))
+        before = where(is_first, fill, naming.read("variables", kept, 0))
         channel = self._channel(name)
-        now = record.device.following(first, before, naming.step_count, channel, self._time_step)
-        self._measured[name] = History(name, variable, length, now, fill, first)
-        return variable
+        now = variable.device.following(first, before, naming.step_count, channel, self._time_step)
+        self._measured[name] = History(name, kept, length, now, fill, first)
+        return kept
 
     @property
     def memories(self) -> list[History]:
@@ -268,24 +279,27 @@ class _Past:
 
 def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
     for entry, name in declared.observed:
-        yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
+        with entry.noting():
+            yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
 
 
 def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
     for entry in _forecasts_in(declared):
-        step = entry.value.get("step", time_step)
-        horizon = entry.child("horizon")
-        count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
+        step, count = entry.value.get("step", time_step), 1
+        with entry.child("horizon").noting():
+            horizon = entry.required("horizon")
+            count = steps_in(horizon, horizon.value, step, _MOST_VALUES)
         error = _error_of(entry.child("error").value)
         for channel, one in enumerate(entry.child("of").elements(), _CHANNELS_OF_FORECASTS):
-            name = one.value
-            for index in range(1, count + 1):
-                ahead = index * step
-                value = naming.forecast(one, name, ahead)
-                if error is not None:
-                    later = naming.step_count + round(ahead / time_step)
-                    value = error.added(value, index / count, later, channel)
-                yield Seen(one, name, value, *declared.limits_of(name), f"[+{ahead:g} s]")
+            with one.noting():
+                for index in range(1, count + 1):
+                    ahead = index * step
+                    value = naming.forecast(one, one.value, ahead)
+                    if error is not None:
+                        later = naming.step_count + nearest_steps(ahead, time_step)
+                        value = error.added(value, index / count, later, channel)
+                    limits = declared.limits_of(one.value)
+                    yield Seen(one, one.value, value, *limits, f"[+{ahead:g} s]")
 
 
 class ForecastError(NamedTuple):

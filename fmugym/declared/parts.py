@@ -69,19 +69,19 @@ class Derived:
 
 def read_memory(entry: Entry) -> Memory:
     """Read a value that the task remembers."""
-    table = entry.value
-    return Memory(entry, table["start"], table.get("update"), read_limits(entry))
+    start = entry.required("start").value
+    return Memory(entry, start, entry.value.get("update"), read_limits(entry))
 
 
 def read_derived(entry: Entry) -> Derived:
     """Read a named expression."""
-    return Derived(entry, entry.value["expr"], read_limits(entry))
+    return Derived(entry, entry.required("expr").value, read_limits(entry))
 
 
 def read_term(entry: Entry) -> Term:
     """Read a reward or a cost."""
-    table = entry.value
-    return Term(entry, table["expr"], table.get("weight", 1.0), table.get("limit"))
+    expression, table = entry.required("expr").value, entry.value
+    return Term(entry, expression, table.get("weight", 1.0), table.get("limit"))
 
 
 def read_limits(entry: Entry) -> Limits:

@@ -14,7 +14,7 @@ from fmugym.declared.declarations import Declarations
 from fmugym.declared.expressions import Expression
 from fmugym.declared.naming import Moment, Naming
 from fmugym.declared.observing import History
-from fmugym.declared.variables import Record
+from fmugym.declared.variables import TaskVariable
 from fmugym.declared.warming import signals_of
 from fmugym.distributions import Choice, is_distribution
 from fmugym.errors import shown
@@ -53,7 +53,7 @@ class Pilot(NamedTuple):
     """A controller and its action.
 
     Attributes:
-        record: The variable that it writes.
+        variable: The variable that it writes.
         place: The place of its action.
         controller: Chooses the value, in the unit of the task.
         names: What it measures.
@@ -65,7 +65,7 @@ class Pilot(NamedTuple):
         is_physical: Whether actions are values in the unit of the task.
     """
 
-    record: Record
+    variable: TaskVariable
     place: int
     controller: Controller
     names: tuple[str, ...]
@@ -81,7 +81,7 @@ class Pilot(NamedTuple):
         Raises:
             ConfigError: If the controller does not fit the action.
         """
-        low, high = self.record.range
+        low, high = self.variable.range
         space = spaces.Box(np.float32(low), np.float32(high), (1,), np.float32)
         self.controller.bind(_Many(count, space, time_step), self.names)
 
@@ -90,12 +90,12 @@ class Pilot(NamedTuple):
         value = self._decided(env)
         if self.is_physical:
             return value
-        if self.record.levels:
-            order = np.argsort(self.record.levels)  # the lower of two levels counts as nearer
-            distances = np.abs(np.array(self.record.levels)[order, None] - value)
+        if self.variable.levels:
+            order = np.argsort(self.variable.levels)  # the lower of two levels counts as nearer
+            distances = np.abs(np.array(self.variable.levels)[order, None] - value)
             return order[distances.argmin(axis=0)]
         if self.present is not None:
-            value = np.clip(value - self.present(env), -self.record.delta, self.record.delta)
+            value = np.clip(value - self.present(env), -self.variable.delta, self.variable.delta)
         return self._rescaled(value)
 
     def _decided(self, env: Any) -> Any:
@@ -104,17 +104,19 @@ class Pilot(NamedTuple):
 
         one: Any = self.controller
         if isinstance(one, Schedule):
-            return np.clip(one.at(self.clock(env)), self.record.low, self.record.high)
+            return np.clip(one.at(self.clock(env)), self.variable.low, self.variable.high)
         rows = np.empty((len(env.step_count), len(self.names)), np.float32)
         for place, signal in enumerate(self.signals(env)):
             rows[:, place] = signal
         return one.act(rows)[:, 0].astype(np.float64)
 
     def _rescaled(self, value: Any) -> Any:
-        record = self.record
+        variable = self.variable
         if not self.rescales:
             return value
-        low, high = (-record.delta, record.delta) if record.delta else (record.low, record.high)
+        low, high = (
+            (-variable.delta, variable.delta) if variable.delta else (variable.low, variable.high)
+        )
         return (value - (low + high) / 2) / ((high - low) / 2)
 
 
@@ -163,7 +165,7 @@ class DeclaredWarmUp(WarmUp):
         self.writes, self.caches = writes, caches
         graph, roots = values[0].graph, [value.node for value in values]
         self.depends_on = variables_in([graph.nodes[number] for number in graph.needed(roots)])
-        told = [repr((p.record.alias, type(p.controller), vars(p.controller))) for p in pilots]
+        told = [repr((p.variable.alias, type(p.controller), vars(p.controller))) for p in pilots]
         content = repr((steps, time_step, told, _described(graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()
         self.begin(1)  # which finds mistakes
@@ -223,7 +225,7 @@ class WarmUpMaker:
             ConfigError: If a controller does not fit, or states cannot be kept.
         """
         table = self._declared.warm_up
-        pilots = [self._pilot(record) for record in self._declared.actions]
+        pilots = [self._pilot(variable) for variable in self._declared.actions]
         kept = [value for history in histories for value in (history.now, history.fill)]
         signals = [self._signal(name) for name in table.signals()]
         with table.entry.placing():
@@ -256,15 +258,15 @@ class WarmUpMaker:
                     "'cache', or draw from a list of values"
                 )
 
-    def _pilot(self, record: Record) -> Pilot | None:
-        controller = self._declared.warm_up.controllers.get(record.alias)
+    def _pilot(self, variable: TaskVariable) -> Pilot | None:
+        controller = self._declared.warm_up.controllers.get(variable.alias)
         if controller is None:
             return None
         names = signals_of(controller)
-        present = function_of(self._naming.present(record)) if record.delta else None
+        present = function_of(self._naming.present(variable)) if variable.delta else None
         return Pilot(
-            record,
-            self._declared.actions.index(record),
+            variable,
+            self._declared.actions.index(variable),
             controller,
             tuple(names),
             function_of(tuple(map(self._signal, names))),

@@ -9,10 +9,26 @@ from typing import Any
 from fmugym.checks import check_mapping, check_number, number_of
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
+from fmugym.declared.mistakes import ConsequenceError
 from fmugym.distributions import as_distribution, is_distribution
 from fmugym.pool.spec import whole_number_of_steps
 
-__all__ = ["finite", "number", "number_or_distribution", "steps_in"]
+__all__ = ["finite", "nearest_steps", "number", "number_or_distribution", "steps_in"]
+
+
+def nearest_steps(length: float, step: float) -> int:
+    """The number of steps that is nearest to a duration.
+
+    Raises:
+        ConsequenceError: If the step is not a number, because the task has a mistake there.
+    """
+    _require_known(step)
+    return round(length / step)
+
+
+def _require_known(step: float) -> None:
+    if math.isnan(step):
+        raise ConsequenceError("the time step is not known")
 
 
 def steps_in(entry: Entry, length: float, step: float, most: float = math.inf) -> int:
@@ -27,6 +43,7 @@ def steps_in(entry: Entry, length: float, step: float, most: float = math.inf) -
     Raises:
         ConfigError: If it is no positive multiple of the step, or there are more.
     """
+    _require_known(step)
     count = whole_number_of_steps(length, step) if step > 0 else None
     if not count:
         raise entry.error(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import cached_property, partial, reduce
@@ -22,8 +23,9 @@ from fmugym.declared.configuring import (
 )
 from fmugym.declared.declarations import Declarations
 from fmugym.declared.devices import NOISE
-from fmugym.declared.entries import gathered
-from fmugym.declared.kpis import kpi_name
+from fmugym.declared.entries import Entry
+from fmugym.declared.expressions import Expression
+from fmugym.declared.kpis import Kpi, kpi_name
 from fmugym.declared.mathematics import minimum
 from fmugym.declared.named import named_values
 from fmugym.declared.naming import Moment, Naming, switch_names
@@ -43,7 +45,7 @@ from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
-from fmugym.declared.variables import Record, inverted, is_plain
+from fmugym.declared.variables import TaskVariable, inverted, is_plain
 from fmugym.distributions import is_distribution
 from fmugym.errors import shown
 from fmugym.task.future import Future
@@ -65,6 +67,7 @@ class ResolvedTask:
 
     Args:
         task: The task.
+        root: The table of all its keys, with the mistakes that are known already.
         description: The model description of its FMU.
         needs_reward: Whether the task must say a reward; a class may have one of its own.
 
@@ -79,24 +82,35 @@ class ResolvedTask:
         unphysical_keys: The keys for which observations or actions are not in the task's units.
 
     Raises:
-        ConfigError: If the task does not fit the FMU, or contradicts itself. The text says where.
+        ConfigError: If the task has mistakes, does not fit the FMU, or contradicts itself. The text
+            tells all of that, and says where.
     """
 
     def __init__(
-        self, task: Task, description: ModelDescription, needs_reward: bool = True
+        self, task: Task, root: Entry, description: ModelDescription, needs_reward: bool = True
     ) -> None:
-        self._task, self._root = task, task.root
-        self._declared = declared = Declarations.read(task.root, description, task.is_physical)
-        if needs_reward and not declared.rewards:
-            raise task.root.error('the task has no reward; say one, for example: reward = "1"')
-        self._time_step = time_step_of(task.root, description)
-        self._warm_steps = self._steps_of_warm_up()
-        self._naming = Naming(declared, self._time_step, self._warm_steps)
-        gathered(lambda make: make(), self._makers())
-        self._kept = histories(declared, self._naming, self._time_step)
-        self._seen, self._sensors = observed_values(
-            declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
-        )
+        self._task, self._root, self._time_step, self._warm_steps = task, root, math.nan, 0
+        self._declared = declared = Declarations.read(root, description, task.is_physical)
+        with root.child("reward").noting():
+            if needs_reward and not declared.rewards:
+                text = 'the task has no reward; say one, for example: reward = "1"'
+                raise root.lack(text, "reward")
+        with root.child("time_step").noting():
+            self._time_step = time_step_of(root, description)
+        with declared.warm_up.entry.noting():
+            self._warm_steps = self._steps_of_warm_up()
+        with root.noting():
+            self._naming = Naming(declared, self._time_step, self._warm_steps)
+            self._read_observations()
+            self._find_mistakes()
+        root.mistakes.require_none()
+        with root.noting():
+            self._make()
+        root.mistakes.require_none()
+
+    def _make(self) -> None:
+        """Make what the attributes are."""
+        declared = self._declared
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
@@ -128,15 +142,48 @@ class ResolvedTask:
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
-    def _makers(self) -> Iterator[Callable[[], Any]]:
-        """Functions that evaluate each expression, so that one error tells all mistakes."""
+    def _read_observations(self) -> None:
+        self._kept = histories(self._declared, self._naming, self._time_step)
+        self._seen, self._sensors = observed_values(
+            self._declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
+        )
+
+    def _find_mistakes(self) -> None:
+        """Evaluate everything once, so that one error tells all mistakes."""
+        for entry, make in self._makers():
+            with entry.noting():
+                make()
+
+    def _makers(self) -> Iterator[tuple[Entry, Callable[[], Any]]]:
         declared = self._declared
-        for name in declared.derived:
-            yield partial(self._naming.value_of, name, Moment.JUDGED)
-        for name, term in {**declared.costs, **declared.rewards}.items():
-            yield partial(self._terms, {name: term})
+        for entry, expression, moment in self._plain_expressions():
+            yield entry, partial(self._naming.value, entry, expression, moment)
+        for name, one in declared.derived.items():
+            yield one.entry, partial(self._naming.value_of, name, Moment.JUDGED)
+        for term in (*declared.rewards.values(), *declared.costs.values()):
+            yield term.entry, partial(self._terms, {"": term})
         for name in declared.flags:
-            yield partial(self._condition, name)
+            yield self._root.child(name), partial(self._condition, name)
+        for kpi in declared.kpis.values():
+            yield kpi.entry, partial(self._kpi_value, kpi)
+        yield self._root, partial(times_of, declared, self._time_step)
+        yield (
+            self._root.child("clock"),
+            partial(clock_of, declared, self._time_step, self._warm_steps),
+        )
+        for seen in self._seen:
+            yield seen.entry, partial(self._in_form, seen)
+
+    def _plain_expressions(self) -> Iterator[tuple[Entry, Expression, Moment]]:
+        """Expressions that are used as they are, where they stand, and when they are evaluated."""
+        for memory in self._declared.memory.values():
+            if memory.update is not None:
+                yield memory.entry, memory.update, Moment.AFTER
+        for name, (_, expression) in self._declared.inputs.items():
+            yield self._root.child("inputs").child(name), expression, Moment.BEFORE
+        for name in self._declared.warm_up.signals():
+            entry = self._declared.warm_up.entry.child("controller")
+            yield entry, Expression.parse(name), Moment.SEEN
 
     # The warm-up.
 
@@ -161,16 +208,17 @@ class ResolvedTask:
     # The config.
 
     def _make_config(self) -> dict[str, Any]:
-        declared, records = self._declared, self._declared.records
+        declared, variables = self._declared, self._declared.variables
         return {
             **(self._root.child("config").value or {}),
             "foreign": self._root.child("foreign").value or {},
             **times_of(declared, self._time_step),
-            "model_input_names": records.names_in_fmu(declared.written),
-            "model_output_names": records.names_in_fmu(self._naming.outputs),
-            "monitor_names": records.names_in_fmu(self._naming.monitors),
+            "model_input_names": variables.names_in_fmu(declared.written),
+            "model_output_names": variables.names_in_fmu(self._naming.outputs),
+            "monitor_names": variables.names_in_fmu(self._naming.monitors),
             "model_parameters": {
-                record.fmu_variable.name: value for record, value in declared.parameters.values()
+                variable.fmu_variable.name: value
+                for variable, value in declared.parameters.values()
             },
             "episode_variables": self._variables(),
             "bounds": bounds_of(declared, self._naming),
@@ -182,9 +230,9 @@ class ResolvedTask:
         kept = [*self._kept, *self._sensors]
         histories = {one.variable: np.zeros(one.length) for one in kept}
         switches: dict[str, float] = {}
-        for record in self._switched_actions:
-            state, since = switch_names(record)
-            switches |= {state: self._is_on_at_start(record), since: _LONG_AGO}
+        for variable in self._switched_actions:
+            state, since = switch_names(variable)
+            switches |= {state: self._is_on_at_start(variable), since: _LONG_AGO}
         worst = {WORST: 0.0} if self._has_worst else {}
         kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
         variables = (
@@ -199,7 +247,7 @@ class ResolvedTask:
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
         """The key of noise, which is drawn last."""
-        devices = [record.device for record in self._declared.records.declared()]
+        devices = [variable.device for variable in self._declared.variables.declared()]
         is_noisy = any(one.is_random for one in devices) or has_errors(self._declared)
         if not is_noisy and not self._declared.steps:
             return {}
@@ -209,15 +257,15 @@ class ResolvedTask:
         return {NOISE: NoiseKey(draws=not draws)}
 
     @property
-    def _switched_actions(self) -> list[Record]:
+    def _switched_actions(self) -> list[TaskVariable]:
         """The actions with a least time on or off."""
-        return [record for record in self._declared.actions if record.is_switched]
+        return [variable for variable in self._declared.actions if variable.is_switched]
 
-    def _is_on_at_start(self, record: Record) -> float:
-        own = 0.0 if record.variable is None else record.variable.start_number
-        _, start = self._declared.parameters.get(record.alias, (record, own))
+    def _is_on_at_start(self, variable: TaskVariable) -> float:
+        own = 0.0 if variable.in_fmu is None else variable.in_fmu.start_number
+        _, start = self._declared.parameters.get(variable.alias, (variable, own))
         if is_distribution(start):
-            raise record.entry.error(f"the start value of {record.alias!r} must not be drawn")
+            raise variable.entry.error(f"the start value of {variable.alias!r} must not be drawn")
         return float(start != 0)
 
     @cached_property
@@ -244,17 +292,19 @@ class ResolvedTask:
 
     def _action_space(self) -> spaces.Space[Any] | None:
         """The action space; None if it is that of the inputs as they are."""
-        records = self._declared.actions
-        are_inputs = all(r.variable is not None and is_plain(r) for r in records)
+        variables = self._declared.actions
+        are_inputs = all(
+            variable.in_fmu is not None and is_plain(variable) for variable in variables
+        )
         rescales = self._declared.rescales
         if are_inputs and not self._declared.inputs and not rescales:
             return None
         if self._declared.is_physical:
-            return _box([record.range for record in records])
-        if not records[0].levels:
-            limits = [(-r.delta, r.delta) if r.delta else r.range for r in records]
-            return _box([(-1.0, 1.0)] * len(records) if rescales else limits)
-        counts = [len(record.levels) for record in records]
+            return _box([variable.range for variable in variables])
+        if not variables[0].levels:
+            limits = [(-r.delta, r.delta) if r.delta else r.range for r in variables]
+            return _box([(-1.0, 1.0)] * len(variables) if rescales else limits)
+        counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 
     def _inputs(self) -> Hook:
@@ -270,16 +320,16 @@ class ResolvedTask:
                 for all.
         """
         declared, values = self._declared, list[Value]()
-        for record in declared.actions:
-            if record.variable is None:
+        for variable in declared.actions:
+            if variable.in_fmu is None:
                 continue
-            value = inverted(record.conversion, self._naming.input(record))
-            is_kept = acting is not None and record.alias not in acting
+            value = inverted(variable.conversion, self._naming.input(variable))
+            is_kept = acting is not None and variable.alias not in acting
             values.append(self._naming.read("inputs", len(values)) if is_kept else value)
-        for name, (record, expression) in declared.inputs.items():
+        for name, (variable, expression) in declared.inputs.items():
             entry = self._root.child("inputs").child(name)
             value = self._naming.value(entry, expression, Moment.BEFORE).number
-            values.append(inverted(record.conversion, value))
+            values.append(inverted(variable.conversion, value))
         if not values:
             raise declared.agent("actions").error(
                 "the actions write no input of the FMU: use them in expressions under [inputs]"
@@ -288,11 +338,11 @@ class ResolvedTask:
 
     def _action_masks(self) -> Hook | None:
         naming, values = self._naming, list[Value]()
-        for record in self._declared.actions:
-            for level in map(naming.constant, record.levels):
-                is_switched = record.is_switched
+        for variable in self._declared.actions:
+            for level in map(naming.constant, variable.levels):
+                is_switched = variable.is_switched
                 values.append(
-                    naming.blocked(record, level) ^ True if is_switched else naming.constant(True)
+                    naming.blocked(variable, level) ^ True if is_switched else naming.constant(True)
                 )
         if not values:
             return None
@@ -301,11 +351,11 @@ class ResolvedTask:
 
     def _observation_space(self) -> spaces.Space[Any] | None:
         """The observation space; None if it is that of the outputs as they are."""
-        names, records = [seen.name for seen in self._seen], self._declared.records
+        names, variables = [seen.name for seen in self._seen], self._declared.variables
         if (
             self._declared.normalization is None
             and names == self._naming.outputs
-            and all(is_plain(records[name]) for name in names)
+            and all(is_plain(variables[name]) for name in names)
         ):
             return None
         return _box([(seen.low, seen.high) for seen in self._normalized])
@@ -313,13 +363,15 @@ class ResolvedTask:
     @cached_property
     def _normalized(self) -> list[Seen]:
         """What the agent observes, in the form of its observations."""
-        declared = self._declared
-        match declared.normalization:
+        return [self._in_form(seen) for seen in self._seen]
+
+    def _in_form(self, seen: Seen) -> Seen:
+        match self._declared.normalization:
             case "limits":
-                return [scaled(seen) for seen in self._seen]
+                return scaled(seen)
             case "nominal":
-                return [normalized(seen, declared.nominal_of(seen.name)) for seen in self._seen]
-        return self._seen
+                return normalized(seen, self._declared.nominal_of(seen.name))
+        return seen
 
     def _observation(self) -> Hook:
         values = function_of([seen.value for seen in self._normalized])
@@ -366,8 +418,8 @@ class ResolvedTask:
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""
         values: dict[str, Value] = {}
-        for record in self._switched_actions:
-            values |= zip(switch_names(record), self._naming.switched(record), strict=True)
+        for variable in self._switched_actions:
+            values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
         return values
 
     def _updates_of_worst(self) -> list[Hook]:
@@ -378,32 +430,43 @@ class ResolvedTask:
         return self._assignments({WORST: minimum(worst, reward)})
 
     def _updates_of_kpis(self) -> list[Hook]:
-        terms, values = self._term_values(Moment.UPDATED), dict[str, Value]()
-        for name, kpi in self._declared.kpis.items():
-            if kpi.how is not None:
-                value = self._naming.value(kpi.entry, kpi.expression, Moment.UPDATED, terms)
-                values[kpi_name(name)] = kpi.updated(value.number, self._naming.step_count)
-        return self._assignments(values)
+        step_count, kpis = self._naming.step_count, self._declared.kpis.items()
+        updated = {
+            kpi_name(name): kpi.updated(self._kpi_value(kpi), step_count)
+            for name, kpi in kpis
+            if kpi.how is not None
+        }
+        return self._assignments(updated)
+
+    def _kpi_value(self, kpi: Kpi) -> Value:
+        """What a figure is made of in a step."""
+        moment = Moment.JUDGED if kpi.how is None else Moment.UPDATED
+        names = self._term_values(moment) | (self._known_kpis() if kpi.how is None else {})
+        return self._naming.value(kpi.entry, kpi.expression, moment, names).number
+
+    def _known_kpis(self) -> dict[str, Value]:
+        """The figures that are no expressions of others, by name."""
+        kpis, step_count = self._declared.kpis, self._naming.step_count
+        return {n: kpi.present(step_count) for n, kpi in kpis.items() if kpi.how is not None}
 
     def _kpi_values(self) -> dict[str, Value]:
         """The figures of the episode until now."""
-        kpis, step_count = self._declared.kpis, self._naming.step_count
-        known = {name: kpi.present(step_count) for name, kpi in kpis.items() if kpi.how is not None}
-        names = self._term_values(Moment.JUDGED) | known
-        others = {
-            name: self._naming.value(kpi.entry, kpi.expression, Moment.JUDGED, names).number
-            for name, kpi in kpis.items()
-            if kpi.how is None
+        known = self._known_kpis()
+        return {
+            name: known[name] if name in known else self._kpi_value(kpi)
+            for name, kpi in self._declared.kpis.items()
         }
-        return {name: (known | others)[name] for name in kpis}
 
     def _term_values(self, moment: Moment) -> dict[str, Value]:
         """Rewards and costs by their names, for the figures that use them."""
         declared = self._declared
         if not declared.kpis:
             return {}
-        terms = {**declared.rewards, **declared.costs}
-        return {name: value for name, value in self._terms(terms, moment).items() if name}
+        values: dict[str, Value] = {}
+        for name, term in {**declared.rewards, **declared.costs}.items():
+            with term.entry.noting():
+                values |= self._terms({name: term}, moment) if name else {}
+        return values
 
     def _updates_of_memory(self) -> list[Hook]:
         """All values of the memory are computed before one of them is written."""

@@ -41,8 +41,11 @@ class Scenario(NamedTuple):
 
 def read_scenarios(section: Entry) -> dict[str, Scenario]:
     """Read the scenarios of a task."""
-    tables = section.value or {}
-    return {name: Scenario(one["start"], one["length"]) for name, one in tables.items()}
+    found = {}
+    for name, entry in section.items().items():
+        with entry.noting():
+            found[name] = Scenario(entry.required("start").value, entry.required("length").value)
+    return found
 
 
 def read_begin(
@@ -76,7 +79,7 @@ def read_begin(
 
 def _starts(entry: Entry) -> Iterator[float]:
     """The possible beginnings in a season, which may go over the turn of the year."""
-    first, last, step = (entry.value[key] for key in ("from", "to", "step"))
+    first, last, step = (entry.required(key).value for key in ("from", "to", "step"))
     last += _YEAR if last < first else 0.0
     if (last - first) / step > _MOST_STARTS:
         raise entry.error(
@@ -91,9 +94,9 @@ def _excluded(entry: Entry, scenarios: Mapping[str, Scenario]) -> list[Scenario]
     if list(names) == ["scenarios"]:
         return list(scenarios.values())
     for name in names:
-        if name not in scenarios:
+        if name not in scenarios and not entry.mistakes.explain(("scenarios", name)):
             raise entry.child("exclude").error(unknown_name("scenario", name, scenarios))
-    return [scenarios[name] for name in names]
+    return [scenarios[name] for name in names if name in scenarios]
 
 
 def held_out_times(root: Entry) -> list[Scenario]:

@@ -113,7 +113,8 @@ def read_data(entry: Entry) -> Series:
     """
     table = entry.value
     if ("file" in table) == ("values" in table):
-        raise entry.error("give either 'file' and 'column', or 'values' and 'step'")
+        text = "give either 'file' and 'column', or 'values' and 'step'"
+        raise entry.lack(text, "file", "values")
     is_stepped = table["interpolation"] == "previous"
     rows = _rows_of_list(entry) if "values" in table else _rows_of_file(entry, is_stepped)
     times, values, period = rows
@@ -144,7 +145,8 @@ def _rows_of_list(entry: Entry) -> _Rows:
     if not len(values):
         raise entry.error("expected at least one value")
     if (times is None) == (step is None):
-        raise entry.error("give either the 'step' between the values, or their 'times'")
+        text = "give either the 'step' between the values, or their 'times'"
+        raise entry.lack(text, "step", "times")
     if times is None:
         return _even_times(step, len(values)), values, None
     if len(times) != len(values):
@@ -287,10 +289,8 @@ def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
     usual = next((known[word] for word in _NAMES_OF_TIME if word in known), None)
     column: str | None = usual if name.value is None else name.value
     if column is None:
-        raise entry.error(
-            "name the column with the times as 'time', or give the 'step' between rows; there are: "
-            + ", ".join(map(repr, rows))
-        )
+        text = "name the column with the times as 'time', or give the 'step' between rows"
+        raise entry.lack(f"{text}; there are: {', '.join(map(repr, rows))}", "time", "step")
     return _seconds(name, rows[column])
 
 
@@ -341,7 +341,7 @@ def read_schedule(point: Entry) -> Series:
     entry = point.child("schedule")
     rows = sorted((_time_of_day(one), one.value) for one in entry.items().values())
     if not rows:
-        raise entry.error('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
+        raise entry.lack('expected times and values, such as { "06:00" = 21, "22:00" = 17 }')
     if rows[0][0] > 0:  # what holds at midnight began on the day before
         rows.insert(0, (0.0, rows[-1][1]))
     times, values = np.array(rows).T

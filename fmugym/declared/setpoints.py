@@ -9,17 +9,17 @@ import numpy as np
 
 from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import Expression
-from fmugym.declared.format import SETPOINT
+from fmugym.declared.format import RAMP, SETPOINT, SINE
 from fmugym.declared.parts import Derived, Limits, Memory, read_limits
 from fmugym.declared.series import Series, read_schedule
 
 __all__ = ["Deviation", "SetPoints", "Steps"]
 
 _CURVES: Final = {
-    "ramp": "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)",
-    "sine": "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})",
+    "ramp": (RAMP, "{from} + ({to} - {from}) * clip((elapsed - {begin}) / {duration}, 0, 1)"),
+    "sine": (SINE, "{mean} + {amplitude} * sin(2 * pi * elapsed / {period} + {phase})"),
 }
-"""Formulas of set points that follow a curve."""
+"""The keys and formulas of set points that follow a curve."""
 
 _UNLIMITED: Final = (-np.inf, np.inf)
 
@@ -75,7 +75,9 @@ class SetPoints:
 
     def add(self, entry: Entry) -> None:
         """Add a set point."""
-        self._add(entry, next(kind for kind in SETPOINT.one_of if kind in entry.value))
+        with entry.noting():
+            given = (kind for kind in SETPOINT.one_of if kind in entry.value)
+            self._add(entry, next(given, SETPOINT.short))
         of = entry.child("of")
         if of.value is not None:
             name, deviation = f"{entry.name}_error", Deviation(entry.name, of.value)
@@ -87,9 +89,8 @@ class SetPoints:
     def _add(self, entry: Entry, kind: str) -> None:
         match kind:
             case "value":
-                self.memory[entry.name] = Memory(
-                    entry, entry.value["value"], None, read_limits(entry)
-                )
+                value = entry.required("value").value
+                self.memory[entry.name] = Memory(entry, value, None, read_limits(entry))
             case "schedule":
                 self.series[entry.name] = read_schedule(entry)
             case "steps":
@@ -103,14 +104,16 @@ class SetPoints:
 
     def _add_curve(self, entry: Entry, kind: str) -> None:
         """Add a curve over the time since the reset; its numbers may be drawn in each episode."""
-        numbers = entry.child(kind).items()
+        curve, (table, formula) = entry.child(kind), _CURVES[kind]
+        numbers = {key: curve.required(key) for key in table.keys}
         names = {key: f"{entry.name}_{key}" for key in numbers}
         for key, one in numbers.items():
             self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
-        expression = Expression.parse(_CURVES[kind].format(**names))
+        expression = Expression.parse(formula.format(**names))
         self.derived[entry.name] = Derived(entry, expression, read_limits(entry))
 
 
 def _steps(entry: Entry, number_of_steps: int) -> Steps:
-    low, high, every = (entry.value["steps"][key] for key in ("low", "high", "every"))
+    steps = entry.child("steps")
+    low, high, every = (steps.required(key).value for key in ("low", "high", "every"))
     return Steps(entry, (low, high), every, _CHANNELS_OF_STEPS + number_of_steps)

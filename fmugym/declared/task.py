@@ -22,8 +22,8 @@ from fmugym.declared.format import TASK, VERSION
 from fmugym.declared.seasons import read_scenarios, scenario_of
 from fmugym.declared.writing import as_toml, revised
 from fmugym.distributions import Choice, LogUniform, Normal, Uniform
-from fmugym.errors import ConfigError, TaskError, reason, shown, unknown_name
-from fmugym.keys import Entries, checked, found_mistakes, with_paths
+from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.keys import Entries, Mistake, checked, found_mistakes, with_paths
 from fmugym.retired import grouped
 from fmugym.signals import ordinary
 
@@ -68,11 +68,18 @@ class Task:
         Raises:
             ConfigError: If it is none of these, or as ``read`` and ``from_dict``.
         """
+        return cls.draft(config)._checked()
+
+    @classmethod
+    def draft(cls, config: Any) -> Task:
+        """Do what ``of`` does, but leave mistakes in values to ``root`` or ``begun``.
+
+        Raises:
+            ConfigError: If a file is missing, no TOML, or has an unknown version.
+        """
         if isinstance(config, Task):
             return config
-        if isinstance(config, Mapping):
-            return cls.from_dict(config)
-        return cls.read(config)
+        return cls._of_dict(config) if isinstance(config, Mapping) else cls._of_file(config)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Task:
@@ -84,6 +91,10 @@ class Task:
         Raises:
             ConfigError: If a file is missing, no TOML, or has an unknown key or version.
         """
+        return cls._of_file(path)._checked()
+
+    @classmethod
+    def _of_file(cls, path: str | os.PathLike[str]) -> Task:
         sources = [_read(check_path("the path of a task", path).absolute())]
         while "extends" in sources[-1].document:
             entry = _root(sources[-1]).child("extends")
@@ -107,13 +118,19 @@ class Task:
         Raises:
             ConfigError: For an unknown key, or as ``read`` for a file that it extends.
         """
+        return cls._of_dict(document, folder)._checked()
+
+    @classmethod
+    def _of_dict(
+        cls, document: Mapping[str, Any], folder: str | os.PathLike[str] | None = None
+    ) -> Task:
         start = Path.cwd() if folder is None else check_path("folder", folder).absolute()
         plain: dict[str, Any] = _grouped(_plain(check_mapping("config", document)))
         source = Source(None, start, "", _with_paths(plain, start))
         _check(source)
         if "extends" not in plain:
             return cls._merged((source,))
-        base = cls.read(_root(source).child("extends").path())
+        base = cls._of_file(_root(source).child("extends").path())
         return cls._merged((source, *base.sources))
 
     @classmethod
@@ -122,22 +139,35 @@ class Task:
         for source in reversed(sources):
             own = {k: v for k, v in source.document.items() if k not in _NOT_INHERITED}
             document = _merge(document, own)
-        task = cls(document, sources)
-        task.root  # noqa: B018  # which finds mistakes
-        return task
+        return cls(document, sources)
 
-    @cached_property
+    def _checked(self) -> Task:
+        self.root  # noqa: B018  # which finds mistakes
+        return self
+
+    @property
     def root(self) -> Entry:
         """The table of all keys, whose values are checked, with the places in the files.
 
         Raises:
             TaskError: If values are wrong; it names all of them.
         """
-        values, mistakes = found_mistakes(TASK, self.document)
-        places = [Entry(None, one.keys, self.sources).error(one.text) for one in mistakes]
-        if places:
-            raise TaskError("\n".join(map(str, places)))
-        return Entry(values, (), self.sources)
+        root = self.begun()
+        root.mistakes.require_none()
+        return root
+
+    def begun(self) -> Entry:
+        """Return the table of all keys, as far as their values are right, with the mistakes."""
+        values, mistakes = self._found
+        root = Entry(values, (), self.sources)
+        for keys, text, is_unknown in mistakes:
+            entry = replace(root, value=None, keys=keys)
+            entry.note(entry.error(text), is_unknown)
+        return root
+
+    @cached_property
+    def _found(self) -> tuple[Any, list[Mistake]]:
+        return found_mistakes(TASK, self.document)
 
     def physical(self) -> Task:
         """Return the task as controllers play it: they read and write values in its units.
@@ -157,13 +187,17 @@ class Task:
         Raises:
             ConfigError: If there is no such scenario.
         """
-        section = self.root.child("scenarios")
+        root = self.begun()
+        section = root.child("scenarios")
+        scenarios = read_scenarios(section)
+        if name not in scenarios:
+            root.mistakes.require_none()
         with section.placing():
-            scenario = scenario_of(read_scenarios(section), name)
+            scenario = scenario_of(scenarios, name)
         times = {"clock": scenario.start, "episode_length": scenario.length}
         if "start_time" in self.document and "clock" not in self.document:
             times["start_time"] = scenario.start_after(
-                self.root.child("warm_up").child("period").value or 0.0
+                root.child("warm_up").child("period").value or 0.0
             )
             del times["clock"]
         outside = self.outside or self

@@ -8,7 +8,7 @@ from typing import Any, Final, Never
 
 from fmugym.declared.resolved_task import ResolvedTask
 from fmugym.declared.task import Task
-from fmugym.declared.task_fmu import describe, fmu_of
+from fmugym.declared.task_fmu import described
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, unknown_argument
 from fmugym.task.alone import alone
@@ -63,12 +63,12 @@ class TaskEnv(FMUEnv):
     ) -> None:
         for name in unknown:
             raise unknown_argument(type(self).__name__, name, _ARGUMENTS)
-        self.task = Task.of(config)
-        source = fmu_of(self.task, master)
+        self.task = Task.draft(config)
+        root = self.task.begun()
+        source, description = described(root, master)
         needs_reward = type(self)._reward_policy is FMUEnv._reward_policy
-        description = describe(self.task, source)
-        with self.task.root.placing():
-            resolved = ResolvedTask(self.task, description, needs_reward)
+        with root.placing():
+            resolved = ResolvedTask(self.task, root, description, needs_reward)
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
         self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -13,13 +14,40 @@ from fmugym.archive.description import ModelDescription
 from fmugym.archive.fmu import FMU
 from fmugym.declared.entries import Entry
 from fmugym.declared.task import Task
-from fmugym.errors import FMULoadError, shown, unknown_name
+from fmugym.errors import FMULoadError, TaskError, shown, unknown_name
 from fmugym.keys import table_of
 from fmugym.signals import ordinary
 from fmugym.systems import Component, FMUSystem
+from fmugym.systems.components import OpenComponent
 from fmugym.task.starting import structural_values
 
-__all__ = ["describe", "fmu_of", "system_of"]
+__all__ = ["described", "fmu_of"]
+
+
+def described(root: Entry, master: str | None = None) -> tuple[Path | FMUSystem, ModelDescription]:
+    """Find the FMU or system of a task, and read its description.
+
+    What is wrong with the rest of the task is left in the mistakes of the root.
+
+    Args:
+        root: The table of all keys of the task.
+        master: Of a system, in the place of what its archive or the task says.
+
+    Raises:
+        ConfigError: If there is none; the text tells all mistakes that are known then.
+        FMULoadError: If it cannot be read, and the task has no mistake.
+    """
+    found: list[tuple[Path | FMUSystem, ModelDescription]] = []
+    try:
+        with root.noting():
+            source = _source(root, master)
+            found.append((source, _describe(root, source)))
+    except FMULoadError:
+        root.mistakes.require_none()
+        raise
+    if not found:
+        root.mistakes.require_none()
+    return found[0]
 
 
 def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
@@ -32,12 +60,19 @@ def fmu_of(task: Task, master: str | None = None) -> Path | FMUSystem:
     Raises:
         ConfigError: If the task names none, or there is no bundled FMU of this name.
     """
-    section = task.root.child("system")
+    root = task.root
+    source = _source(root, master)
+    root.mistakes.require_none()
+    return source
+
+
+def _source(root: Entry, master: str | None) -> Path | FMUSystem:
+    section = root.child("system")
     if section.value is None:
-        return _fmu_or_archive(task.root.required("fmu"), master)
-    if task.root.child("fmu").value is not None:
+        return _fmu_or_archive(root.required("fmu"), master)
+    if root.child("fmu").value is not None:
         raise section.error("a task has either 'fmu' or 'system'")
-    return system_of(section, master)
+    return _system(section, master)
 
 
 def _fmu_or_archive(entry: Entry, master: str | None) -> Path | FMUSystem:
@@ -70,36 +105,59 @@ def _path(entry: Entry) -> Path:
     if isinstance(given, str):
         return Path(given)
     with entry.placing():
-        return bundled_fmu(given["bundled"], given["fmi_version"])
+        return bundled_fmu(entry.required("bundled").value, given["fmi_version"])
 
 
-def system_of(section: Entry, master: str | None = None) -> FMUSystem:
-    """Make the system that the section ``[system]`` declares.
-
-    Args:
-        section: The section.
-        master: In the place of what it says.
-
-    Raises:
-        ConfigError: If it has a mistake. The text says where.
-        FMULoadError: If an FMU cannot be read.
-    """
-    named = section.child("components").items()
-    components = {name: _component(entry) for name, entry in named.items()}
+def _system(section: Entry, master: str | None) -> FMUSystem:
+    """Make the system that the section ``[system]`` declares, as far as it has no mistakes."""
+    components: dict[str, Component] = {}
+    for name, entry in section.child("components").items().items():
+        with entry.noting():
+            components[name] = _component(entry)
+    if not components:
+        section.mistakes.require_none()
     states = tuple(map(_version, components.values()))
     key = repr(section.value), states, master
     known = _known.get(key)
     if known is not None:
         return known
-    options = {**section.value, "components": components}
+    connections = [entry.value for entry in section.child("connections").elements()]
+    options = {**section.value, "components": components, "connections": connections}
     if master is not None:
         options["master"] = master
-    with section.placing():
-        system = FMUSystem(**options)
+    try:
+        with section.placing():
+            section.mistakes.require_none()
+            system = FMUSystem(**options)
+    except TaskError:
+        return _sound_part(section, options)
     while len(_known) >= _MOST_KNOWN:
         _known.pop(next(iter(_known)))
     _known[key] = system
     return system
+
+
+def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
+    """Note what is wrong in a system, and make it of the rest."""
+    sound = {**options, "components": {}, "connections": [], "units": {}}
+    for name, component in options["components"].items():
+        for given in (replace(component, start_values={}), component):
+            with section.child("components").child(name).noting():
+                fmu = OpenComponent(name, given).fmu
+                sound["components"][name] = replace(given, fmu=fmu)
+    hidden = section.mistakes.hidden
+    hidden |= section.child("components").items().keys() - sound["components"].keys()
+    for entry in section.child("connections").elements():
+        one, ends = entry.value, {entry.value.source, entry.value.target}
+        with replace(entry, element=f"{one.source} -> {one.target}").noting():
+            if hidden.isdisjoint(name.partition(".")[0] for name in ends):
+                FMUSystem(**{**sound, "connections": [*sound["connections"], one]})
+                sound["connections"].append(one)
+        if one not in sound["connections"]:
+            hidden |= ends
+    with section.child("units").noting():
+        return FMUSystem(**{**sound, "units": options.get("units", {})})
+    return FMUSystem(**sound)
 
 
 _MOST_KNOWN: Final = 16
@@ -127,7 +185,7 @@ def _version(component: Component) -> tuple[str, int, int]:
     return str(path), status.st_mtime_ns, status.st_size
 
 
-def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:
+def _describe(root: Entry, source: Path | FMUSystem) -> ModelDescription:
     """Read the description of the FMU or system of a task, once for all environments of it.
 
     Raises:
@@ -136,19 +194,20 @@ def describe(task: Task, source: Path | FMUSystem) -> ModelDescription:
     """
     if isinstance(source, FMUSystem):
         return source.as_fmu().description
-    entry = task.root.child("fmu")
+    entry = root.child("fmu")
     status = _status(entry, source)
     with _placing_load(entry):
         description = _read_description(source, status.st_mtime_ns, status.st_size)
-    return _resized(description, task.root.child("parameters"))
+    return _resized(description, root.child("parameters"))
 
 
 def _resized(description: ModelDescription, parameters: Entry) -> ModelDescription:
     """Give arrays the sizes that the task gives to structural parameters."""
     given = parameters.value if isinstance(parameters.value, dict) else {}
-    with parameters.placing():
+    with parameters.noting():
         sizes = structural_values(description, given)
         return description.resized(sizes) if sizes else description
+    return description
 
 
 def _status(entry: Entry, path: Path) -> Any:

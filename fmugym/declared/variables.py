@@ -1,10 +1,11 @@
-"""The variables of a task: one record for each, on every path between the task and the FMU."""
+"""The variables of a task, each with its place in the file and its variable of the FMU."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 from fmugym.archive.description import ModelDescription
@@ -12,7 +13,8 @@ from fmugym.archive.units import IDENTITY, Conversion, conversion_between
 from fmugym.archive.variable import Variable
 from fmugym.declared.computed import Value
 from fmugym.declared.devices import IDEAL, Device, read_device
-from fmugym.declared.entries import Entry, gathered
+from fmugym.declared.entries import Entry
+from fmugym.declared.mistakes import ConsequenceError
 from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
@@ -21,8 +23,9 @@ from fmugym.task.roles import input_variable, output_variable
 from fmugym.task.starting import checked, spread
 
 __all__ = [
-    "Record",
-    "Records",
+    "NAMING",
+    "TaskVariable",
+    "TaskVariables",
     "converted",
     "inverted",
     "is_plain",
@@ -30,17 +33,20 @@ __all__ = [
 ]
 
 _PLAIN: Final = ("levels", "delta", "min_on", "min_off")
-"""Keys of a variable that are attributes of its record as they are."""
+"""Keys of a variable that are attributes of it as they are."""
+
+NAMING: Final = ("variables", "memory", "expressions", "data", "setpoints")
+"""The sections whose keys are names in expressions."""
 
 
 @dataclass(frozen=True)
-class Record:
+class TaskVariable:
     """A variable as a task sees it.
 
     Attributes:
         alias: Its name in the task.
         entry: Where it is declared or used first.
-        variable: The FMU's variable, with the bounds and the sampling of the task; None for an
+        in_fmu: The FMU's variable, with the bounds and the sampling of the task; None for an
             action that only expressions read.
         unit: The unit of the task; None if neither the task nor the FMU gives one.
         conversion: From the FMU's unit to that of the task.
@@ -55,7 +61,7 @@ class Record:
 
     alias: str
     entry: Entry
-    variable: Variable | None
+    in_fmu: Variable | None
     unit: str | None
     conversion: Conversion
     low: float
@@ -89,12 +95,12 @@ class Record:
         Raises:
             ConfigError: If there is none.
         """
-        if self.variable is None:
+        if self.in_fmu is None:
             raise self.entry.error(
                 f"{self.alias!r} is no variable of the FMU; give the FMU's name of it: "
                 f'{self.alias} = {{ name = "..." }}'
             )
-        return self.variable
+        return self.in_fmu
 
     @property
     def is_bounded(self) -> bool:
@@ -102,7 +108,7 @@ class Record:
         return math.isfinite(self.low) and math.isfinite(self.high)
 
 
-class Records:
+class TaskVariables:
     """The variables by their aliases; a variable of the FMU needs no declaration to be used.
 
     Args:
@@ -112,38 +118,64 @@ class Records:
 
     def __init__(self, root: Entry, description: ModelDescription) -> None:
         self._root, self._description = root, description
-        declared = root.child("variables").items()
-        read = gathered(self._declared, declared.values())
-        self._records = dict(zip(declared, read, strict=True))
+        self._entries = root.child("variables").items()
+        self._variables: dict[str, TaskVariable] = {}
+        for name, entry in self._entries.items():
+            with entry.noting():
+                self._variables[name] = self._declared(entry)
 
-    def declared(self) -> list[Record]:
+    def declared(self) -> list[TaskVariable]:
         """The variables that the task declares or has used."""
-        return list(self._records.values())
+        return list(self._variables.values())
 
     def names(self) -> list[str]:
         """The aliases, and the names of the FMU's variables."""
-        return list(dict.fromkeys([*self._records, *self._description.variables]))
+        known = [*self._entries, *self._variables, *self._description.variables]
+        return list(dict.fromkeys(known))
 
     def names_in_fmu(self, aliases: Sequence[str]) -> list[str]:
         """The FMU's names of variables."""
         return [self[alias].fmu_variable.name for alias in aliases]
 
-    def get(self, alias: str) -> Record | None:
-        """The record of an alias or of a variable of the FMU; None if there is none."""
-        variable = None if alias in self._records else self._description.find(alias)
-        if variable is not None:
-            entry = Entry(None, ("variables", alias), self._root.sources)
-            self._records[alias] = self._record(alias, entry, variable)
-        return self._records.get(alias)
+    def get(self, alias: str) -> TaskVariable | None:
+        """The variable of an alias or of a variable of the FMU; None if there is none."""
+        known = self._variables.keys() | self._entries.keys()
+        in_fmu = None if alias in known else self._description.find(alias)
+        if in_fmu is not None:
+            entry = self._root.child("variables").child(alias)
+            self._variables[alias] = self._variable(alias, entry, in_fmu)
+        return self._variables.get(alias)
 
-    def __getitem__(self, alias: str) -> Record:
-        record = self.get(alias)
-        if record is None:
+    def __getitem__(self, alias: str) -> TaskVariable:
+        variable = self.get(alias)
+        if variable is None:
+            self.require_unhidden(alias)
             raise unknown_name("variable", alias, self.names())
-        return record
+        return variable
 
-    def find(self, entry: Entry, name: str, role: str, others: Sequence[str] = ()) -> Record:
-        """The record of a name.
+    def require_unhidden(self, name: str) -> None:
+        """Check that no mistake that is known already may be why there is no such name.
+
+        Raises:
+            ConsequenceError: If one may be. It is where the name is declared.
+        """
+        mistakes, sources = self._root.mistakes, self._root.sources
+        sections = filter(partial(self._may_declare, name), (*NAMING, "reward", "costs", "kpis"))
+        places = [(section, name) for section in sections]
+        setpoints = self._root.child("setpoints").items()
+        places += [("setpoints", one) for one in setpoints if name.startswith(f"{one}_")]
+        misspelt = [s.document.get(key) for key in mistakes.unknown_sections for s in sources]
+        is_misspelt = any(isinstance(one, Mapping) and name in one for one in misspelt)
+        is_hidden = not mistakes.hidden.isdisjoint((name, name.partition(".")[0]))
+        if is_hidden or is_misspelt or any(map(mistakes.explain, places)):
+            raise ConsequenceError(f"{name!r} has a mistake where it is declared")
+
+    def _may_declare(self, name: str, section: str) -> bool:
+        value = self._root.child(section).value
+        return value is None or (isinstance(value, Mapping) and name in value)
+
+    def find(self, entry: Entry, name: str, role: str, others: Sequence[str] = ()) -> TaskVariable:
+        """The variable of a name.
 
         Args:
             entry: Where the name stands.
@@ -154,11 +186,12 @@ class Records:
         Raises:
             ConfigError: If there is none, with the nearest name.
         """
-        record = self.get(name)
-        if record is None:
+        variable = self.get(name)
+        if variable is None:
+            self.require_unhidden(name)
             error = unknown_name(role, name, [*others, *self.names()])
             raise entry.error(f"{error}{self._dotted(name, entry.value)}")
-        return record
+        return variable
 
     def _dotted(self, name: str, value: object) -> str:
         """Say what TOML makes of a name with dots, if that explains an unknown name."""
@@ -169,8 +202,8 @@ class Records:
                 return f' (a name with dots stands in quotes: "{name}")'
         return ""
 
-    def input_of(self, entry: Entry, unit: str | None) -> Record:
-        """The record of an input that data are written to, in the unit of the data.
+    def input_of(self, entry: Entry, unit: str | None) -> TaskVariable:
+        """The variable of an input that data are written to, in the unit of the data.
 
         Args:
             entry: The name of the input: an alias, or the FMU's.
@@ -179,25 +212,25 @@ class Records:
         Raises:
             ConfigError: If there is no such input, or the unit does not fit it.
         """
-        record = self.find(entry, entry.value, "input")
-        self.check_input(entry, record)
-        if unit is None or record.variable is None:
-            return record
+        variable = self.find(entry, entry.value, "input")
+        self.check_input(entry, variable)
+        if unit is None or variable.in_fmu is None:
+            return variable
         with entry.placing():
-            own, units = record.variable.unit, self._description.units
-            return replace(record, conversion=conversion_between(own, unit, units))
+            own, units = variable.in_fmu.unit, self._description.units
+            return replace(variable, conversion=conversion_between(own, unit, units))
 
-    def check_input(self, entry: Entry, record: Record) -> None:
+    def check_input(self, entry: Entry, variable: TaskVariable) -> None:
         """Check that a variable can be written before each step; one without the FMU's name can.
 
         Raises:
             ConfigError: If it cannot.
         """
-        if (record.entry.value or {}).get("sample", "last") != "last":
-            raise record.entry.error("'sample' is for variables that are read from the FMU")
-        if record.variable is not None:
+        if (variable.entry.value or {}).get("sample", "last") != "last":
+            raise variable.entry.error("'sample' is for variables that are read from the FMU")
+        if variable.in_fmu is not None:
             with entry.placing():
-                input_variable(self._description, record.fmu_variable.name)
+                input_variable(self._description, variable.fmu_variable.name)
 
     def check_output(self, entry: Entry, name: str) -> None:
         """Check that a variable can be read after each step.
@@ -210,32 +243,34 @@ class Records:
         with entry.placing():
             output_variable(self._description, self[name].fmu_variable.name)
 
-    def _declared(self, entry: Entry) -> Record:
+    def _declared(self, entry: Entry) -> TaskVariable:
         name = entry.child("name")
         if name.value is None:
-            return self._record(entry.name, entry, self._description.find(entry.name))
+            return self._variable(entry.name, entry, self._description.find(entry.name))
+        if self._description.find(name.value) is None:
+            self.require_unhidden(name.value)
         with name.placing():
-            return self._record(entry.name, entry, self._description.variable(name.value))
+            return self._variable(entry.name, entry, self._description.variable(name.value))
 
-    def _record(self, alias: str, entry: Entry, variable: Variable | None) -> Record:
+    def _variable(self, alias: str, entry: Entry, in_fmu: Variable | None) -> TaskVariable:
         given = entry.value or {}
         sample = given.get("sample", "last")
-        own = None if variable is None else variable.unit
+        own = None if in_fmu is None else in_fmu.unit
         if sample == "integral" and own is not None:
             own = f"({own}).s"
         unit = given.get("unit", own)
         with entry.child("unit").placing():
             conversion = conversion_between(own, unit, self._description.units)
-        limited = None if sample == "integral" else variable
+        limited = None if sample == "integral" else in_fmu
         if "delta" in given and "levels" in given:
             raise entry.error("an action has either 'levels' or 'delta'")
         low, high = _limits(entry, limited, conversion)
-        if variable is not None:
+        if in_fmu is not None:
             ends = sorted(map(conversion.inverse, (low, high)))
             bounds = (ends[0], ends[1]) if given.keys() & {"min", "max"} else None
-            variable = replace(variable, bounds=bounds, sampling=sample)
-        return Record(
-            *(alias, entry, variable, unit, conversion, low, high),
+            in_fmu = replace(in_fmu, bounds=bounds, sampling=sample)
+        return TaskVariable(
+            *(alias, entry, in_fmu, unit, conversion, low, high),
             nominal=given.get("nominal", _own_nominal(limited, conversion)),
             device=read_device(entry),
             **{key: given[key] for key in _PLAIN if key in given},
@@ -247,7 +282,7 @@ def _limits(entry: Entry, variable: Variable | None, conversion: Conversion) -> 
     given, (low, high) = entry.value or {}, _own_limits(variable, conversion)
     low, high = given.get("min", low), given.get("max", high)
     if not low < high and given.keys() & {"min", "max"}:
-        raise entry.error(f"min must be below max, got {low} and {high}")
+        raise entry.error(f"min must be below max, got {low:g} and {high:g}")
     return low, high
 
 
@@ -282,50 +317,50 @@ def inverted(conversion: Conversion, value: Value) -> Value:
     return value if conversion.factor == 1.0 else value / conversion.factor
 
 
-def is_plain(record: Record) -> bool:
+def is_plain(variable: TaskVariable) -> bool:
     """Whether the values of the task are those of the FMU."""
-    is_same = record.conversion == IDENTITY and not record.levels
-    return is_same and record.is_direct
+    is_same = variable.conversion == IDENTITY and not variable.levels
+    return is_same and variable.is_direct
 
 
-def start_value(record: Record, entry: Entry) -> Any:
+def start_value(variable: TaskVariable, entry: Entry) -> Any:
     """The value of a parameter: a number or distribution in the unit of the FMU, or a text.
 
     Raises:
         ConfigError: If the variable cannot be set, or the value does not fit it.
     """
-    variable = _settable(record, entry)
-    if variable.shape:
-        return _array_start(variable, entry)
-    value, is_text = entry.value, bool(variable.items) or variable.kind == "string"
+    in_fmu = _settable(variable, entry)
+    if in_fmu.shape:
+        return _array_start(in_fmu, entry)
+    value, is_text = entry.value, bool(in_fmu.items) or in_fmu.kind == "string"
     with entry.placing():
         if not (isinstance(value, str) and is_text):
             value = number_or_distribution(entry.name, value)
-        value = _in_unit_of_fmu(record.conversion, value)
-        if variable.kind == "string":
+        value = _in_unit_of_fmu(variable.conversion, value)
+        if in_fmu.kind == "string":
             return value
-        return within(variable, checked(variable, value))
+        return within(in_fmu, checked(in_fmu, value))
 
 
-def fitted_value(record: Record, entry: Entry, value: Any) -> Any:
+def fitted_value(variable: TaskVariable, entry: Entry, value: Any) -> Any:
     """A distribution of a parameter that is in the unit of the FMU already.
 
     Raises:
         ConfigError: As ``start_value``.
     """
-    variable = _settable(record, entry)
+    in_fmu = _settable(variable, entry)
     with entry.placing():
-        return within(variable, checked(variable, value))
+        return within(in_fmu, checked(in_fmu, value))
 
 
-def _settable(record: Record, entry: Entry) -> Variable:
-    variable = record.fmu_variable
-    if not variable.settable_at_start:
+def _settable(variable: TaskVariable, entry: Entry) -> Variable:
+    in_fmu = variable.fmu_variable
+    if not in_fmu.settable_at_start:
         raise entry.error(
-            f"{variable.name!r} cannot be set at the start of an episode: it is a "
-            f"{variable.variability} {variable.causality}"
+            f"{in_fmu.name!r} cannot be set at the start of an episode: it is a "
+            f"{in_fmu.variability} {in_fmu.causality}"
         )
-    return variable
+    return in_fmu
 
 
 def _array_start(variable: Variable, entry: Entry) -> Any:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from fmugym.checks import check_text
 from fmugym.declared.entries import Entry
-from fmugym.declared.variables import Record
+from fmugym.declared.mistakes import ConsequenceError
+from fmugym.declared.variables import TaskVariable
 from fmugym.errors import shown, unknown_name
 
 if TYPE_CHECKING:
@@ -49,40 +50,31 @@ def signals_of(controller: Controller) -> list[str]:
 
 
 def read_warm_up(
-    root: Entry, actions: Sequence[Record], controlled: Sequence[tuple[str, str]]
+    root: Entry, actions: Sequence[TaskVariable], controlled: Sequence[tuple[str, str]]
 ) -> WarmUpTable:
-    """Read the warm-up of a task.
+    """Read the warm-up of a task, and note its mistakes, such as a controller of no action.
 
     Args:
         root: The task.
         actions: Its actions.
         controlled: What is measured and its set point, in pairs, for a thermostat.
-
-    Raises:
-        ConfigError: If it has no period, or a controller of no action.
     """
-    from fmugym.baselines import MPC
-
     known = _named_controllers(root)
     entry = root.child("warm_up")
     if entry.value is None:
         return WarmUpTable(entry)
-    given = entry.child("controller")
-    entries = {} if given.value is None else _by_action(given, actions)
-    records = {record.alias: record for record in actions}
-    controllers = {
-        name: _thermostat(one, records[name], controlled)
-        if _is_bare_thermostat(one, known)
-        else _controller(one, known)
-        for name, one in entries.items()
-    }
-    for name, one in entries.items():
-        if isinstance(controllers[name], MPC):
-            raise one.error(
-                "MPC plans with copies of the environment, which there are none of in a warm-up; "
-                "take a pid, a hysteresis or a number"
+    controllers: dict[str, Controller] = {}
+    for name, one in _by_action(entry.child("controller"), actions).items():
+        with one.noting():
+            variable = _action_of(one, name, actions)
+            controllers[name] = (
+                _thermostat(one, variable, controlled)
+                if _is_bare_thermostat(one, known)
+                else _acting(one, known)
             )
-    return WarmUpTable(entry, entry.value["period"], controllers, entry.value["cache"])
+    return WarmUpTable(
+        entry, entry.value.get("period", 0.0), controllers, entry.value.get("cache", False)
+    )
 
 
 def _named_controllers(root: Entry) -> dict[str, Entry]:
@@ -91,11 +83,11 @@ def _named_controllers(root: Entry) -> dict[str, Entry]:
 
     known = root.child("controllers").items()
     for one in known.values():
-        if has_range(one.value):
-            with one.placing():
+        with one.noting():
+            if has_range(one.value):
                 search_of(one.value)
-        else:
-            _controller(one, {})
+            else:
+                _controller(one, {})
     return known
 
 
@@ -103,7 +95,9 @@ def _is_bare_thermostat(entry: Entry, known: Mapping[str, Entry]) -> bool:
     return entry.value in THERMOSTATS and entry.value not in known
 
 
-def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, str]]) -> Controller:
+def _thermostat(
+    entry: Entry, variable: TaskVariable, controlled: Sequence[tuple[str, str]]
+) -> Controller:
     """A thermostat whose arguments the task tells: it heats with the highest action.
 
     Raises:
@@ -112,11 +106,13 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
     """
     from fmugym.baselines import Hysteresis
 
-    low, high = record.range
+    low, high = variable.range
     if len(controlled) == 1:
         (of, setpoint), *_ = controlled
         with entry.placing():
             return Hysteresis(of, setpoint, 0.0, below=high, above=low)
+    if any(map(entry.mistakes.explain, [("setpoints",), ("agent", "observations")])):
+        raise ConsequenceError("what is controlled is not known")
     of, setpoint = controlled[0] if controlled else ("T", "21")
     raise entry.error(
         f"{shown(entry.value)} alone needs one set point with the key 'of', and the task has "
@@ -125,16 +121,40 @@ def _thermostat(entry: Entry, record: Record, controlled: Sequence[tuple[str, st
     )
 
 
-def _by_action(entry: Entry, actions: Sequence[Record]) -> dict[str, Entry]:
-    names = [record.alias for record in actions]
-    if isinstance(entry.value, Mapping):
-        for name, one in entry.items().items():
-            if name not in names:
-                raise one.error(unknown_name("action", name, names))
+def _by_action(entry: Entry, actions: Sequence[TaskVariable]) -> dict[str, Entry]:
+    if entry.value is None or isinstance(entry.value, Mapping):
         return entry.items()
-    if len(names) == 1:
-        return {names[0]: entry}
-    raise entry.error(f"name a controller for each action, such as {{ {names[0]} = 0 }}")
+    names = [variable.alias for variable in actions]
+    with entry.noting():
+        _require_actions(entry)
+        if len(names) > 1:
+            raise entry.error(f"name a controller for each action, such as {{ {names[0]} = 0 }}")
+    return dict.fromkeys(names, entry)
+
+
+def _require_actions(entry: Entry) -> None:
+    if entry.mistakes.explain(("agent", "actions")):
+        raise ConsequenceError("the actions are not known")
+
+
+def _action_of(entry: Entry, name: str, actions: Sequence[TaskVariable]) -> TaskVariable:
+    for variable in actions:
+        if variable.alias == name:
+            return variable
+    _require_actions(entry)
+    raise unknown_name("action", name, [variable.alias for variable in actions])
+
+
+def _acting(entry: Entry, known: Mapping[str, Entry]) -> Controller:
+    from fmugym.baselines import MPC
+
+    controller = _controller(entry, known)
+    if isinstance(controller, MPC):
+        raise entry.error(
+            "MPC plans with copies of the environment, which there are none of in a warm-up; "
+            "take a pid, a hysteresis or a number"
+        )
+    return controller
 
 
 def _controller(entry: Entry, known: Mapping[str, Entry]) -> Controller:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.variable import Variable
-from fmugym.errors import SimulationError, printable
+from fmugym.errors import SimulationError, first_of
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.processors import available_processors
 from fmugym.pool.spec import DEFAULT_CALL_TIMEOUT, ISOLATIONS, PoolSpec, ResetMethod
@@ -32,9 +32,6 @@ __all__ = [
 FloatArray = npt.NDArray[np.float64]
 StatusArray = npt.NDArray[np.int8]
 MaskArray = npt.NDArray[np.bool_]
-
-_MOST_NAMES: Final = 5
-"""The most variables that a message names."""
 
 
 Played = tuple[Any, int, bool, MaskArray | None]
@@ -287,10 +284,3 @@ def naming(failure: str, variables: tuple[Variable, ...]) -> str:
     """The words of a failure to read variables, with their names."""
     names = first_of([variable.name for variable in variables])
     return failure.replace("reading variables", f"reading {names}", 1)
-
-
-def first_of(names: Sequence[str]) -> str:
-    """The first of some names for a message, which tells how many more there are."""
-    few = ", ".join(names[:_MOST_NAMES])
-    more = len(names) - _MOST_NAMES
-    return printable(f"{few} and {more} more" if more > 0 else few)

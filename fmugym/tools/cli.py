@@ -145,13 +145,14 @@ def _code_of(arguments: argparse.Namespace) -> int:
     except BrokenPipeError:  # the reader, for example ``head``, has ended
         drop_output()
     except ordinary(FMUGymError, OSError) as error:
-        note(_told(error), "error")
+        for line in _told(error).splitlines():  # a task may have several mistakes
+            note(line, "error")
         return 1
     return 0
 
 
 def _told(error: Exception) -> str:
-    """An error in a line; those of the system without their numbers."""
+    """An error as a text; those of the system without their numbers."""
     if not isinstance(error, OSError):
         return str(error)
     if error.filename is None:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fmugym.errors import ConfigError
-from fmugym.tools.options import require_folder
 
 __all__ = ["Generation", "LinearController", "Training", "show", "write_picture"]
 
@@ -151,16 +150,13 @@ def write_picture(controllers: list[LinearController], seed: int, path: Path) ->
     """Write a PNG file with a row of frames from an episode of each controller.
 
     Raises:
-        ConfigError: If the file exists, its folder does not, or its name has another ending.
+        ConfigError: If its name has another ending.
         OSError: If it cannot be written.
     """
     import pygame
 
     if path.suffix.lower() != ".png":
         raise ConfigError(f"the picture's name must end with .png, not {path.name!r}")
-    require_folder(path)
-    if path.exists():
-        raise ConfigError(f"{str(path)!r} exists; give the name of a new file")
     rows = [_row(controller, seed) for controller in controllers]
     picture = np.concatenate(rows)
     pygame.image.save(pygame.surfarray.make_surface(picture.swapaxes(0, 1)), path)

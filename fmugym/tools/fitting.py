@@ -24,7 +24,7 @@ from fmugym.tools.options import (
     add_task,
     check_numbers,
     note,
-    require_new_task,
+    require_toml,
     say,
     say_json,
     write_extension,
@@ -93,7 +93,7 @@ def _fit(arguments: argparse.Namespace) -> None:
     check_numbers(arguments, "candidates")
     make_env, output = maker_of(arguments.task, None, arguments.master), arguments.output
     if output is not None:
-        require_new_task(output)
+        require_toml(output)
     if arguments.plot is not None:
         require_picture(arguments.plot)
     if not arguments.parameter:

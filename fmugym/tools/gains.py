@@ -19,7 +19,7 @@ from fmugym.tools.options import (
     add_task,
     check_numbers,
     note,
-    require_new_task,
+    require_toml,
     say,
     say_json,
     tell,
@@ -60,7 +60,7 @@ def _tune(arguments: argparse.Namespace) -> None:
     output: Path | None = arguments.output
     if output is not None:
         _require_name(arguments.name)
-        require_new_task(output)
+        require_toml(output)
     found: list[Tuning] = []
     try:
         _search(search, arguments, found)

@@ -40,8 +40,7 @@ __all__ = [
     "only_player",
     "output_of",
     "players_of",
-    "require_folder",
-    "require_new_task",
+    "require_toml",
     "say",
     "say_json",
     "shown_in_any_case",
@@ -160,9 +159,7 @@ def add_master(command: argparse.ArgumentParser) -> None:
     command.add_argument("--master", choices=MASTERS, help=text)
 
 
-def add_episodes(
-    command: argparse.ArgumentParser, episodes: int, seed: int, *, steps: bool = True
-) -> None:
+def add_episodes(command: argparse.ArgumentParser, episodes: int, seed: int) -> None:
     """Add the options for which episodes are played."""
     command.add_argument(
         "--episodes",
@@ -178,14 +175,13 @@ def add_episodes(
         metavar="N",
         help=f"of the first episode, the next have the next; default {seed}",
     )
-    if steps:
-        command.add_argument(
-            "--steps",
-            type=int,
-            default=10_000,
-            metavar="N",
-            help="the most steps of an episode; default 10000",
-        )
+    command.add_argument(
+        "--steps",
+        type=int,
+        default=10_000,
+        metavar="N",
+        help="the most steps of an episode; default 10000",
+    )
 
 
 def add_players(command: argparse.ArgumentParser) -> None:
@@ -316,8 +312,8 @@ def free_outputs(arguments: argparse.Namespace) -> Iterator[None]:
 
 
 def _require_free(path: Path, is_forced: bool) -> None:
-    if path.suffix:
-        require_folder(path)
+    if path.suffix and not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {shown(str(path.parent))}; make it first")
     if _is_replaceable(path) and not is_forced:
         raise ConfigError(f"{path} exists; name a new one, or replace it with --force")
 
@@ -356,28 +352,14 @@ def shown_in_any_case(show: Callable[[], None]) -> Iterator[None]:
     show()
 
 
-def require_folder(path: Path) -> None:
-    """Refuse a file whose folder does not exist, before work is done for it.
+def require_toml(path: Path) -> None:
+    """Refuse a task file with another ending before anything is played for it.
 
     Raises:
-        ConfigError: If there is no such folder.
-    """
-    if not path.parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {shown(str(path.parent))}; make it first")
-
-
-def require_new_task(path: Path) -> None:
-    """Refuse a task file before anything is played for it.
-
-    Raises:
-        ConfigError: If it is no TOML file, or its folder does not exist.
-        FileExistsError: If it exists.
+        ConfigError: If it has one.
     """
     if path.suffix.lower() != ".toml":
         raise ConfigError(f"a task file ends with .toml, got {shown(str(path))}")
-    require_folder(path)
-    if path.exists():
-        raise FileExistsError(f"{path} exists; name a new file")
 
 
 def write_extension(path: Path, target: str, more: Mapping[str, Any]) -> None:

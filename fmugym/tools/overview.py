@@ -15,8 +15,7 @@ from typing import Any, Final
 from fmugym.archive.dependencies import missing_tool, note_on
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
-from fmugym.errors import FMULoadError, plain
-from fmugym.pool.base import first_of
+from fmugym.errors import FMULoadError, first_of, plain
 from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "overview", "start_value", "tables"]

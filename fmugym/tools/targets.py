@@ -59,7 +59,7 @@ def maker_of(
         task = Task.from_dict(tomllib.loads(Proposal(open_model(path)).text()))
         return partial(load, task, **own)
     if path.suffix.lower() == ".toml" or path.is_file():
-        return partial(load, Task.read(path), scenario=scenario, **own)
+        return partial(load, Task.draft(path), scenario=scenario, **own)
     module, separator, name = target.partition(":")
     if separator and name.isidentifier() and "/" not in module:
         if scenario is not None:

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import printable
-from fmugym.pool.base import first_of
+from fmugym.errors import first_of, printable
 from fmugym.pool.bundle import SaveMethod
 from fmugym.pool.spec import PoolSpec, ResetMethod
 from fmugym.pool.wishes import Wishes

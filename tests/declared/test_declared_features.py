@@ -405,8 +405,9 @@ def test_a_variable_may_have_several_names(load):
     assert abs(np.corrcoef(fine, rough)[0, 1]) < 0.6
 
 
-def test_several_names_are_sampled_in_one_way():
+@pytest.mark.parametrize("names", [["q", "mean"], ["mean", "q"]])
+def test_several_names_are_sampled_in_one_way(names):
     variables = BASE["variables"] | {"mean": {"name": "q", "sample": "mean"}}
-    agent = {"actions": ["tau"], "observations": ["q", "mean"]}
-    with pytest.raises(TaskError, match=r"'q' and 'mean' .*'sample'"):
+    agent = {"actions": ["tau"], "observations": names}
+    with pytest.raises(TaskError, match=rf"'{names[0]}' and '{names[1]}' .*'sample'"):
         fmugym.load(BASE | {"variables": variables, "agent": agent})
