@@ -53,7 +53,7 @@ class Axes:
 
     def search(self, population: int, rng: np.random.Generator) -> CMA:
         """A search that begins in the middle."""
-        return CMA(np.full(len(self.ranges), 0.5), _SIGMA, population, rng, largest_sigma=_SIGMA)
+        return CMA(np.full(len(self.ranges), 0.5), _SIGMA, population, rng, growth=1.0)
 
     def numbers(self, places: FloatArray) -> dict[str, FloatArray]:
         """The numbers for places of shape (n, k), each of shape (n,).
@@ -122,7 +122,7 @@ def tune(
     returns: list[float] = []
     with closing(Arena(make_env, candidates * episodes, most_steps)) as arena:
         for _ in range(rounds):
-            _, reached = entrant.play(arena, range(seed, seed + episodes), ())
+            _, reached = entrant.play(arena, range(seed, seed + episodes))
             returns.append(reached)
             best = {name: float(one) for name, one in axes.numbers(entrant.leader).items()}
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))
