@@ -150,6 +150,9 @@ class Arena:
         totals: FloatArray = np.empty(0)
         running = np.arange(len(seeds)) < count
         for _ in range(self._most_steps):
+            count = int(np.count_nonzero(running))
+            if not count:
+                break
             if self.steps + count > self.ceiling:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
             self.steps += count
@@ -163,10 +166,5 @@ class Arena:
             counted: Any = are_all or running  # for all, that takes less time
             for total, value in zip(totals, values, strict=True):
                 np.add(total, value, out=total, where=counted)
-            ended = terminated | truncated
-            if ended.any():
-                running = running & ~ended
-                count = int(np.count_nonzero(running))
-                if not count:
-                    break
+            running = running & ~(terminated | truncated)
         return totals

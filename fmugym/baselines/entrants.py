@@ -32,15 +32,16 @@ class Entrant:
 
     Attributes:
         cma: The search.
-        make: Makes a controller for N environments from their numbers, shape (N, n).
+        make: Makes a controller for N environments from their numbers, shape (N, n). For
+            validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
         then: What enters when this one gains nothing; None for nothing.
         rounds: How many it has had.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
-        best: The best numbers in validation, shape (n,); None before the first one.
-        merit: Their merit.
-        gained: The round in which they were found, or in which something was changed.
+        best: The agent with the best numbers in validation; None before the first one.
+        merit: Its merit.
+        gained: The round in which it was found, or in which something was changed.
         starts: How often the search has started anew.
         agreement: The mean correlation of ranks by two halves of the episodes.
         last_round: The round of the whole search in which it played last.
@@ -109,7 +110,8 @@ class Entrant:
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
         if max(merits) > self.merit:
-            self.merit, self.best, self.gained = max(merits), self.cma.mean.copy(), self.rounds
+            self.merit, self.gained = max(merits), self.rounds
+            self.best = self.make.with_numbers(self.cma.mean)
         self.lead = NO_MERIT
 
 

@@ -46,14 +46,14 @@ class Form:
     Attributes:
         observed: The number of observations; 0 for a network that gives constants.
         acting: The number of outputs.
-        hidden: The widths of the hidden layers, which end in a tanh.
+        hidden: The width of the hidden layer, which ends in a tanh; 0 for none.
         history: Whether the network also sees the last change of each observation, its leaky
             integral, and the last action.
     """
 
     observed: int
     acting: int
-    hidden: tuple[int, ...] = ()
+    hidden: int = 0
     history: bool = False
 
     @property
@@ -64,7 +64,7 @@ class Form:
     @property
     def shapes(self) -> list[tuple[int, int]]:
         """The inputs, the constant one included, and the outputs of each layer."""
-        widths = [self.features, *self.hidden, self.acting]
+        widths = [self.features, *filter(None, [self.hidden]), self.acting]
         return [(before + 1, after) for before, after in itertools.pairwise(widths)]
 
     @property
@@ -140,13 +140,6 @@ class Agent:
     names: Sequence[str] = ()
     actions: str = ""
 
-    @classmethod
-    def constant(cls, name: str, value: float, ranges: Sequence[tuple[float, float]]) -> Self:
-        """The agent that always gives all numbers of the action one value."""
-        low, high = np.transpose(ranges)
-        weights = (2.0 * value - low - high) / (high - low)
-        return cls(name, None, Form(0, len(ranges)), weights)
-
     def __call__(self, rows: FloatArray) -> Policy:
         """The policy with what was missing, shape (n,) or (N, n), to be bound to N environments.
 
@@ -189,14 +182,13 @@ class Agent:
         with reading(f"the agent in {shown(str(folder))} cannot be read"):
             with (folder / AGENT).open("rb") as file, np.load(file, allow_pickle=False) as found:
                 facts = json.loads(str(found["facts"]))
-                arrays = {n: np.asarray(found[n], np.float64) for n in ("weights", "scale")}
-            form = facts["form"]
-            form = form and Form(**form | {"hidden": tuple(form["hidden"])})
-            shapes = [(form.size,), (2, form.features or 1)] if form else [(0,), (2, 1)]
-            has_gaps = not all(np.isfinite(one).all() for one in arrays.values())
-            if has_gaps or [one.shape for one in arrays.values()] != shapes:
-                raise ValueError(f"expected finite numbers in arrays of the shapes {shapes}")
-            return cls(**facts | arrays | {"form": form, "names": tuple(facts["names"])})
+                weights, scale = (np.asarray(found[n], np.float64) for n in ("weights", "scale"))
+            form = facts["form"] and Form(**facts["form"])
+            counts = [form.size, *[form.features or 1] * 2] if form else [0, 1, 1]
+            numbers = [weights, *scale]
+            if [*map(len, numbers)] != counts or not np.isfinite(np.hstack(numbers)).all():
+                raise ValueError(f"expected {counts} finite numbers")
+            return cls(**facts | {"form": form, "weights": weights, "scale": scale})
 
 
 _NO_NETWORK: Final = Agent("")
@@ -285,6 +277,11 @@ class Policy(Controller):
         width = len(self.names)
         return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
 
+    def constant(self, name: str, value: float) -> Agent:
+        """The agent that always gives all elements of the action one value."""
+        weights = self.told([value] * len(self.middle))
+        return Agent(name, None, Form(0, self.acting), weights)
+
     def step(
         self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
     ) -> tuple[list[Any], Memory]:
@@ -300,25 +297,28 @@ class Policy(Controller):
         Returns:
             The elements of the action, and what to keep.
         """
-        features, *kept = self._features(observed, memory)
-        given = None if self.form is None else network(features)
-        if given is None or self.choices:
-            action = list(base if given is None else given)
-        else:
-            action = list(map(_corrected, base, given, self.limits))
-        return action, (*kept, self._told(action)) if kept else ()
+        if self.form is None:
+            return list(base), ()
+        features, *kept = self._features(self.form, observed, memory)
+        action = list(network(features))
+        if not self.choices:
+            action = [
+                limited(limited(one, low, high) + (high - low) / 2 * change, low, high)
+                for one, change, (low, high) in zip(base, action, self.limits, strict=True)
+            ]
+        return action, (*kept, self.told(action)) if kept else ()
 
-    def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
+    def _features(self, form: Form, observed: Any, memory: Memory) -> tuple[Any, ...]:
         """What the network sees, and what it shall see of this step in the next one."""
         if not memory:
-            return (observed[..., : self.form.observed] if self.form else observed,)
+            return (observed[..., : form.observed],)
         last, leaky, told = memory
         is_first = np.isnan(last)
         change = np.where(is_first, 0.0, observed - last)
         leaky = np.where(is_first, observed, leaky + _FADE * (observed - leaky))
         return np.concatenate([observed, change, leaky, told], axis=-1), observed, leaky
 
-    def _told(self, action: Sequence[Any]) -> Any:
+    def told(self, action: Sequence[Any]) -> Any:
         """The action as the network sees it in the next step.
 
         Numbers go from -1 to 1. Of a choice, the chosen element is 1 and the others are 0.
@@ -375,9 +375,3 @@ def require_task(
     if any(told.values()):
         differences = "; ".join(text for text, differs in told.items() if differs)
         raise ConfigError(f"{agent} is for another task: {differences}")
-
-
-def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:
-    """An element of the action: that of the controller, and the change in halves of the range."""
-    low, high = limits
-    return limited(limited(base, low, high) + (high - low) / 2 * change, low, high)

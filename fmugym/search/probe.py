@@ -78,10 +78,9 @@ class Probe:
             limit = env.spec.max_episode_steps if env.spec is not None else None
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
-        declared = task.get("controllers", {})
         agents = [
-            Agent(name, one) if isinstance(one, str) else Agent.constant(name, one, policy.limits)
-            for name, one in declared.items()
+            Agent(name, one) if isinstance(one, str) else policy.constant(name, one)
+            for name, one in task.get("controllers", {}).items()
             if not plans_ahead(one)
         ]
         form = Form(len(policy.names), policy.acting)

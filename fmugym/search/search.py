@@ -123,7 +123,7 @@ class Search:
         """The controllers that were declared, and have numbers now."""
         return [
             *self._fixed,
-            *(one.make.with_numbers(one.best) for one in self._tuned if one.gained),
+            *(one.best for one in self._tuned if one.best),
         ]
 
     # Rounds.
@@ -133,7 +133,7 @@ class Search:
         if not self.is_tuned:
             self._play(min(self._tuned, key=lambda one: one.rounds), arena)
         elif self.baseline is None:
-            self.best, self.merit = _best_of(arena, self.others(), self._validation)
+            self.best, self.merit = _best_of(arena, self.others(), self._seeds(VALIDATION))
             self.baseline, self.merit_of_baseline = self.best, self.merit
             self._enter(arena, self.best)
         else:
@@ -158,10 +158,10 @@ class Search:
         """Give a leader that gains nothing more episodes, or a new start, which may be its last."""
         if not leader.takes_more_episodes():
             leader.starts += 1
-            leader.cma = self._cma(leader.make.with_numbers(leader.best))
+            leader.cma = self._cma(leader.best)
         leader.gained = leader.rounds
         if leader.then is not None:
-            (start,) = leader.then.form.extended(leader.best[None])
+            (start,) = leader.then.form.extended(leader.best.weights[None])
             self._contenders.append(self._entrant(leader.then.with_numbers(start)))
             leader.then = None
 
@@ -170,17 +170,17 @@ class Search:
         self.rounds += 1
         entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
-            entrant.validate(arena, self._validation)
+            entrant.validate(arena, self._seeds(VALIDATION))
             if entrant.merit > self.merit:
-                self.best, self.merit = entrant.make.with_numbers(entrant.best), entrant.merit
+                self.best, self.merit = entrant.best, entrant.merit
 
     def _training(self, count: int) -> list[int]:
         seeds: list[int] = self._rng.integers(VALIDATION, size=count).tolist()
         return seeds
 
-    @property
-    def _validation(self) -> range:
-        return range(VALIDATION, VALIDATION + (_VALIDATED if self.episodes > 1 else 1))
+    def _seeds(self, first: int, count: int = _VALIDATED) -> range:
+        """Seeds of a validation; one is enough if all episodes are the same."""
+        return range(first, first + (1 if self.probe.is_same else count))
 
     # Who takes part.
 
@@ -202,7 +202,7 @@ class Search:
         history = replace(linear, history=True)
         scale = self._scale(arena, history, baseline)
         forms = {"linear": linear, "linear with history": history}
-        forms["network"] = replace(linear, hidden=(16,))
+        forms["network"] = replace(linear, hidden=16)
         agents = [
             Agent(name, None, form, scale=scale[:, : form.features]) for name, form in forms.items()
         ]
@@ -247,13 +247,14 @@ class Search:
             agents = [self.baseline]
             searches = sorted(self._contenders, key=lambda one: one.merit)[-2:]
         for one in searches:
-            found = (one.best, one.gained), (one.cma.mean, one.rounds)
-            agents += [one.make.with_numbers(numbers) for numbers, rounds in found if rounds]
+            if one.best:
+                agents.append(one.best)
+            if one.rounds:
+                agents.append(one.make.with_numbers(one.cma.mean))
         if len(agents) < 2:
             return agents, range(0)
         most = self.rounds * FEW * self.episodes // (_PART * len(agents))
-        count = min(_LAST, max(self.episodes, most)) if self.episodes > 1 else 1
-        return agents, range(_FINAL, _FINAL + count)
+        return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))
 
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in the last validation; None if nobody can compete in it."""

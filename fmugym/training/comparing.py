@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import closing
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -13,39 +13,25 @@ from fmugym.episodes.evaluation import HELD_OUT_SEED
 from fmugym.search.policy import Agent
 from fmugym.series.intervals import confidence
 
-__all__ = ["episodes_of", "judge", "verdict"]
-
-_EPISODES: Final = 100
-_OF_SCENARIO: Final = 4
-"""Episodes of a test, and of each scenario if the task has some."""
-
-
-def episodes_of(scenarios: int, episodes: int | None) -> int:
-    """How many episodes of each scenario are played.
-
-    Args:
-        scenarios: How many there are.
-        episodes: What the user says; None for the default.
-    """
-    return episodes or (_EPISODES if scenarios < 2 else _OF_SCENARIO)
+__all__ = ["judge", "verdict"]
 
 
 def judge(
-    agents: Mapping[str, Agent], arenas: Mapping[str, Arena], episodes: int | None
+    agents: Mapping[str, Agent], arenas: Mapping[str, Arena], episodes: int
 ) -> dict[str, Any]:
     """Let agents play the same episodes.
 
     Args:
         agents: By name.
         arenas: Those of the scenarios, by name; they are closed.
-        episodes: How many episodes of each scenario; None for the default.
+        episodes: How many episodes of each scenario.
 
     Returns:
         By the names of the agents, in types that JSON has: ``total_reward``, the mean of an
         episode summed over the scenarios; ``rewards`` of the episodes by scenario; and
         ``mean_costs`` by name.
     """
-    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes_of(len(arenas), episodes))
+    seeds = range(HELD_OUT_SEED, HELD_OUT_SEED + episodes)
     played = []
     for arena in arenas.values():
         with closing(arena):

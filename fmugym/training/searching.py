@@ -23,7 +23,7 @@ from fmugym.search.probe import FEW, MOST_PROBED, Probe, task_of
 from fmugym.search.search import Search
 from fmugym.signals import Ignoring
 from fmugym.training.agents import FACTS
-from fmugym.training.comparing import episodes_of, judge, verdict
+from fmugym.training.comparing import judge, verdict
 from fmugym.training.diary import note
 from fmugym.training.training import require_new
 
@@ -42,6 +42,10 @@ hardly be faster, and take long to open."""
 _LONGEST: Final = 2**31
 """Steps of a scenario, which has a length of its own."""
 
+_EPISODES: Final = 100
+_OF_SCENARIO: Final = 4
+"""Episodes of a test, and of each scenario if the task has some."""
+
 _TRIED: Final = 2
 """Steps that tell how long a controller takes that plans ahead."""
 
@@ -56,9 +60,8 @@ class Searching:
         folder: Where the agent is written; it must not exist, unless a search is resumed.
         minutes: Real time of all but the test; None for one minute, or no limit if there are
             rounds.
-        rounds: The largest number of rounds, those of a resumed search included; None for any.
-        steps: The largest number of steps of all environments together, in all but the test; None
-            for any.
+        rounds: The largest number of rounds, those of a resumed search included.
+        steps: The largest number of steps of all environments together, in all but the test.
         envs: The largest number of environments that step together.
         seed: Of candidates and episodes.
         episodes: Of the test, in each scenario; None for the default.
@@ -70,8 +73,8 @@ class Searching:
     scenarios: Mapping[str, Callable[[], FMUEnv]]
     folder: Path
     minutes: float | None = None
-    rounds: int | None = None
-    steps: int | None = None
+    rounds: float = np.inf
+    steps: float = np.inf
     envs: int = MOST_ENVS
     seed: int = 0
     episodes: int | None = None
@@ -81,9 +84,7 @@ class Searching:
     @property
     def seconds(self) -> float:
         """The real time."""
-        if self.minutes is None:
-            return 60.0 * _MINUTES if self.rounds is None else np.inf
-        return 60.0 * self.minutes
+        return 60.0 * (self.minutes or (_MINUTES if np.isinf(self.rounds) else np.inf))
 
     def run(self, *, resume: bool = False) -> dict[str, Any]:
         """Search an agent, write it, and let it play the test.
@@ -104,7 +105,6 @@ class Searching:
         self._begin = monotonic()
         self._found = self._resumed() if resume else self._begun()
         self._probe, self._before = self._found.probe, self._found.steps
-        self._most = self.steps or np.inf
         self._tell_the_plan()
         try:
             with closing(self._arena_of(self.make_env, self._probe.most_steps)) as self._arena:
@@ -117,7 +117,7 @@ class Searching:
 
     def _begun(self) -> Search:
         require_new(self.folder)
-        if self.steps is not None and self.steps <= MOST_PROBED:
+        if self.steps <= MOST_PROBED:
             raise ConfigError(
                 f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
             )
@@ -163,14 +163,14 @@ class Searching:
                 f"the baseline only; for more, give --minutes {needed:.0f}"
             )
         limits = {
-            f"for {self.seconds:g} s": np.isfinite(self.seconds),
+            f"for {self.seconds:g} s": self.seconds,
             f"until round {self.rounds}": self.rounds,
             f"for at most {self.steps} steps": self.steps,
         }
         kind = "one episode, as all are the same" if probe.is_same else "new episodes"
         self.tell(
             f"candidates play {kind} of up to {probe.most_steps} steps, "
-            + " and ".join(text for text, is_given in limits.items() if is_given)
+            + " and ".join(text for text, limit in limits.items() if limit < np.inf)
         )
 
     def _winner(self) -> Agent:
@@ -187,7 +187,7 @@ class Searching:
             if self._found.best is not None:
                 self._save(self._found.best)
         self.tell(self._text())
-        self._arena.ceiling = self._most
+        self._arena.ceiling = self.steps
         try:
             winner = self._found.winner(self._arena)
         except CeilingError:  # no round has had enough steps
@@ -209,13 +209,13 @@ class Searching:
         took = 0.0
         while not self._is_over(took):
             begin, before = monotonic(), self._found
-            self._arena.ceiling = self._most - self._reserved(before)
+            self._arena.ceiling = self.steps - self._reserved(before)
             found = pickle.loads(pickle.dumps(before))
             try:
                 found.advance(self._arena)
             except CeilingError:
                 return
-            if self._arena.steps > self._most - self._reserved(found):
+            if self._arena.steps > self.steps - self._reserved(found):
                 return
             self._found = found
             if found.baseline and (before.baseline is None or found.merit > before.merit):
@@ -233,7 +233,7 @@ class Searching:
     def _is_over(self, took: float) -> bool:
         """Whether there is no time for another round like the last one, or nothing left to do."""
         found = self._found
-        if found.is_over or found.rounds >= (self.rounds or np.inf):
+        if found.is_over or found.rounds >= self.rounds:
             return True
         if not self._is_enough and found.is_tuned and found.baseline is None:
             return True
@@ -274,28 +274,37 @@ class Searching:
         probe, found = self._probe, self._found
         if winner is found.baseline:
             self.tell(f"nothing was found that beats {winner.name}: the folder has that controller")
-        count = 1 if probe.is_same else self.episodes
         baseline = found.baseline or winner
         agents = {winner.name: winner}
-        for other in [baseline, *found.others(), *self._planners(baseline.text, count)]:
+        for other in [baseline, *found.others()]:
             agents.setdefault(other.name, other)
         arenas = {
             name: self._arena_of(make, probe.most_steps if make is self.make_env else _LONGEST)
             for name, make in self.scenarios.items()
         }
+        usual = _EPISODES if len(arenas) < 2 else _OF_SCENARIO
+        count = 1 if probe.is_same else self.episodes or usual
         test = judge(agents, arenas, count)
+        steps = sum(one.steps for one in arenas.values()) / len(agents)
+        planners = {one.name: one for one in self._planners(baseline.text, steps)}
+        test |= judge(planners, arenas, count)
         return self._save(winner, test=test, verdict=verdict(test, probe.limits))
 
-    def _planners(self, baseline: str | None, episodes: int | None) -> Iterator[Agent]:
+    def _planners(self, baseline: str | None, steps: float) -> Iterator[Agent]:
         """The controllers that plan ahead and whose test takes no longer than the search.
 
         They begin with the plan of the baseline.
+
+        Args:
+            baseline: The text of a controller.
+            steps: Those of the test of an agent. The first ones tell how long a step takes.
         """
-        declared = self._probe.task.get("controllers", {})
-        for name, text in declared.items():
+        for name, text in self._probe.task.get("controllers", {}).items():
             if plans_ahead(text):
                 agent = Agent(name, warmed(text, baseline))
-                minutes = self._minutes_of_test(agent, episodes)
+                with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
+                    agent.play(arena, range(1))
+                minutes = arena.seconds / arena.steps * steps / 60.0
                 if minutes <= (self.minutes or _MINUTES):
                     yield agent
                 else:
@@ -303,17 +312,6 @@ class Searching:
                         f"left out: {name}, whose test would take about {minutes:.0f} min; "
                         "'fmugym evaluate' compares it with the agent"
                     )
-
-    def _minutes_of_test(self, agent: Agent, episodes: int | None) -> float:
-        """About how long an agent would take for the test, by the time of its first steps."""
-        steps = 0
-        for make_env in self.scenarios.values():
-            with closing(make_env()) as env:
-                steps += env.config.max_episode_steps or self._probe.most_steps
-        with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
-            agent.play(arena, range(1))
-            pace = arena.seconds / arena.steps
-        return pace * steps * episodes_of(len(self.scenarios), episodes) / 60.0
 
 
 def _first_lines(probe: Probe) -> Iterator[str]:

@@ -36,8 +36,8 @@ HEATERS = {
     "a change": (TASKS["change"], PID, HISTORY),
     "a rate": (TASKS["rate"], None, HISTORY),
     "levels": (TASKS["levels"], PID, LINEAR),
-    "memory": (TASKS["memory"], None, Form(1, 1, hidden=(8, 4))),
-    "two actions": (PAIR, None, Form(1, 1, hidden=(16,), history=True)),
+    "memory": (TASKS["memory"], None, Form(1, 1, hidden=8)),
+    "two actions": (PAIR, None, Form(1, 1, hidden=16, history=True)),
 }  # fmt: skip
 
 
@@ -109,7 +109,7 @@ class Agents:
         ("text", "form"),
         [
             (None, HISTORY),
-            (None, Form(1, 1, hidden=(8,))),
+            (None, Form(1, 1, hidden=8)),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", None),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", HISTORY),
         ],
