@@ -16,11 +16,8 @@ from fmugym.vector import FMUVectorEnv
 
 __all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome"]
 
-MOST_ENVS: Final = 512
-"""As many environments there are, unless the caller says less."""
-
-_WIDEST: Final = 256
-"""More environments than this need not step together: they would hardly be faster."""
+MOST_ENVS: Final = 256
+"""As many environments step together, unless the caller says less: more would hardly be faster."""
 
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
@@ -65,12 +62,13 @@ class Outcome(NamedTuple):
 class Arena:
     """A vector environment in which candidates play the same episodes.
 
-    The environments are made when they are needed, and kept by their number. Where candidates and
-    episodes are too many for them, they play in groups, with the same result.
+    The environments are made when they are needed, and again when more of them are. Where
+    candidates and episodes are too many for them, they play in groups, with the same result. Where
+    they are too few, the other environments rest.
 
     Args:
         make_env: A function that makes the environment, or its class.
-        most_envs: The largest number of environments, of all sizes together.
+        most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
         limits: What costs may add up to in an episode, by name.
 
@@ -89,13 +87,14 @@ class Arena:
     ) -> None:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
         self._limits = limits
-        self._envs: dict[int, FMUVectorEnv] = {}
+        self._envs: FMUVectorEnv | None = None
         self.steps, self.seconds, self.ceiling = 0, 0.0, math.inf
 
     def close(self) -> None:
         """Close the environments."""
-        while self._envs:
-            self._envs.popitem()[1].close()
+        if self._envs is not None:
+            self._envs.close()
+            self._envs = None
 
     def play(
         self, make: Make, numbers: FloatArray, seeds: Sequence[int], has_moments: bool = False
@@ -129,15 +128,11 @@ class Arena:
 
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
-        size = min(jobs, self._most_envs, _WIDEST)
-        fitting = [count for count in self._envs if count >= size]
-        is_full = sum(self._envs) + size > self._most_envs
-        if fitting and (is_full or size in fitting):
-            return self._envs[min(fitting)]
-        if is_full:
+        size = min(jobs, self._most_envs)
+        if self._envs is None or self._envs.num_envs < size:
             self.close()
-        self._envs[size] = FMUVectorEnv(self._make_env, size)
-        return self._envs[size]
+            self._envs = FMUVectorEnv(self._make_env, size)
+        return self._envs
 
     def _play(
         self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self
@@ -23,7 +23,7 @@ from fmugym.search.flattening import choices_of, rows_of
 
 __all__ = ["AGENT", "LIMIT", "Agent", "Form", "Policy", "require_task", "scale_of"]
 
-AGENT: Final = "agent.npz"
+AGENT: Final = "policy.json"
 """The file of an agent in its folder."""
 
 LIMIT: Final = 5.0
@@ -85,18 +85,16 @@ class Form:
         found = np.insert(given, [count - 1] * (inputs - count), 0.0, axis=1)
         return found.reshape(len(given), -1) * math.sqrt(inputs / count)
 
-    def layers(self, weights: FloatArray) -> Iterator[FloatArray]:
+    def layers(self, weights: FloatArray) -> list[FloatArray]:
         """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
 
         Args:
             weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
                 step length suits all.
         """
-        place = 0
-        for before, after in self.shapes:
-            part = weights[:, place : place + before * after]
-            yield part.reshape(-1, before, after) / math.sqrt(before)
-            place += before * after
+        ends = np.cumsum([before * after for before, after in self.shapes])
+        pairs = zip(np.split(weights, ends[:-1], axis=1), self.shapes, strict=True)
+        return [part.reshape(-1, *shape) / math.sqrt(shape[0]) for part, shape in pairs]
 
 
 def scale_of(moments: FloatArray) -> FloatArray:
@@ -168,26 +166,24 @@ class Agent:
 
     def save(self, folder: Path) -> None:
         """Write the agent to a folder; a file that is there is replaced."""
-        facts = json.dumps(asdict(replace(self, weights=None, scale=None)))
-        with (folder / AGENT).open("wb") as file:
-            np.savez(file, facts=facts, weights=self.weights, scale=self.scale)
+        text = json.dumps(asdict(self), default=np.ndarray.tolist)
+        (folder / AGENT).write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, folder: Path) -> Self:
-        """Read the agent in a folder; its file holds numbers and texts only.
+        """Read the agent in a folder.
 
         Raises:
             ConfigError: If the file is missing or damaged.
         """
         with reading(f"the agent in {shown(str(folder))} cannot be read"):
-            with (folder / AGENT).open("rb") as file, np.load(file, allow_pickle=False) as found:
-                facts = json.loads(str(found["facts"]))
-                weights, scale = (np.asarray(found[n], np.float64) for n in ("weights", "scale"))
+            facts = json.loads((folder / AGENT).read_text(encoding="utf-8"))
+            weights, scale = (np.array(facts[name], np.float64) for name in ("weights", "scale"))
             form = facts["form"] and Form(**facts["form"])
-            counts = [form.size, *[form.features or 1] * 2] if form else [0, 1, 1]
-            numbers = [weights, *scale]
-            if [*map(len, numbers)] != counts or not np.isfinite(np.hstack(numbers)).all():
-                raise ValueError(f"expected {counts} finite numbers")
+            shapes = [(form.size,), (2, form.features or 1)] if form else [(0,), (2, 1)]
+            is_finite = np.isfinite(weights).all() and np.isfinite(scale).all()
+            if not is_finite or [weights.shape, scale.shape] != shapes:
+                raise ValueError(f"expected finite numbers of the shapes {shapes}")
             return cls(**facts | {"form": form, "weights": weights, "scale": scale})
 
 
@@ -241,7 +237,7 @@ class Policy(Controller):
         if agent.names:
             require_task("the agent", (agent.names, agent.actions), (self.names, str(space)))
         if self.form is not None:
-            self._layers = list(self.form.layers(np.atleast_2d(agent.weights)))
+            self._layers = self.form.layers(np.atleast_2d(agent.weights))
         self._memory = self.starts
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
