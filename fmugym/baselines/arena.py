@@ -158,8 +158,7 @@ class Arena:
             moments = controller.moments if has_moments else ()
             values = rewards, *(infos["costs"][name] for name in self._limits), *moments
             totals = totals if len(totals) else np.zeros((len(values), len(seeds)))
-            counted: Any = are_all or running  # for all, that takes less time
             for total, value in zip(totals, values, strict=True):
-                np.add(total, value, out=total, where=counted)
+                np.add(total, value, out=total, where=running)
             running = running & ~(terminated | truncated)
         return totals

@@ -120,7 +120,7 @@ def _of_controller(policy: Policy, rows: Any, memory: Sequence[Any]) -> tuple[An
 
 def _network_of(policy: Policy) -> Network | None:
     """The network; None if there is none, or it sees nothing and so gives constants."""
-    if policy.form is None or not policy.form.features:
+    if not policy.agent.features:
         return None
     matrices = [one[0] for one in policy._layers]
     functions = [(Activation("tanh"),)] * (len(matrices) - 1) + [()]

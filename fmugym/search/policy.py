@@ -21,7 +21,7 @@ from fmugym.baselines.tuning import Axes
 from fmugym.errors import ConfigError, reading, shown
 from fmugym.search.flattening import choices_of, rows_of
 
-__all__ = ["AGENT", "LIMIT", "Agent", "Form", "Policy", "require_task", "scale_of"]
+__all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
 
 AGENT: Final = "policy.json"
 """The file of an agent in its folder."""
@@ -37,64 +37,6 @@ _CONSTANT: Final = 1e-8
 
 Memory = tuple[Any, ...]
 """What a policy keeps from one step to the next: arrays of numbers, or of symbols."""
-
-
-@dataclass(frozen=True)
-class Form:
-    """A class of networks.
-
-    Attributes:
-        observed: The number of observations; 0 for a network that gives constants.
-        acting: The number of outputs.
-        hidden: The width of the hidden layer, which ends in a tanh; 0 for none.
-        history: Whether the network also sees the last change of each observation, its leaky
-            integral, and the last action.
-    """
-
-    observed: int
-    acting: int
-    hidden: int = 0
-    history: bool = False
-
-    @property
-    def features(self) -> int:
-        """How many numbers the network sees."""
-        return 3 * self.observed + self.acting if self.history else self.observed
-
-    @property
-    def shapes(self) -> list[tuple[int, int]]:
-        """The inputs, the constant one included, and the outputs of each layer."""
-        widths = [self.features, *filter(None, [self.hidden]), self.acting]
-        return [(before + 1, after) for before, after in itertools.pairwise(widths)]
-
-    @property
-    def size(self) -> int:
-        """The number of weights."""
-        return sum(before * after for before, after in self.shapes)
-
-    def extended(self, weights: FloatArray) -> FloatArray:
-        """The weights that decide as those of N linear policies that see the first features only.
-
-        This form is linear, too.
-
-        Args:
-            weights: Shape (N, n), where n is the number of outputs if they give constants.
-        """
-        given = weights.reshape(len(weights), -1, self.acting)
-        count, inputs = given.shape[1], self.shapes[0][0]
-        found = np.insert(given, [count - 1] * (inputs - count), 0.0, axis=1)
-        return found.reshape(len(given), -1) * math.sqrt(inputs / count)
-
-    def layers(self, weights: FloatArray) -> list[FloatArray]:
-        """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
-
-        Args:
-            weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
-                step length suits all.
-        """
-        ends = np.cumsum([before * after for before, after in self.shapes])
-        pairs = zip(np.split(weights, ends[:-1], axis=1), self.shapes, strict=True)
-        return [part.reshape(-1, *shape) / math.sqrt(shape[0]) for part, shape in pairs]
 
 
 def scale_of(moments: FloatArray) -> FloatArray:
@@ -123,7 +65,11 @@ class Agent:
         name: What it is called.
         text: The controller, as ``controller_of`` or ``search_of`` reads it; None for the middle of
             the range.
-        form: The network; None for none.
+        observed: The number of observations that the network sees; 0 for one that gives constants.
+        acting: The number of its outputs; 0 for no network.
+        hidden: The width of its hidden layer, which ends in a tanh; 0 for none.
+        history: Whether it also sees the last change of each observation, its leaky integral, and
+            the last action.
         weights: Those of the network, shape (n,), or (N, n) with those of each environment.
         scale: Mean and divisor of each feature, shape (2, f).
         names: What it observes; empty if that is not known yet.
@@ -132,7 +78,10 @@ class Agent:
 
     name: str
     text: str | None = None
-    form: Form | None = None
+    observed: int = 0
+    acting: int = 0
+    hidden: int = 0
+    history: bool = False
     weights: Any = ()
     scale: Any = ((0.0,), (1.0,))
     names: Sequence[str] = ()
@@ -179,12 +128,54 @@ class Agent:
         with reading(f"the agent in {shown(str(folder))} cannot be read"):
             facts = json.loads((folder / AGENT).read_text(encoding="utf-8"))
             weights, scale = (np.array(facts[name], np.float64) for name in ("weights", "scale"))
-            form = facts["form"] and Form(**facts["form"])
-            shapes = [(form.size,), (2, form.features or 1)] if form else [(0,), (2, 1)]
+            agent = cls(**facts | {"weights": weights, "scale": scale})
+            shapes = (agent.size,), (2, agent.features or 1)
             is_finite = np.isfinite(weights).all() and np.isfinite(scale).all()
-            if not is_finite or [weights.shape, scale.shape] != shapes:
+            if not is_finite or (weights.shape, scale.shape) != shapes:
                 raise ValueError(f"expected finite numbers of the shapes {shapes}")
-            return cls(**facts | {"form": form, "weights": weights, "scale": scale})
+            return agent
+
+    # Its network.
+
+    @property
+    def features(self) -> int:
+        """How many numbers the network sees."""
+        return 3 * self.observed + self.acting if self.history else self.observed
+
+    @property
+    def shapes(self) -> list[tuple[int, int]]:
+        """The inputs, the constant one included, and the outputs of each layer."""
+        widths = [self.features, *filter(None, [self.hidden]), self.acting]
+        return [(before + 1, after) for before, after in itertools.pairwise(widths)]
+
+    @property
+    def size(self) -> int:
+        """The number of weights."""
+        return sum(before * after for before, after in self.shapes)
+
+    def extended(self, weights: FloatArray) -> FloatArray:
+        """The weights that decide as those of N linear policies that see the first features only.
+
+        This one is linear, too.
+
+        Args:
+            weights: Shape (N, n), where n is the number of outputs if they give constants.
+        """
+        given = weights.reshape(len(weights), -1, self.acting)
+        count, inputs = given.shape[1], self.shapes[0][0]
+        found = np.insert(given, [count - 1] * (inputs - count), 0.0, axis=1)
+        return found.reshape(len(given), -1) * math.sqrt(inputs / count)
+
+    def layers(self, weights: FloatArray) -> list[FloatArray]:
+        """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
+
+        Args:
+            weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
+                step length suits all.
+        """
+        ends = np.cumsum([before * after for before, after in self.shapes])
+        pairs = zip(np.split(weights, ends[:-1], axis=1), self.shapes, strict=True)
+        return [part.reshape(-1, *shape) / math.sqrt(shape[0]) for part, shape in pairs]
 
 
 _NO_NETWORK: Final = Agent("")
@@ -206,13 +197,13 @@ class Policy(Controller):
     masks: Callable[[], Any] | None
 
     def __init__(self, baseline: Controller | None, agent: Agent = _NO_NETWORK) -> None:
-        self.baseline, self.agent, self.form = baseline, agent, agent.form
+        self.baseline, self.agent = baseline, agent
 
     def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
         """See ``Controller.bind``; observations may be of any numeric space."""
         is_vector = hasattr(env, "single_observation_space")
         self._seen = env.single_observation_space if is_vector else env.observation_space
-        names = tuple(self._names_of(env) if names is None else names)
+        names = tuple(names or self._names_of(env))
         if self.baseline is not None:
             self.baseline.bind(env, names)
         base, self.masks = env.unwrapped, None
@@ -236,8 +227,8 @@ class Policy(Controller):
         agent = self.agent
         if agent.names:
             require_task("the agent", (agent.names, agent.actions), (self.names, str(space)))
-        if self.form is not None:
-            self._layers = self.form.layers(np.atleast_2d(agent.weights))
+        if agent.acting:
+            self._layers = agent.layers(np.atleast_2d(agent.weights))
         self._memory = self.starts
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
@@ -268,7 +259,7 @@ class Policy(Controller):
     @property
     def starts(self) -> Memory:
         """What the network sees of the past, at the beginning of an episode."""
-        if self.form is None or not self.form.history:
+        if not self.agent.history:
             return ()
         width = len(self.names)
         return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
@@ -276,7 +267,7 @@ class Policy(Controller):
     def constant(self, name: str, value: float) -> Agent:
         """The agent that always gives all elements of the action one value."""
         weights = self.told([value] * len(self.middle))
-        return Agent(name, None, Form(0, self.acting), weights)
+        return Agent(name, acting=self.acting, weights=weights)
 
     def step(
         self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
@@ -293,9 +284,9 @@ class Policy(Controller):
         Returns:
             The elements of the action, and what to keep.
         """
-        if self.form is None:
+        if not self.agent.acting:
             return list(base), ()
-        features, *kept = self._features(self.form, observed, memory)
+        features, *kept = self._features(observed, memory)
         action = list(network(features))
         if not self.choices:
             action = [
@@ -304,10 +295,10 @@ class Policy(Controller):
             ]
         return action, (*kept, self.told(action)) if kept else ()
 
-    def _features(self, form: Form, observed: Any, memory: Memory) -> tuple[Any, ...]:
+    def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
         """What the network sees, and what it shall see of this step in the next one."""
         if not memory:
-            return (observed[..., : form.observed],)
+            return (observed[..., : self.agent.observed],)
         last, leaky, told = memory
         is_first = np.isnan(last)
         change = np.where(is_first, 0.0, observed - last)

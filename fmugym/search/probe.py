@@ -14,7 +14,7 @@ from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
 from fmugym.search.flattening import require_numbers
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.policy import Agent, Form, Policy
+from fmugym.search.policy import Agent, Policy
 
 __all__ = ["FEW", "MOST_PROBED", "Probe", "task_of"]
 
@@ -41,7 +41,7 @@ class Probe:
 
     Attributes:
         task: See ``task_of``.
-        form: That of linear policies.
+        linear: The linear policy without a controller, whose weights are missing.
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
             that suggest themselves.
         limits: What each cost may add up to in an episode.
@@ -52,7 +52,7 @@ class Probe:
     """
 
     task: Mapping[str, Any]
-    form: Form
+    linear: Agent
     agents: Sequence[Agent]
     limits: Mapping[str, float]
     length: int | None
@@ -83,13 +83,12 @@ class Probe:
             for name, one in task.get("controllers", {}).items()
             if not plans_ahead(one)
         ]
-        form = Form(len(policy.names), policy.acting)
-        rows = form.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, form.acting)))
+        linear = Agent("linear", None, len(policy.names), policy.acting)
+        rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
         def play(actions: int, most_steps: int) -> tuple[Any, float]:
             with closing(Arena(make_env, envs, most_steps)) as arena:
-                agent = Agent("constant action", None, form)
-                outcome = arena.play(agent, rows[:actions], range(_EPISODES), has_moments=True)
+                outcome = arena.play(linear, rows[:actions], range(_EPISODES), has_moments=True)
                 return outcome, arena.seconds / arena.steps
 
         outcome, seconds = play(_ACTIONS, _STEPS)
@@ -99,7 +98,7 @@ class Probe:
             _, seconds = play(FEW, _TIMED)
         return cls(
             task,
-            form,
+            linear,
             agents or [Agent("PI", text) for text in guesses],
             limits,
             length,

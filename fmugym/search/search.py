@@ -14,7 +14,7 @@ from fmugym.baselines.controller import FloatArray
 from fmugym.baselines.entrants import NO_MERIT, Entrant
 from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import Axes
-from fmugym.search.policy import Agent, Form, scale_of
+from fmugym.search.policy import Agent, scale_of
 from fmugym.search.probe import FEW, MOST_PROBED, Probe
 
 __all__ = ["VALIDATION", "Search"]
@@ -97,7 +97,7 @@ class Search:
             if has_range(one.text)
         ]
         if not probe.agents:
-            constant = Agent("constant action", None, Form(0, probe.form.acting))
+            constant = Agent("constant action", acting=probe.linear.acting)
             self._tuned = [self._entrant(constant)]
         self._contenders: list[Entrant] = []
         self.best: Agent | None = None
@@ -161,7 +161,7 @@ class Search:
             leader.cma = self._cma(leader.best)
         leader.gained = leader.rounds
         if leader.then is not None:
-            (start,) = leader.then.form.extended(leader.best.weights[None])
+            (start,) = leader.then.extended(leader.best.weights[None])
             self._contenders.append(self._entrant(leader.then.with_numbers(start)))
             leader.then = None
 
@@ -189,22 +189,20 @@ class Search:
 
     def _cma(self, agent: Agent) -> CMA:
         """The search for the weights of an agent, which begins with those that it has, or 0."""
-        form: Any = agent.form
-        mean = agent.weights if len(agent.weights) else np.zeros(form.size)
-        sigma = _OF_NETWORKS if form.hidden else 1.0
+        mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
+        sigma = _OF_NETWORKS if agent.hidden else 1.0
         sigma *= 1.0 if agent.text is None else _OF_CORRECTIONS
-        population = _MANY if form.observed else FEW
+        population = _MANY if agent.observed else FEW
         return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
-        linear = self.probe.form
-        history = replace(linear, history=True)
-        scale = self._scale(arena, history, baseline)
-        forms = {"linear": linear, "linear with history": history}
-        forms["network"] = replace(linear, hidden=16)
+        linear = self.probe.linear
+        history = replace(linear, name="linear with history", history=True)
+        network = replace(linear, name="network", hidden=16)
+        scale = self._scale(arena, history, baseline.text)
         agents = [
-            Agent(name, None, form, scale=scale[:, : form.features]) for name, form in forms.items()
+            replace(one, scale=scale[:, : one.features]) for one in (linear, history, network)
         ]
         if baseline.text is not None:
             first, then, _ = (
@@ -215,20 +213,20 @@ class Search:
             del agents[1]  # only these observations are like those that were seen
         self._contenders += map(self._entrant, agents)
 
-    def _scale(self, arena: Arena, history: Form, baseline: Agent) -> FloatArray:
+    def _scale(self, arena: Arena, history: Agent, controller: str | None) -> FloatArray:
         """What observations are like while candidates add constants to what agents decide.
 
         If there is a controller, only the best candidates count: policies that are worth something
         see the like, while others may drive the process far away.
         """
         seen: list[tuple[Merit, Any]] = []
-        for text in (baseline.text, None):
+        for text in (controller, None):
             rows = history.extended(self._rng.uniform(-1, 1, (_MANY, history.acting)))
-            agent = Agent("constant corrections", text, history)
-            outcome = arena.play(agent, rows, self._training(self.episodes), has_moments=True)
+            seeds = self._training(self.episodes)
+            outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
             seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)
             self.rounds += 1
-        part = 1 if baseline.text is None else _BEST_PART
+        part = 1 if controller is None else _BEST_PART
         best = sorted(seen, key=lambda one: one[0])[-(len(seen) // part) :]
         return scale_of(sum(moments for _, moments in best))
 
