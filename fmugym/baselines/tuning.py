@@ -120,7 +120,7 @@ def tune(
     cma = axes.search(candidates, np.random.default_rng(seed))
     entrant = Entrant(cma, lambda rows: make_controller(**axes.numbers(rows)), episodes)
     returns: list[float] = []
-    with closing(Arena(make_env, candidates * episodes, most_steps)) as arena:
+    with closing(Arena(make_env, most_steps=most_steps)) as arena:
         for _ in range(rounds):
             _, reached = entrant.play(arena, range(seed, seed + episodes))
             returns.append(reached)

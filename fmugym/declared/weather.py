@@ -121,14 +121,14 @@ def _records(text: str) -> tuple[int, FloatArray]:
     """How many there are in an hour, and their numbers, without those of a leap day."""
     head = _PERIODS.search(text)
     lines = text[head.end() :].splitlines() if head else []
-    rows = [[*map(str.strip, line.split(",")[:_WIDTH])] for line in lines if line.strip()]
+    rows = [line.split(",")[:_WIDTH] for line in lines if line.strip()]
     widths = {len(row) for row in rows}
     if head is None or len(widths) != 1 or min(widths) <= len(_DATES):
         raise ValueError(
             f"expected rows of {_WIDTH} cells below a line such as 'DATA PERIODS,1,1,Data,Sunday,"
             "1/1,12/31'"
         )
-    cells = [[cell or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
+    cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
     numbers = np.array(cells, np.float64)
     return int(head[1]), numbers[(numbers[:, 1:3] != (2, 29)).any(axis=1)]
 

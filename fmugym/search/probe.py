@@ -75,7 +75,7 @@ class Probe:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
             guesses = guessed_controllers(task, env)
-            limit = env.spec.max_episode_steps if env.spec is not None else None
+            limit = getattr(env.spec, "max_episode_steps", None)
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
         agents = [

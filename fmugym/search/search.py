@@ -175,8 +175,7 @@ class Search:
                 self.best, self.merit = entrant.best, entrant.merit
 
     def _training(self, count: int) -> list[int]:
-        seeds: list[int] = self._rng.integers(VALIDATION, size=count).tolist()
-        return seeds
+        return list(map(int, self._rng.integers(VALIDATION, size=count)))
 
     def _seeds(self, first: int, count: int = _VALIDATED) -> range:
         """Seeds of a validation; one is enough if all episodes are the same."""

@@ -69,7 +69,7 @@ def add_train(commands: Commands) -> None:
         "--rounds", type=int, help="that the search ends with: repeats an earlier one"
     )
     command.add_argument("--steps", type=int, help="of all environments together, at most")
-    command.add_argument("--envs", type=int, help="that step together; default 512, or 8 with PPO")
+    command.add_argument("--envs", type=int, help="that step together; default 256, or 8 with PPO")
     command.add_argument("--seed", type=int, help="default 0")
     command.add_argument("--episodes", type=int, help="of a test; default 100, 4 of each scenario")
     command.add_argument(
