@@ -54,15 +54,16 @@ class CMA:
         self._root = self._covariance
         ranks = math.log((population + 1) / 2) - np.log(np.arange(1, population // 2 + 1))
         self._weights = ranks / ranks.sum()
-        self._mass = mass = 1 / (self._weights @ self._weights)
+        mass = 1 / (self._weights @ self._weights)
         self._fade = (mass + 2) / (n + mass + 5)
         self._damping = 1 + 2 * max(0.0, math.sqrt((mass - 1) / (n + 1)) - 1) + self._fade
-        self._fade_path = (4 + mass / n) / (n + 4 + 2 * mass / n)
+        self._fades = np.array([[(4 + mass / n) / (n + 4 + 2 * mass / n)], [self._fade]])
+        self._gains = np.sqrt(self._fades * (2 - self._fades) * mass)
+        self._paths = np.zeros((2, n))
         speed = (n + 2) / 3 if self._is_separable else 1.0
         self._rate_one = min(1.0, speed * 2 / ((n + 1.3) ** 2 + mass))
         rate = speed * 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)
         self._rate_many = min(1 - self._rate_one, rate)
-        self._path, self._white_path = np.zeros(n), np.zeros(n)
         self._usual_length = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
 
     def ask(self) -> FloatArray:
@@ -91,14 +92,10 @@ class CMA:
         step = self._weights @ best
         mean, (norm, sigma) = self.mean + self.sigma * step, self._limits
         self.mean = mean * min(1.0, norm / max(float(np.linalg.norm(mean)), 1e-300))
-        self._path = self._followed(self._path, self._fade_path, step)
-        self._white_path = self._followed(self._white_path, self._fade, white)
-        length = float(np.linalg.norm(self._white_path)) / self._usual_length
+        self._paths = (1 - self._fades) * self._paths + self._gains * np.stack([step, white])
+        length = float(np.linalg.norm(self._paths[1])) / self._usual_length
         growth = math.exp(min(1.0, self._fade / self._damping * (length - 1)))
         self.sigma = min(growth * self.sigma * self._adapted(best), sigma)
-
-    def _followed(self, path: FloatArray, fade: float, step: FloatArray) -> FloatArray:
-        return (1 - fade) * path + math.sqrt(fade * (2 - fade) * self._mass) * step
 
     def _adapted(self, best: FloatArray) -> float:
         """Learn the covariance, and find what turns normal numbers into steps.
@@ -107,7 +104,8 @@ class CMA:
             The size of steps, by which they are divided; else it would grow beside ``sigma``.
         """
         many = self._weights @ best**2 if self._is_separable else (best.T * self._weights) @ best
-        one = self._path**2 if self._is_separable else np.outer(self._path, self._path)
+        path = self._paths[0]
+        one = path**2 if self._is_separable else np.outer(path, path)
         kept = 1 - self._rate_one - self._rate_many
         covariance = kept * self._covariance + self._rate_many * many + self._rate_one * one
         if self._is_separable:
@@ -116,9 +114,6 @@ class CMA:
             values, axes = np.linalg.eigh(covariance)
             root = (axes * np.sqrt(np.maximum(values, 1e-300))) @ axes.T
         size = float(np.linalg.norm(root)) / math.sqrt(self.mean.size)
-        self._root, self._path, self._covariance = (
-            root / size,
-            self._path / size,
-            covariance / size**2,
-        )
+        self._root, self._covariance = root / size, covariance / size**2
+        self._paths[0] /= size
         return size

@@ -130,7 +130,7 @@ class Agent:
             weights, scale = (np.array(facts[name], np.float64) for name in ("weights", "scale"))
             agent = cls(**facts | {"weights": weights, "scale": scale})
             shapes = (agent.size,), (2, agent.features or 1)
-            is_finite = np.isfinite(weights).all() and np.isfinite(scale).all()
+            is_finite = np.isfinite(np.append(weights, scale)).all()
             if not is_finite or (weights.shape, scale.shape) != shapes:
                 raise ValueError(f"expected finite numbers of the shapes {shapes}")
             return agent
