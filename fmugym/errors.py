@@ -21,7 +21,8 @@ from __future__ import annotations
 
 import difflib
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final
 
 from fmugym.signals import ordinary
@@ -40,6 +41,7 @@ __all__ = [
     "nearest_name",
     "plain",
     "printable",
+    "reading",
     "reason",
     "shown",
     "unknown_argument",
@@ -168,6 +170,21 @@ def reason(error: Exception) -> str:
     """Return the text of an error of another library, which may quote any amount of a file."""
     text = str(error)
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
+
+
+@contextmanager
+def reading(failure: str) -> Iterator[None]:
+    """While a file is read, make a ``ConfigError`` of whatever a damaged one raises.
+
+    Args:
+        failure: Its text, to which the reason is added: ``"the agent in ... cannot be read"``.
+    """
+    try:
+        yield
+    except FMUGymError:
+        raise
+    except ordinary(Exception) as error:  # a damaged file may raise anything
+        raise ConfigError(f"{failure}: {reason(error)}") from error
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> ConfigError:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -13,19 +14,19 @@ from fmugym.baselines.controller import Controller, FloatArray
 from fmugym.errors import FMUGymError
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Outcome"]
+__all__ = ["MOST_ENVS", "MOST_STEPS", "Arena", "CeilingError", "Merit", "Outcome"]
 
-MOST_ENVS: Final = 512
-"""As many environments there are, unless the caller says less."""
-
-_WIDEST: Final = 256
-"""More environments than this need not step together: they would hardly be faster."""
+MOST_ENVS: Final = 256
+"""As many environments step together, unless the caller says less: more would hardly be faster."""
 
 MOST_STEPS: Final = 10_000
 """Steps after which an episode without an end is stopped."""
 
 Make = Callable[[FloatArray], Controller]
 """Makes one controller for N environments, from the numbers of each of them, shape (N, k)."""
+
+Merit = tuple[float, float]
+"""How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
 
 
 class CeilingError(FMUGymError):
@@ -37,26 +38,39 @@ class Outcome(NamedTuple):
 
     Attributes:
         returns: The total rewards, shape (n, k).
-        costs: The total of each cost that the arena watches, shape (n, k, c).
-        watched: The totals of other numbers, shape (n, k, r).
+        costs: The total of each cost that has a limit, shape (n, k, c).
+        limits: The limits by name.
+        moments: The totals of ``moments`` of the controllers, shape (n, k, r); r is 0 if nobody
+            has asked for them.
     """
 
     returns: FloatArray
     costs: FloatArray
-    watched: FloatArray
+    limits: Mapping[str, float]
+    moments: FloatArray
+
+    @property
+    def merits(self) -> list[Merit]:
+        """The merit of each candidate: those within the limits of all costs come first."""
+        bounds = np.array([*self.limits.values()])
+        sizes = np.where(bounds == 0.0, 1.0, np.abs(bounds))
+        beyond = np.maximum(self.costs.mean(axis=1) - bounds, 0.0)
+        excess: FloatArray = (beyond / sizes).sum(axis=1)
+        return list(zip((-excess).tolist(), self.returns.mean(axis=1).tolist(), strict=True))
 
 
 class Arena:
     """A vector environment in which candidates play the same episodes.
 
-    The environments are made when they are needed, and kept by their number. Where candidates and
-    episodes are too many for them, they play in groups, with the same result.
+    The environments are made when they are needed, and again when more of them are. Where
+    candidates and episodes are too many for them, they play in groups, with the same result. Where
+    they are too few, the other environments rest.
 
     Args:
         make_env: A function that makes the environment, or its class.
-        most_envs: The largest number of environments, of all sizes together.
+        most_envs: The largest number of environments.
         most_steps: Steps after which an episode is stopped.
-        costs: The names of costs to add up.
+        limits: What costs may add up to in an episode, by name.
 
     Attributes:
         steps: The steps of all episodes until now.
@@ -69,25 +83,21 @@ class Arena:
         make_env: Callable[[], Any],
         most_envs: int = MOST_ENVS,
         most_steps: int = MOST_STEPS,
-        costs: Sequence[str] = (),
+        limits: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
-        self._costs = tuple(costs)
-        self._envs: dict[int, FMUVectorEnv] = {}
+        self._limits = limits
+        self._envs: FMUVectorEnv | None = None
         self.steps, self.seconds, self.ceiling = 0, 0.0, math.inf
 
     def close(self) -> None:
         """Close the environments."""
-        while self._envs:
-            _, envs = self._envs.popitem()
-            envs.close()
+        if self._envs is not None:
+            self._envs.close()
+            self._envs = None
 
     def play(
-        self,
-        make: Make,
-        numbers: FloatArray,
-        seeds: Sequence[int],
-        watch: Callable[[Any], FloatArray] | None = None,
+        self, make: Make, numbers: FloatArray, seeds: Sequence[int], has_moments: bool = False
     ) -> Outcome:
         """Let candidates play.
 
@@ -95,7 +105,8 @@ class Arena:
             make: Makes the controller of a group.
             numbers: What the candidates differ in, shape (n, k).
             seeds: The seeds of their episodes.
-            watch: Gives more numbers of a controller that has decided, shape (r, N).
+            has_moments: Whether to add up ``moments`` of controllers, which they have after each
+                decision, shape (r, N).
 
         Raises:
             CeilingError: If more steps are needed than there may be.
@@ -108,37 +119,35 @@ class Arena:
             controller = make(numbers[who]).bind(envs)
             own = [seeds[index] for index in which.tolist()]
             begin = perf_counter()
-            totals = self._play(envs, controller, own, len(part), watch)
+            totals = self._play(envs, controller, own, len(part), has_moments)
             self.seconds += perf_counter() - begin
             groups.append(totals[:, : len(part)])
         totals = np.concatenate(groups, axis=1).reshape(-1, len(numbers), len(seeds))
-        costs, watched = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._costs)], axis=-1)
-        return Outcome(totals[0], costs, watched)
+        costs, moments = np.split(np.moveaxis(totals[1:], 0, -1), [len(self._limits)], axis=-1)
+        return Outcome(totals[0], costs, self._limits, moments)
 
     def _opened(self, jobs: int) -> FMUVectorEnv:
         """Environments for so many episodes, or as many as there may be."""
-        size = min(jobs, self._most_envs, _WIDEST)
-        fitting = [count for count in self._envs if count >= size]
-        is_full = sum(self._envs) + size > self._most_envs
-        if fitting and (is_full or size in fitting):
-            return self._envs[min(fitting)]
-        if is_full:
+        size = min(jobs, self._most_envs)
+        if self._envs is None or self._envs.num_envs < size:
             self.close()
-        self._envs[size] = FMUVectorEnv(self._make_env, size)
-        return self._envs[size]
+            self._envs = FMUVectorEnv(self._make_env, size)
+        return self._envs
 
     def _play(
-        self, envs: FMUVectorEnv, controller: Controller, seeds: list[int], count: int, watch: Any
+        self, envs: FMUVectorEnv, controller: Any, seeds: list[int], count: int, has_moments: bool
     ) -> FloatArray:
-        """Rewards, costs and what is watched, summed over an episode, shape (1 + c + r, N).
+        """Rewards, costs and moments, summed over an episode, shape (1 + c + r, N).
 
         Environments from ``count`` on rest, as do those whose episodes have ended.
         """
         observations, infos = envs.reset(seed=seeds)
-        totals: FloatArray = np.zeros((1 + len(self._costs), len(seeds)))
-        watched: FloatArray = np.empty((0, len(seeds)))
+        totals: FloatArray = np.empty(0)
         running = np.arange(len(seeds)) < count
         for _ in range(self._most_steps):
+            count = int(np.count_nonzero(running))
+            if not count:
+                break
             if self.steps + count > self.ceiling:
                 raise CeilingError(f"all {self.ceiling:g} steps are done")
             self.steps += count
@@ -146,18 +155,10 @@ class Arena:
             are_all = count == len(seeds)
             result = envs.step(actions) if are_all else envs.step_around(actions, ~running)
             observations, rewards, terminated, truncated, infos = result
-            counted: Any = are_all or running  # for all, that takes less time
-            costs = (infos["costs"][name] for name in self._costs)
-            for total, values in zip(totals, (rewards, *costs), strict=True):
-                np.add(total, values, out=total, where=counted)
-            if watch is not None:
-                seen = watch(controller)
-                watched = watched if len(watched) else np.zeros(seen.shape)
-                np.add(watched, seen, out=watched, where=counted)
-            ended = terminated | truncated
-            if ended.any():
-                running = running & ~ended
-                count = int(np.count_nonzero(running))
-                if not count:
-                    break
-        return np.concatenate([totals, watched])
+            moments = controller.moments if has_moments else ()
+            values = rewards, *(infos["costs"][name] for name in self._limits), *moments
+            totals = totals if len(totals) else np.zeros((len(values), len(seeds)))
+            for total, value in zip(totals, values, strict=True):
+                np.add(total, value, out=total, where=running)
+            running = running & ~(terminated | truncated)
+        return totals

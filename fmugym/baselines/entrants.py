@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import Arena, Outcome
+from fmugym.baselines.arena import Arena, Merit
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import FloatArray
 
-__all__ = ["MOST_EPISODES", "NO_MERIT", "Entrant", "Merit", "merits_of"]
-
-Merit = tuple[float, float]
-"""How good a candidate is: minus the excess of its costs, and its mean return. More is better."""
+__all__ = ["NO_MERIT", "Entrant"]
 
 NO_MERIT: Final[Merit] = (-math.inf, -math.inf)
 
-MOST_EPISODES: Final = 64
+_MOST_EPISODES: Final = 64
 _AGREEMENT: Final = 0.3
 """If the ranks by two halves of the episodes correlate less, a round has too few of them."""
 
@@ -29,37 +26,23 @@ _FADE: Final = 0.1
 if few rounds counted."""
 
 
-def merits_of(outcome: Outcome, limits: Sequence[float]) -> list[Merit]:
-    """The merit of each candidate: those within the limits of all costs come first.
-
-    Args:
-        outcome: What they have reached.
-        limits: What each cost may add up to in an episode.
-    """
-    means: FloatArray = outcome.costs.mean(axis=1)
-    bounds = np.array(limits, np.float64)
-    sizes = np.where(bounds == 0.0, 1.0, np.abs(bounds))
-    excess = (np.maximum(means - bounds, 0.0) / sizes).sum(axis=1)
-    returns = outcome.returns.mean(axis=1)
-    return list(zip((-excess).tolist(), returns.tolist(), strict=True))
-
-
 @dataclass
 class Entrant:
     """One search, and what has come of it.
 
     Attributes:
         cma: The search.
-        make: Makes a controller for N environments from their numbers, shape (N, n).
+        make: Makes a controller for N environments from their numbers, shape (N, n). For
+            validation, it has the method ``with_numbers`` of an ``Agent``.
         episodes: How many each candidate plays in a round.
+        then: What enters when this one gains nothing; None for nothing.
         rounds: How many it has had.
         leader: The numbers of the best candidate since the last validation, shape (n,).
         lead: Its merit.
-        merit: That of the best numbers in validation.
-        best: Its numbers, shape (n,).
+        best: The agent with the best numbers in validation; None before the first one.
+        merit: Its merit.
         gained: The round in which it was found, or in which something was changed.
         starts: How often the search has started anew.
-        then: Makes larger controllers, which enter when these gain nothing; None for none.
         agreement: The mean correlation of ranks by two halves of the episodes.
         last_round: The round of the whole search in which it played last.
     """
@@ -67,32 +50,33 @@ class Entrant:
     cma: CMA
     make: Any
     episodes: int
+    then: Any = None
     rounds: int = 0
-    leader: FloatArray = field(default_factory=lambda: np.empty(0))
+    leader: Any = None
     lead: Merit = NO_MERIT
+    best: Any = None
     merit: Merit = NO_MERIT
-    best: FloatArray = field(default_factory=lambda: np.empty(0))
     gained: int = 0
     starts: int = 0
-    then: Any = None
     agreement: float = 1.0
     last_round: int = 0
 
-    def play(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> Merit:
+    def play(self, arena: Arena, seeds: Sequence[int]) -> Merit:
         """Do a round, and return the merit of its best candidate.
 
         Ranks decide, so that the scale of rewards does not matter.
         """
         found = self.cma.ask()
         outcome = arena.play(self.make, found, seeds)
-        merits = merits_of(outcome, limits)
+        merits = outcome.merits
         order = sorted(range(len(found)), key=merits.__getitem__, reverse=True)
         self.cma.tell(np.array(order))
         self.rounds += 1
-        if merits[order[0]] > self.lead:
-            self.leader, self.lead = found[order[0]], merits[order[0]]
+        reached = merits[order[0]]
+        if reached > self.lead:
+            self.leader, self.lead = found[order[0]], reached
         self._note_agreement(outcome.returns)
-        return merits[order[0]]
+        return reached
 
     def _note_agreement(self, returns: FloatArray) -> None:
         """Take twice as many episodes where chance decides on the order of candidates.
@@ -100,33 +84,35 @@ class Entrant:
         That is so if the ranks by two halves of the episodes hardly correlate, in the mean of some
         rounds.
         """
-        if not 1 < returns.shape[1] < MOST_EPISODES:
+        if len(returns.T) == 1:
             return
         first, second = (_ranks(part.mean(axis=1)) for part in np.array_split(returns, 2, axis=1))
         size = math.sqrt((first @ first) * (second @ second))
         if size > 0:  # otherwise all have reached the same
             self.agreement += _FADE * (float(first @ second) / size - self.agreement)
-        if self.agreement < _AGREEMENT:
-            self.episodes, self.agreement = 2 * self.episodes, 1.0
+        if self.agreement < _AGREEMENT and self.takes_more_episodes():
+            self.agreement = 1.0
 
-    def validate(self, arena: Arena, seeds: Sequence[int], limits: Sequence[float]) -> None:
+    def takes_more_episodes(self) -> bool:
+        """Take twice as many episodes; False if that is no use."""
+        if not 1 < self.episodes < _MOST_EPISODES:
+            return False
+        self.episodes *= 2
+        return True
+
+    def validate(self, arena: Arena, seeds: Sequence[int]) -> None:
         """Let the mean of the search and the leader play; the better one is kept if it is the best.
 
         The search goes on from the leader if that is better: where most candidates reach the same,
         their mean does not come near the few that reach more.
         """
-        numbers = np.stack([self.cma.mean, self.leader])
-        merits = merits_of(arena.play(self.make, numbers, seeds), limits)
+        merits = arena.play(self.make, np.stack([self.cma.mean, self.leader]), seeds).merits
         if merits[1] > merits[0]:
             self.cma.mean = self.leader
         if max(merits) > self.merit:
-            self.merit, self.best, self.gained = max(merits), self.cma.mean.copy(), self.rounds
+            self.merit, self.gained = max(merits), self.rounds
+            self.best = self.make.with_numbers(self.cma.mean)
         self.lead = NO_MERIT
-
-    def offers(self) -> list[FloatArray]:
-        """The best numbers and the present mean, as far as they are there."""
-        found = (self.best, self.gained), (self.cma.mean, self.rounds)
-        return [numbers for numbers, rounds in found if rounds]
 
 
 def _ranks(values: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import numpy as np
 
@@ -193,7 +193,7 @@ def warmed(text: str, warm: str | None) -> str:
     return text if warm is None or "warm" in arguments else f"{text} {shlex.quote(f'warm={warm}')}"
 
 
-def has_range(text: Any) -> bool:
+def has_range(text: Any) -> TypeGuard[str]:
     """Whether a text has ``LOW..HIGH`` in the place of a number."""
     return isinstance(text, str) and _RANGE.search(text) is not None
 

@@ -53,7 +53,7 @@ class Axes:
 
     def search(self, population: int, rng: np.random.Generator) -> CMA:
         """A search that begins in the middle."""
-        return CMA(np.full(len(self.ranges), 0.5), _SIGMA, population, rng, largest_sigma=_SIGMA)
+        return CMA(np.full(len(self.ranges), 0.5), _SIGMA, population, rng, growth=1.0)
 
     def numbers(self, places: FloatArray) -> dict[str, FloatArray]:
         """The numbers for places of shape (n, k), each of shape (n,).
@@ -120,9 +120,9 @@ def tune(
     cma = axes.search(candidates, np.random.default_rng(seed))
     entrant = Entrant(cma, lambda rows: make_controller(**axes.numbers(rows)), episodes)
     returns: list[float] = []
-    with closing(Arena(make_env, candidates * episodes, most_steps)) as arena:
+    with closing(Arena(make_env, most_steps=most_steps)) as arena:
         for _ in range(rounds):
-            _, reached = entrant.play(arena, range(seed, seed + episodes), ())
+            _, reached = entrant.play(arena, range(seed, seed + episodes))
             returns.append(reached)
             best = {name: float(one) for name, one in axes.numbers(entrant.leader).items()}
             found = Tuning(make_controller(**best), best, max(returns), tuple(returns))

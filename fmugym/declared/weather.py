@@ -18,8 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.errors import ConfigError, reason, shown
-from fmugym.signals import ordinary
+from fmugym.errors import ConfigError, reading, shown
 
 __all__ = ["Cells", "FloatArray", "Table", "read_modelica", "read_weather"]
 
@@ -73,13 +72,8 @@ _CODES: Final[Mapping[str, float]] = {
 _CODES_OF_TABLES: Final = {**_CODES, "Wind Direction": math.inf}
 """The same in tables, which count turns of the wind beyond 360 degrees."""
 
-_MEANS: Final = (
-    *("Extraterrestrial Horizontal Radiation", "Extraterrestrial Direct Normal Radiation"),
-    *("Global Horizontal Radiation", "Direct Normal Radiation", "Diffuse Horizontal Radiation"),
-    *("Global Horizontal Illuminance", "Direct Normal Illuminance"),
-    *("Diffuse Horizontal Illuminance", "Zenith Luminance"),
-)
-"""The fields that are means of the time since the row before."""
+_MEANS: Final = ("Radiation", "Illuminance", "Luminance")
+"""How the names of fields end that are means of the time since the row before."""
 
 _WIDTH: Final = len(_DATES) + len(_CODES)
 _PERIODS: Final = re.compile(r"^DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,.*)?$", re.M)
@@ -117,30 +111,26 @@ def read_weather(name: str, lines: Sequence[str]) -> Table:
     Raises:
         ConfigError: If they are no such weather.
     """
-    try:
+    with reading(f"{name} is no weather of EnergyPlus"):
         per_hour, numbers = _records("\n".join(lines))
         times = [_end_of(row, i % per_hour + 1, per_hour) for i, row in enumerate(numbers)]
-    except ordinary(ValueError) as error:
-        raise ConfigError(f"{name} is no weather of EnergyPlus: {reason(error)}") from None
-    dates, fields = np.split(numbers, [len(_DATES)], axis=1)
-    return _weather(dict(zip(_DATES, dates.T, strict=True)), np.array(times), fields, _CODES)
+        return _weather((*_DATES, *_CODES), numbers, np.array(times), _CODES)
 
 
 def _records(text: str) -> tuple[int, FloatArray]:
     """How many there are in an hour, and their numbers, without those of a leap day."""
     head = _PERIODS.search(text)
     lines = text[head.end() :].splitlines() if head else []
-    rows = [[*map(str.strip, line.split(",")[:_WIDTH])] for line in lines if line.strip()]
-    rows = [row for row in rows if row[1:3] != ["2", "29"]]
-    if head is None or not rows:
+    rows = [line.split(",")[:_WIDTH] for line in lines if line.strip()]
+    widths = {len(row) for row in rows}
+    if head is None or len(widths) != 1 or min(widths) <= len(_DATES):
         raise ValueError(
-            "expected rows below a line such as 'DATA PERIODS,1,1,Data,Sunday,1/1,12/31'"
+            f"expected rows of {_WIDTH} cells below a line such as 'DATA PERIODS,1,1,Data,Sunday,"
+            "1/1,12/31'"
         )
-    width = len(rows[0])
-    if width <= len(_DATES) or any(len(row) != width for row in rows):
-        raise ValueError(f"expected rows of {_WIDTH} cells")
-    cells = [[cell or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
-    return int(head[1]), np.array(cells, np.float64)
+    cells = [[cell.strip() or "nan" for cell in (*row[:5], "", *row[6:])] for row in rows]
+    numbers = np.array(cells, np.float64)
+    return int(head[1]), numbers[(numbers[:, 1:3] != (2, 29)).any(axis=1)]
 
 
 def _end_of(row: FloatArray, part: int, parts: int) -> float:
@@ -153,17 +143,17 @@ def _end_of(row: FloatArray, part: int, parts: int) -> float:
 
 
 def _weather(
-    before: Mapping[str, FloatArray],
-    times: FloatArray,
-    numbers: FloatArray,
-    codes: Mapping[str, float],
+    names: Sequence[str], rows: FloatArray, times: FloatArray, codes: Mapping[str, float]
 ) -> Table:
     """Weather of rows of fields. It lasts whole days, with a row for its first midnight or not."""
-    found = zip(codes.items(), numbers.T, strict=False)
-    fields = {name: np.where(values < code, values, np.nan) for (name, code), values in found}
+    found = zip(names, rows.T, strict=False)  # the last fields may be missing
+    columns = {
+        name: np.where(values < codes.get(name, math.inf), values, np.nan) for name, values in found
+    }
     period = math.ceil((times[-1] - times[0]) / _DAY) * _DAY
-    means = dict.fromkeys(_MEANS, float(np.diff(times[:2]).sum()))
-    return Table({**before, **fields, "time": times}, period, means)
+    step = float(np.diff(times[:2]).sum())
+    means = {name: step for name in columns if name.endswith(_MEANS)}
+    return Table({**columns, "time": times}, period, means)
 
 
 def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
@@ -191,22 +181,16 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
 
 
 def _modelica_table(what: str, shape: tuple[str, str], cells: str, is_weather: bool) -> Table:
-    rows, width = map(int, shape)
-    try:
-        numbers = np.array(cells.translate(_SEPARATORS).split(), np.float64).reshape(rows, width)
-    except ordinary(ValueError) as error:
-        raise ConfigError(f"{what} is damaged: {reason(error)}") from None
+    with reading(f"{what} is damaged"):
+        numbers = np.array(cells.translate(_SEPARATORS).split(), np.float64)
+        numbers = numbers.reshape(*map(int, shape))
     if not numbers.size:
         raise ConfigError(f"{what} has no rows")
-    times = _with_jumps(numbers[:, 0])
+    times, width = numbers[:, 0], len(numbers.T)
+    period = float(times[-1] - times[0])
+    is_left = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one
+    times = times - _BEFORE_JUMP * period * is_left
     if is_weather and width == 1 + len(_CODES):
-        return _weather({"time": times}, times, numbers[:, 1:], _CODES_OF_TABLES)
-    columns = {str(i + 1) if i else "time": numbers[:, i] for i in range(width)}
-    period = float(numbers[-1, 0] - numbers[0, 0])
-    return Table({**columns, "time": times}, period or _DAY)
-
-
-def _with_jumps(times: FloatArray) -> FloatArray:
-    """The times of rows, of which those before a row of the same time come a little earlier."""
-    again = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one
-    return np.where(again, times - _BEFORE_JUMP * (times[-1] - times[0]), times)
+        return _weather(("time", *_CODES), numbers, times, _CODES_OF_TABLES)
+    columns = dict(zip(("time", *map(str, range(2, width + 1))), numbers.T, strict=True))
+    return Table(columns | {"time": times}, period or _DAY)

@@ -18,8 +18,7 @@ from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Layer, Network, Scaling
 from fmugym.export.policies import network_of_model
 from fmugym.scaling import are_scaled
-from fmugym.search.agent import Agent
-from fmugym.search.policy import LIMIT, Policy
+from fmugym.search.policy import LIMIT, Agent, Policy
 
 __all__ = ["Decision", "decision_of"]
 
@@ -76,7 +75,7 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
 def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
     law, past = policy.baseline, policy.starts
     _require_known(law, observed)
-    if policy.parts and policy.masks is not None:
+    if policy.choices and policy.masks is not None:
         raise ConfigError("a policy that needs masks of actions cannot be exported")
     starts = dict(zip(_MEMORY, past, strict=False))  # without a history there are none
     if isinstance(law, Law):
@@ -116,16 +115,16 @@ def _of_controller(policy: Policy, rows: Any, memory: Sequence[Any]) -> tuple[An
     if isinstance(policy.baseline, Law):
         action, state = policy.baseline.step(rows, memory[0])
         return [action], [state]
-    return np.repeat(np.array(policy.middle)[:, np.newaxis], len(rows), axis=1), []
+    return policy.middle, []
 
 
 def _network_of(policy: Policy) -> Network | None:
     """The network; None if there is none, or it sees nothing and so gives constants."""
-    if policy.form is None or not policy.form.features:
+    if not policy.agent.features:
         return None
     matrices = [one[0] for one in policy._layers]
     functions = [(Activation("tanh"),)] * (len(matrices) - 1) + [()]
     layers = [Layer(m[:-1].T, m[-1], then) for m, then in zip(matrices, functions, strict=True)]
-    mean, divisor = policy.scale
+    mean, divisor = policy.agent.scale
     scaling = Scaling(mean, divisor, np.full(mean.shape, LIMIT))
     return Network(tuple(layers), policy.space, scaling, dtype=np.dtype(np.float64))

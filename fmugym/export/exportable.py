@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.export.decisions import decision_of
 from fmugym.export.logic import Logic, logic_of
 from fmugym.export.network import Network
-from fmugym.search.agent import Agent as FoundAgent
+from fmugym.search.policy import Agent as FoundAgent
 
 __all__ = ["Agent", "agent_of"]
 

@@ -44,14 +44,12 @@ def _parts(space: Any, values: Any = None) -> Iterator[tuple[Any, Any]]:
 
 def choices_of(space: Any) -> list[range]:
     """The elements to choose from, for each part of an action; empty if actions are numbers."""
-    if isinstance(space, spaces.Discrete):
-        return [range(int(space.start), int(space.start + space.n))]
-    if isinstance(space, spaces.MultiDiscrete):
-        pairs = zip(space.start.flat, space.nvec.flat, strict=True)
-        return [range(int(start), int(start + n)) for start, n in pairs]
+    if isinstance(space, spaces.Box):
+        return []
     if isinstance(space, spaces.MultiBinary):
         return [range(2)] * int(np.prod(space.shape))
-    return []
+    counts = space.n if isinstance(space, spaces.Discrete) else space.nvec
+    return [range(int(start), int(start + n)) for start, n in np.broadcast(space.start, counts)]
 
 
 def require_numbers(observed: spaces.Space[Any], acting: spaces.Space[Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 
-__all__ = ["guessed_controller", "guessed_controllers"]
+__all__ = ["both_controllers", "guessed_controllers"]
 
 _DECADES: Final = 100.0
 """Gains are tried from this part of the ratio of the ranges to this multiple of it."""
@@ -28,82 +28,65 @@ def guessed_controllers(document: Mapping[str, Any], env: Any) -> list[str]:
         Texts for ``search_of``; none if the reward has no difference between something measured
         that the agent observes, and a set point that it observes, or a number.
     """
-    space: Any = env.action_space
-    names = env.observation_names
+    space, seen, names = env.action_space, env.observation_space, env.observation_names
     if not isinstance(space, spaces.Box) or space.shape not in ((), (1,)) or names is None:
         return []
-    low, high = env.observation_space.low, env.observation_space.high
-    widths = dict(zip(names, (high - low).tolist(), strict=True))
-    points = {name for section in _NOT_MEASURED for name in document.get(section, {})}
-    reach = float(np.ptp([space.low, space.high]))
+    widths = dict(zip(names, (seen.high - seen.low).tolist(), strict=True))
+    reach = (space.high - space.low).item()
     longest = (env.config.max_episode_steps or 100) * env.config.time_step
-    times = env.config.time_step, longest
-    found = {
-        guessed_controller(of, setpoint, reach / _width(widths[of], setpoint), times, sign)
-        for of, setpoint in _pairs(document, set(names), points)
-        for sign in ("", "-")
-    }
+    found: set[str] = set()
+    for of, setpoint in _pairs(document, set(names)):
+        known = abs(setpoint) if isinstance(setpoint, float) else 0.0
+        width = widths[of] if np.isfinite(widths[of]) else known or 1.0
+        found |= {*both_controllers(of, setpoint, reach / width, (env.config.time_step, longest))}
     return sorted(found)
 
 
-def guessed_controller(
-    of: str, setpoint: str | float, gain: float, times: tuple[float, float], sign: str = ""
-) -> str:
-    """A PI controller with ranges.
+def both_controllers(
+    of: str, setpoint: str | float, gain: float, times: tuple[float, float]
+) -> tuple[str, str]:
+    """PI controllers with ranges: one that raises the action to raise the value, and the reverse.
 
     Args:
         of: What is measured.
         setpoint: What it shall be.
         gain: A likely gain; smaller and larger ones are tried, too.
         times: The shortest and the longest integral time in s.
-        sign: ``"-"`` for actions that lower the value.
     """
-    ends = [f"{sign}{gain * factor:.3g}" for factor in (1 / _DECADES, _DECADES)]
-    kp = "..".join(reversed(ends) if sign else ends)
-    return f"pid of={of} setpoint={setpoint} kp={kp} ti={times[0]:.6g}..{times[1]:.6g}"
+    low, high = (f"{gain * factor:.3g}" for factor in (1 / _DECADES, _DECADES))
+    rest = f"ti={times[0]:.6g}..{times[1]:.6g}"
+    text = f"pid of={of} setpoint={setpoint} kp="
+    return f"{text}{low}..{high} {rest}", f"{text}-{high}..-{low} {rest}"
 
 
-def _width(width: float, setpoint: str | float) -> float:
-    """The range of what is measured, as far as it is known."""
-    known = abs(setpoint) if isinstance(setpoint, float) else 0.0
-    return width if np.isfinite(width) else known or 1.0
-
-
-def _pairs(
-    document: Mapping[str, Any], observed: set[str], points: set[str]
-) -> Iterator[tuple[str, str | float]]:
+def _pairs(document: Mapping[str, Any], observed: set[str]) -> Iterator[tuple[Any, Any]]:
     """What is measured, and its set point: from the set points, and the differences in rewards."""
     for name, entry in document.get("setpoints", {}).items():
         of = entry.get("of") if isinstance(entry, Mapping) else None
-        if of in observed and name in observed:
+        if {of, name} <= observed:
             yield of, name
+    given = {name for section in _NOT_MEASURED for name in document.get(section, {})}
+    for sides in _differences(document):
+        for of, setpoint in (sides, sides[::-1]):
+            is_known = isinstance(setpoint, float) or setpoint in observed
+            if of in observed - given and is_known:
+                yield of, setpoint
+                break
+
+
+def _differences(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
+    """What is on both sides of each minus: a name, a number, or None for anything else."""
     for section in ("reward", "costs", "expressions"):
-        for text in _texts(document.get(section, {})):
-            for left, right in _differences(text):
-                for of, setpoint in ((left, right), (right, left)):
-                    is_known = isinstance(setpoint, float) or setpoint in observed
-                    if of in observed - points and setpoint is not None and is_known:
-                        yield str(of), setpoint
-                        break
-
-
-def _texts(section: Any) -> Iterator[str]:
-    terms = section.values() if isinstance(section, Mapping) else [section]
-    for term in terms:
-        text = term.get("expr") if isinstance(term, Mapping) else term
-        if isinstance(text, str):
-            yield text
-
-
-def _differences(text: str) -> Iterator[tuple[str | float | None, str | float | None]]:
-    """What is on both sides of each minus."""
-    for node in ast.walk(ast.parse(text.strip(), mode="eval")):
-        if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-            yield _side(node.left), _side(node.right)
+        terms = document.get(section, {})
+        for term in terms.values() if isinstance(terms, Mapping) else [terms]:
+            text = term.get("expr") if isinstance(term, Mapping) else term
+            tree = ast.parse(text.strip() if isinstance(text, str) else "0", mode="eval")
+            for node in ast.walk(tree):
+                if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+                    yield _side(node.left), _side(node.right)
 
 
 def _side(node: ast.expr) -> str | float | None:
-    """A name or a number; None for anything else."""
     match node:
         case ast.Name(name):
             return name

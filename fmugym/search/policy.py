@@ -1,27 +1,30 @@
-"""Policies as arrays: a controller, and a network that corrects what it decides."""
+"""Agents that a search finds, and how they decide: controllers that a network corrects."""
 
 from __future__ import annotations
 
 import itertools
+import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, Self
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
+from fmugym.baselines.arena import Arena, Outcome
 from fmugym.baselines.controller import Controller, FloatArray, attribute_of, limited
-from fmugym.errors import ConfigError
+from fmugym.baselines.parsing import controller_of, has_range, search_of
+from fmugym.baselines.tuning import Axes
+from fmugym.errors import ConfigError, reading, shown
 from fmugym.search.flattening import choices_of, rows_of
 
-__all__ = ["LIMIT", "Form", "Policy", "Scale", "names_that_differ"]
+__all__ = ["AGENT", "LIMIT", "Agent", "Policy", "require_task", "scale_of"]
 
-_NOTHING: Final = np.empty(0)
-
-Memory = tuple[Any, ...]
-"""What a policy keeps from one step to the next: arrays of numbers, or of symbols."""
+AGENT: Final = "policy.json"
+"""The file of an agent in its folder."""
 
 LIMIT: Final = 5.0
 """The largest magnitude of a scaled feature."""
@@ -32,25 +35,107 @@ _FADE: Final = 0.05
 _CONSTANT: Final = 1e-8
 """A feature whose deviation is smaller than this, beside its mean, counts as constant."""
 
+Memory = tuple[Any, ...]
+"""What a policy keeps from one step to the next: arrays of numbers, or of symbols."""
+
+
+def scale_of(moments: FloatArray) -> FloatArray:
+    """What features are like.
+
+    Args:
+        moments: The sums of what ``Policy.moments`` gives in each step.
+
+    Returns:
+        The mean of each feature, and its standard deviation, shape (2, f); constant ones are not
+        made larger.
+    """
+    mean, squares = np.split(moments[1:] / moments[0], 2)
+    deviation = np.sqrt(np.maximum(squares - mean**2, 0.0))
+    is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
+    return np.stack([mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation)])
+
 
 @dataclass(frozen=True)
-class Form:
-    """A class of policies.
+class Agent:
+    """A controller, and a network that corrects it.
+
+    Until they are found, the text has ranges in the places of numbers, or the weights are missing.
 
     Attributes:
         name: What it is called.
-        observed: The number of observations; 0 for a network that gives constants.
-        acting: The number of outputs.
-        hidden: The widths of the hidden layers, which end in a tanh.
-        history: Whether the network also sees the last change of each observation, its leaky
-            integral, and the last action.
+        text: The controller, as ``controller_of`` or ``search_of`` reads it; None for the middle of
+            the range.
+        observed: The number of observations that the network sees; 0 for one that gives constants.
+        acting: The number of its outputs; 0 for no network.
+        hidden: The width of its hidden layer, which ends in a tanh; 0 for none.
+        history: Whether it also sees the last change of each observation, its leaky integral, and
+            the last action.
+        weights: Those of the network, shape (n,), or (N, n) with those of each environment.
+        scale: Mean and divisor of each feature, shape (2, f).
+        names: What it observes; empty if that is not known yet.
+        actions: The action space, in words.
     """
 
     name: str
-    observed: int
-    acting: int
-    hidden: tuple[int, ...] = ()
+    text: str | None = None
+    observed: int = 0
+    acting: int = 0
+    hidden: int = 0
     history: bool = False
+    weights: Any = ()
+    scale: Any = ((0.0,), (1.0,))
+    names: Sequence[str] = ()
+    actions: str = ""
+
+    def __call__(self, rows: FloatArray) -> Policy:
+        """The policy with what was missing, shape (n,) or (N, n), to be bound to N environments.
+
+        Binding it raises ``ConfigError`` if the agent is for another task.
+        """
+        if has_range(self.text):
+            tunable = search_of(self.text)
+            return Policy(tunable.make(**Axes(tunable.ranges).numbers(rows)))
+        baseline = None if self.text is None else controller_of(self.text)
+        return Policy(baseline, replace(self, weights=rows))
+
+    def with_numbers(self, found: FloatArray) -> Agent:
+        """The agent with what was missing, shape (n,)."""
+        if has_range(self.text):
+            tunable = search_of(self.text)
+            return Agent(f"tuned {self.name}", tunable.text(Axes(tunable.ranges).numbers(found)))
+        return replace(self, weights=found)
+
+    def policy(self) -> Policy:
+        """The controller, to be bound to an environment, as by a call."""
+        return self(self.weights)
+
+    def play(self, arena: Arena, seeds: Sequence[int]) -> Outcome:
+        """Let the agent play alone."""
+        return arena.play(self, np.atleast_2d(self.weights), seeds)
+
+    def save(self, folder: Path) -> None:
+        """Write the agent to a folder; a file that is there is replaced."""
+        text = json.dumps(asdict(self), default=np.ndarray.tolist)
+        (folder / AGENT).write_text(text, encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: Path) -> Self:
+        """Read the agent in a folder.
+
+        Raises:
+            ConfigError: If the file is missing or damaged.
+        """
+        with reading(f"the agent in {shown(str(folder))} cannot be read"):
+            facts = json.loads((folder / AGENT).read_text(encoding="utf-8"))
+            weights, scale = (np.array(facts[name], np.float64) for name in ("weights", "scale"))
+            agent = cls(**facts | {"weights": weights, "scale": scale})
+            shapes = (agent.size,), (2, agent.features or 1)
+            is_finite = np.isfinite(np.append(weights, scale)).all()
+            if not is_finite or (weights.shape, scale.shape) != shapes:
+                raise ValueError(f"expected finite numbers of the shapes {shapes}")
+            return agent
+
+    # Its network.
 
     @property
     def features(self) -> int:
@@ -60,7 +145,7 @@ class Form:
     @property
     def shapes(self) -> list[tuple[int, int]]:
         """The inputs, the constant one included, and the outputs of each layer."""
-        widths = [self.features, *self.hidden, self.acting]
+        widths = [self.features, *filter(None, [self.hidden]), self.acting]
         return [(before + 1, after) for before, after in itertools.pairwise(widths)]
 
     @property
@@ -69,58 +154,31 @@ class Form:
         return sum(before * after for before, after in self.shapes)
 
     def extended(self, weights: FloatArray) -> FloatArray:
-        """The weights that decide as those of a linear policy without a history, shape (n,).
+        """The weights that decide as those of N linear policies that see the first features only.
 
-        This form is linear, too.
+        This one is linear, too.
+
+        Args:
+            weights: Shape (N, n), where n is the number of outputs if they give constants.
         """
-        found, count = np.zeros(self.shapes[0]), self.observed + 1
-        given = weights.reshape(count, self.acting) * math.sqrt(len(found) / count)
-        found[: self.observed], found[-1] = given[:-1], given[-1]
-        return found.ravel()
+        given = weights.reshape(len(weights), -1, self.acting)
+        count, inputs = given.shape[1], self.shapes[0][0]
+        found = np.insert(given, [count - 1] * (inputs - count), 0.0, axis=1)
+        return found.reshape(len(given), -1) * math.sqrt(inputs / count)
 
-    def constants(self, values: FloatArray) -> FloatArray:
-        """The weights of N linear policies that give constants of shape (N, outputs)."""
-        found = np.zeros((len(values), self.size))
-        found[:, -self.acting :] = values * math.sqrt(self.shapes[0][0])
-        return found
-
-    def layers(self, weights: FloatArray) -> Iterator[FloatArray]:
+    def layers(self, weights: FloatArray) -> list[FloatArray]:
         """The layers of N networks, each of shape (N, inputs + 1, outputs); the bias comes last.
 
         Args:
             weights: Shape (N, size). Those of a layer count in units of 1/sqrt(inputs), so that one
                 step length suits all.
         """
-        place = 0
-        for before, after in self.shapes:
-            part = weights[:, place : place + before * after]
-            yield part.reshape(-1, before, after) / math.sqrt(before)
-            place += before * after
+        ends = np.cumsum([before * after for before, after in self.shapes])
+        pairs = zip(np.split(weights, ends[:-1], axis=1), self.shapes, strict=True)
+        return [part.reshape(-1, *shape) / math.sqrt(shape[0]) for part, shape in pairs]
 
 
-class Scale(NamedTuple):
-    """What features are like.
-
-    Attributes:
-        mean: Of each feature, shape (f,).
-        divisor: Its standard deviation, shape (f,); constant ones are not made larger.
-    """
-
-    mean: FloatArray
-    divisor: FloatArray
-
-    @classmethod
-    def of(cls, moments: FloatArray, features: int) -> Self:
-        """Compute them.
-
-        Args:
-            moments: The sums of what ``Policy.moments`` gives in each step.
-            features: The number f.
-        """
-        mean, squares = np.split(moments[1:] / moments[0], [features])
-        deviation = np.sqrt(np.maximum(squares - mean**2, 0.0))
-        is_constant = deviation <= _CONSTANT * (1.0 + np.abs(mean))
-        return cls(mean, np.where(is_constant, np.maximum(np.abs(mean), 1.0), deviation))
+_NO_NETWORK: Final = Agent("")
 
 
 class Policy(Controller):
@@ -133,31 +191,19 @@ class Policy(Controller):
 
     Args:
         baseline: The controller; None for the middle of the range, or the first of the choices.
-        form: What the network sees, and its layers; None for no network.
-        weights: Shape (n,) with n from ``Form.size``, or (N, n) with those of each environment.
-        scale: Mean and divisor of each feature, shape (f,).
-        task: The names of the observations, and the action space in words, that it is for; None
-            for any.
+        agent: Tells the network, and what the policy is for.
     """
 
     masks: Callable[[], Any] | None
 
-    def __init__(
-        self,
-        baseline: Controller | None,
-        form: Form | None = None,
-        weights: FloatArray = _NOTHING,
-        scale: tuple[FloatArray, FloatArray] = (_NOTHING, _NOTHING),
-        task: tuple[tuple[str, ...], str] | None = None,
-    ) -> None:
-        self.baseline, self.form, self.task = baseline, form, task
-        self.weights, self.scale = weights, scale
+    def __init__(self, baseline: Controller | None, agent: Agent = _NO_NETWORK) -> None:
+        self.baseline, self.agent = baseline, agent
 
     def bind(self, env: Any, names: Iterable[str] | None = None) -> Self:
         """See ``Controller.bind``; observations may be of any numeric space."""
         is_vector = hasattr(env, "single_observation_space")
         self._seen = env.single_observation_space if is_vector else env.observation_space
-        names = tuple(self._names_of(env) if names is None else names)
+        names = tuple(names or self._names_of(env))
         if self.baseline is not None:
             self.baseline.bind(env, names)
         base, self.masks = env.unwrapped, None
@@ -174,25 +220,16 @@ class Policy(Controller):
 
     def _prepare(self) -> None:
         space: Any = self.space
-        self._choices = choices_of(space)
-        self.parts = tuple(map(len, self._choices))
-        pairs = () if self.parts else zip(space.low.flat, space.high.flat, strict=True)
-        self.limits = tuple((float(low), float(high)) for low, high in pairs)
-        self.acting = sum(self.parts) or len(self.limits)
-        self._require_task()
-        if self.form is not None:
-            self._layers = list(self.form.layers(np.atleast_2d(self.weights)))
-        self._memory = tuple(np.repeat(one[None], self.count, axis=0) for one in self.starts)
-
-    def _require_task(self) -> None:
-        """Refuse another task than that of the agent; the text names what differs."""
-        if self.task in (None, (self.names, str(self.space))):
-            return
-        names, space = self.task
-        told = names_that_differ(names, self.names)
-        if space != str(self.space):
-            told.append(f"its actions are {space}, here they are {self.space}")
-        raise ConfigError(f"the agent is for another task: {'; '.join(told)}")
+        self.choices = choices_of(space)
+        ends = () if self.choices else (space.low.ravel().tolist(), space.high.ravel().tolist())
+        self.limits = tuple(zip(*ends, strict=True))
+        self.acting = sum(map(len, self.choices)) or len(self.limits)
+        agent = self.agent
+        if agent.names:
+            require_task("the agent", (agent.names, agent.actions), (self.names, str(space)))
+        if agent.acting:
+            self._layers = agent.layers(np.atleast_2d(agent.weights))
+        self._memory = self.starts
 
     def _forget(self, mask: npt.NDArray[np.bool_]) -> None:
         if self.baseline is not None:
@@ -201,9 +238,8 @@ class Policy(Controller):
         self._memory = tuple(np.where(mask[:, None], start, now) for start, now in pairs)
 
     def _decide(self, rows: FloatArray) -> FloatArray:
-        if self.baseline is None:
-            base = np.repeat(np.array(self.middle)[:, None], self.count, axis=1)
-        else:
+        base = self.middle
+        if self.baseline is not None:
             base = self.baseline._decide(rows).reshape(self.count, -1).T
         action, self._memory = self.step(rows, self._memory, base, self._network)
         return np.stack(action, axis=-1)
@@ -215,17 +251,23 @@ class Policy(Controller):
         return np.concatenate([np.ones((1, self.count)), shown, shown**2])
 
     @property
-    def middle(self) -> list[float]:
-        """The middle of the range of each number, or the first choice of each part."""
-        return [float(one[0]) for one in self._choices] or [(a + b) / 2 for a, b in self.limits]
+    def middle(self) -> FloatArray:
+        """The middle of each range, or the first choice of each part: shape (m, N)."""
+        middle = [float(one[0]) for one in self.choices] or [(a + b) / 2 for a, b in self.limits]
+        return np.repeat(np.array(middle)[:, None], self.count, axis=1)
 
     @property
     def starts(self) -> Memory:
         """What the network sees of the past, at the beginning of an episode."""
-        if self.form is None or not self.form.history:
+        if not self.agent.history:
             return ()
         width = len(self.names)
         return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
+
+    def constant(self, name: str, value: float) -> Agent:
+        """The agent that always gives all elements of the action one value."""
+        weights = self.told([value] * len(self.middle))
+        return Agent(name, acting=self.acting, weights=weights)
 
     def step(
         self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
@@ -242,31 +284,34 @@ class Policy(Controller):
         Returns:
             The elements of the action, and what to keep.
         """
+        if not self.agent.acting:
+            return list(base), ()
         features, *kept = self._features(observed, memory)
-        given = None if self.form is None else network(features)
-        if given is None or self.parts:
-            action = list(base if given is None else given)
-        else:
-            action = list(map(_corrected, base, given, self.limits))
-        return action, (*kept, self._told(action)) if kept else ()
+        action = list(network(features))
+        if not self.choices:
+            action = [
+                limited(limited(one, low, high) + (high - low) / 2 * change, low, high)
+                for one, change, (low, high) in zip(base, action, self.limits, strict=True)
+            ]
+        return action, (*kept, self.told(action)) if kept else ()
 
     def _features(self, observed: Any, memory: Memory) -> tuple[Any, ...]:
         """What the network sees, and what it shall see of this step in the next one."""
         if not memory:
-            return (observed[..., : self.form.observed] if self.form else observed,)
+            return (observed[..., : self.agent.observed],)
         last, leaky, told = memory
         is_first = np.isnan(last)
         change = np.where(is_first, 0.0, observed - last)
         leaky = np.where(is_first, observed, leaky + _FADE * (observed - leaky))
         return np.concatenate([observed, change, leaky, told], axis=-1), observed, leaky
 
-    def _told(self, action: Sequence[Any]) -> Any:
+    def told(self, action: Sequence[Any]) -> Any:
         """The action as the network sees it in the next step.
 
         Numbers go from -1 to 1. Of a choice, the chosen element is 1 and the others are 0.
         """
-        if self.parts:
-            told = [one == n for one, all_ in zip(action, self._choices, strict=True) for n in all_]
+        if self.choices:
+            told = [one == n for one, all_ in zip(action, self.choices, strict=True) for n in all_]
         else:
             pairs = zip(action, self.limits, strict=True)
             told = [(2.0 * one - low - high) / ((high - low) or 1.0) for one, (low, high) in pairs]
@@ -277,33 +322,43 @@ class Policy(Controller):
 
         Rows are contiguous, as products of rows with gaps may be rounded in another way.
         """
-        self._shown, (mean, divisor) = features, self.scale
+        self._shown, (mean, divisor) = features, self.agent.scale
         rows = np.ascontiguousarray(features)
         values = limited((rows - mean) / divisor, -LIMIT, LIMIT)[:, None]
-        *hidden, last = self._layers
-        for layer in hidden:
-            values = np.tanh(values @ layer[:, :-1] + layer[:, -1:])
-        outputs = (values @ last[:, :-1] + last[:, -1:])[:, 0].T
-        if not self.parts:
+        for place, layer in enumerate(self._layers):
+            values = (np.tanh(values) if place else values) @ layer[:, :-1] + layer[:, -1:]
+        outputs = values[:, 0].T
+        if not self.choices:
             return outputs
         if self.masks is not None:
             outputs = np.where(np.array(self.masks()).T, outputs, -np.inf)
-        split = np.split(outputs, np.cumsum(self.parts)[:-1])
+        parts = np.split(outputs, np.cumsum([*map(len, self.choices)])[:-1])
         return [
-            one[0] + part.argmax(axis=0) for one, part in zip(self._choices, split, strict=True)
+            all_[0] + part.argmax(axis=0) for all_, part in zip(self.choices, parts, strict=True)
         ]
 
 
-def names_that_differ(own: Sequence[str], here: Sequence[str]) -> list[str]:
-    """Say how the observations of an agent and of a task differ; nothing if they do not."""
-    gone, more = ([n for n in a if n not in b] for a, b in ((own, here), (here, own)))
-    told = [f"it observes {', '.join(gone)}, which this task does not give"] if gone else []
-    if more:
-        told.append(f"this task also gives {', '.join(more)}")
-    return told or (["the order of the observations differs"] if list(own) != list(here) else [])
+def require_task(
+    agent: str, own: tuple[Sequence[str], str], here: tuple[Sequence[str], str]
+) -> None:
+    """Refuse another task than that of an agent.
 
+    Args:
+        agent: What to call it.
+        own: The names of what it observes, and what its actions are.
+        here: Those of the task.
 
-def _corrected(base: Any, change: Any, limits: tuple[float, float]) -> Any:
-    """An element of the action: that of the controller, and the change in halves of the range."""
-    low, high = limits
-    return limited(limited(base, low, high) + (high - low) / 2 * change, low, high)
+    Raises:
+        ConfigError: With what differs.
+    """
+    (names, actions), (given, taken) = own, here
+    gone, more = ([n for n in a if n not in b] for a, b in ((names, given), (given, names)))
+    told = {
+        f"it observes {', '.join(gone)}, which this task does not give": gone,
+        f"this task also gives {', '.join(more)}": more,
+        "the order of the observations differs": not (gone or more) and [*names] != [*given],
+        f"its actions are {actions}, here they are {taken}": actions != taken,
+    }
+    if any(told.values()):
+        differences = "; ".join(text for text, differs in told.items() if differs)
+        raise ConfigError(f"{agent} is for another task: {differences}")

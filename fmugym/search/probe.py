@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
-from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines.arena import MOST_STEPS, Arena, Outcome
+from fmugym.baselines.arena import MOST_STEPS, Arena
+from fmugym.baselines.parsing import plans_ahead
 from fmugym.env import FMUEnv
 from fmugym.search.flattening import require_numbers
 from fmugym.search.guessing import guessed_controllers
-from fmugym.search.policy import Form, Policy
-from fmugym.search.search import FEW
+from fmugym.search.policy import Agent, Policy
 
-__all__ = ["MOST_PROBED", "Probe", "task_of"]
+__all__ = ["FEW", "MOST_PROBED", "Probe", "task_of"]
+
+FEW: Final = 8
+"""The candidates of a round for a controller, which has few numbers."""
 
 _ACTIONS: Final = 2
 _EPISODES: Final = 4
@@ -40,9 +41,9 @@ class Probe:
 
     Attributes:
         task: See ``task_of``.
-        acting: How many numbers choose an action.
-        ranges: The lowest and the highest value of each number; empty if actions are chosen.
-        guesses: Texts of controllers that suggest themselves.
+        linear: The linear policy without a controller, whose weights are missing.
+        agents: Controllers that the task declares and that do not plan ahead. Without any, those
+            that suggest themselves.
         limits: What each cost may add up to in an episode.
         length: The steps of an episode; None if they are not limited.
         is_same: Whether all episodes are the same.
@@ -51,9 +52,8 @@ class Probe:
     """
 
     task: Mapping[str, Any]
-    acting: int
-    ranges: tuple[tuple[float, float], ...]
-    guesses: Sequence[str]
+    linear: Agent
+    agents: Sequence[Agent]
     limits: Mapping[str, float]
     length: int | None
     is_same: bool
@@ -75,31 +75,34 @@ class Probe:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
             guesses = guessed_controllers(task, env)
-            limit = env.spec.max_episode_steps if env.spec is not None else None
+            limit = getattr(env.spec, "max_episode_steps", None)
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
-        form = Form("constant action", len(policy.names), policy.acting)
-        rows = form.constants(np.random.default_rng(0).uniform(-1, 1, (FEW, form.acting)))
-        scale = np.zeros(form.features), np.ones(form.features)
-        make = partial(Policy, None, form, scale=scale)
+        agents = [
+            Agent(name, one) if isinstance(one, str) else policy.constant(name, one)
+            for name, one in task.get("controllers", {}).items()
+            if not plans_ahead(one)
+        ]
+        linear = Agent("linear", None, len(policy.names), policy.acting)
+        rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
-        def play(actions: int, most_steps: int) -> tuple[Outcome, float]:
-            seeds, watch = range(_EPISODES), attrgetter("moments")
+        def play(actions: int, most_steps: int) -> tuple[Any, float]:
             with closing(Arena(make_env, envs, most_steps)) as arena:
-                outcome = arena.play(make, rows[:actions], seeds, watch)
+                outcome = arena.play(linear, rows[:actions], range(_EPISODES), has_moments=True)
                 return outcome, arena.seconds / arena.steps
 
-        (returns, _, moments), seconds = play(_ACTIONS, _STEPS)
+        outcome, seconds = play(_ACTIONS, _STEPS)
+        returns = outcome.returns
+        seen = np.dstack([returns, outcome.moments])
         if seconds < _QUICK:
             _, seconds = play(FEW, _TIMED)
         return cls(
             task,
-            policy.acting,
-            policy.limits,
-            guesses,
+            linear,
+            agents or [Agent("PI", text) for text in guesses],
             limits,
             length,
-            is_same=bool((returns == returns[:, :1]).all() and (moments == moments[:, :1]).all()),
+            is_same=bool((seen == seen[:, :1]).all()),
             only_return=float(returns[0, 0]) if (returns == returns[0, 0]).all() else None,
             seconds=seconds,
         )
@@ -109,9 +112,9 @@ class Probe:
         """The steps after which an episode is stopped."""
         return self.length or MOST_STEPS
 
-    def round_time(self, candidates: int, episodes: int) -> float:
-        """About how many seconds a round takes."""
-        return self.seconds * self.most_steps * candidates * episodes
+    def round_time(self, episodes: int) -> float:
+        """About how many seconds a round of a controller takes."""
+        return self.seconds * self.most_steps * FEW * episodes
 
 
 def task_of(env: Any) -> dict[str, Any]:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 
-from fmugym.baselines import Controller
-from fmugym.baselines.arena import Arena
+from fmugym.baselines.arena import Arena, Merit
 from fmugym.baselines.cma import CMA
 from fmugym.baselines.controller import FloatArray
-from fmugym.baselines.entrants import MOST_EPISODES, NO_MERIT, Entrant, Merit, merits_of
-from fmugym.baselines.parsing import Search as Tunable
+from fmugym.baselines.entrants import NO_MERIT, Entrant
+from fmugym.baselines.parsing import has_range, search_of
 from fmugym.baselines.tuning import Axes
-from fmugym.search.agent import Agent
-from fmugym.search.policy import Form, Policy, Scale
+from fmugym.search.policy import Agent, scale_of
+from fmugym.search.probe import FEW, MOST_PROBED, Probe
 
-__all__ = ["FEW", "VALIDATION", "Search"]
+__all__ = ["VALIDATION", "Search"]
 
 VALIDATION: Final = 500_000
 """Episodes of validation have seeds from here on, those of training have smaller ones."""
@@ -26,11 +25,8 @@ VALIDATION: Final = 500_000
 _FINAL: Final = VALIDATION + 1000
 """The first seed of the last validation, in which all candidates compete."""
 
-FEW: Final = 8
-"""The candidates of a round for a controller, which has few numbers."""
-
 _MANY: Final = 32
-"""Those of a round for policies."""
+"""The candidates of a round for policies."""
 
 _EPISODES: Final = 4
 """Each candidate plays so many, or one if all are the same."""
@@ -65,97 +61,48 @@ _LARGEST: Final = 30.0
 _GROWTH: Final = 5.0
 """Steps become so many times as large as the first ones, at most."""
 
-_MANY_WEIGHTS: Final = 200
-"""More than these are searched without covariances."""
-
-_SIGMA: Final = 1.0
 _OF_NETWORKS: Final = 4.0
 _OF_CORRECTIONS: Final = 0.4
-"""The first steps of the weights, and how many times as large they are in networks, and where they
-correct a controller."""
-
-_MIDDLE: Final = Agent("", None)
-
-
-@dataclass(frozen=True)
-class _Tuned:
-    """Makes controllers with the numbers of a tunable one."""
-
-    name: str
-    tunable: Tunable
-
-    def __call__(self, rows: FloatArray) -> Controller:
-        return Policy(self.tunable.make(**Axes(self.tunable.ranges).numbers(rows)))
-
-    def agent(self, best: FloatArray) -> Agent:
-        numbers = Axes(self.tunable.ranges).numbers(best)
-        return Agent(f"tuned {self.name}", self.tunable.text(numbers))
-
-
-@dataclass(frozen=True)
-class _Policies:
-    """Makes policies of one form over one controller."""
-
-    under: Agent
-    form: Form
-    scale: Scale
-
-    def __call__(self, rows: FloatArray) -> Controller:
-        return self.agent(rows).policy()
-
-    def agent(self, best: FloatArray) -> Agent:
-        count, name = self.form.features, self.form.name
-        parts = self.scale.mean[:count], self.scale.divisor[:count]
-        name = name if self.under.text is None else f"{self.under.name} + {name}"
-        return Agent(name, self.under.text, self.form, best, parts)
+"""The first steps of the weights are 1, so many times as large in networks, and where they correct
+a controller."""
 
 
 class Search:
     """A search, which goes on round by round. Nothing in it depends on time.
 
     Args:
-        sizes: How many numbers are observed, and how many choose an action.
-        fixed: Controllers that are ready.
-        tunable: Those with numbers to be found, and their names.
-        limits: What each cost may add up to in an episode.
-        is_same: Whether all episodes are the same.
+        probe: What is known of the task.
         seed: Of the candidates and of the episodes.
 
     Attributes:
+        probe, seed: As given.
         episodes: How many each candidate plays in the first rounds.
-        seed: As given.
         rounds: How many there have been.
+        steps: Those of all environments until the search was last saved.
         best: The best agent in validation, once there is one.
         merit: Its merit.
         baseline: The best agent without a network, once it is known.
         merit_of_baseline: Its merit.
     """
 
-    def __init__(
-        self,
-        sizes: tuple[int, int],
-        fixed: Sequence[Agent],
-        tunable: Sequence[tuple[str, Tunable]],
-        limits: Sequence[float] = (),
-        is_same: bool = False,
-        seed: int = 0,
-    ) -> None:
-        self._sizes, self._limits, self._fixed = sizes, tuple(limits), list(fixed)
-        self.episodes, self.seed = 1 if is_same else _EPISODES, seed
+    def __init__(self, probe: Probe, seed: int) -> None:
+        self.probe, self.seed = probe, seed
+        self.episodes = 1 if probe.is_same else _EPISODES
+        self.rounds, self.steps = 0, MOST_PROBED
         self._rng = np.random.default_rng(seed)
+        self._fixed = [one for one in probe.agents if not has_range(one.text)]
         self._tuned = [
-            Entrant(Axes(one.ranges).search(FEW, self._rng), _Tuned(name, one), self.episodes)
-            for name, one in tunable
+            Entrant(Axes(search_of(one.text).ranges).search(FEW, self._rng), one, self.episodes)
+            for one in probe.agents
+            if has_range(one.text)
         ]
-        if not (fixed or tunable):
-            nothing = Scale(np.empty(0), np.empty(0))
-            make = _Policies(_MIDDLE, Form("constant action", 0, sizes[1]), nothing)
-            self._tuned = [self._entrant(make, FEW)]
+        if not probe.agents:
+            constant = Agent("constant action", acting=probe.linear.acting)
+            self._tuned = [self._entrant(constant)]
         self._contenders: list[Entrant] = []
         self.best: Agent | None = None
         self.baseline: Agent | None = None
         self.merit = self.merit_of_baseline = NO_MERIT
-        self.rounds = 0
 
     @property
     def is_tuned(self) -> bool:
@@ -174,7 +121,10 @@ class Search:
 
     def others(self) -> list[Agent]:
         """The controllers that were declared, and have numbers now."""
-        return [*self._fixed, *(one.make.agent(one.best) for one in self._tuned if one.gained)]
+        return [
+            *self._fixed,
+            *(one.best for one in self._tuned if one.best),
+        ]
 
     # Rounds.
 
@@ -183,13 +133,15 @@ class Search:
         if not self.is_tuned:
             self._play(min(self._tuned, key=lambda one: one.rounds), arena)
         elif self.baseline is None:
-            self.best, self.merit = self._best_of(arena, self.others(), self._validation)
+            self.best, self.merit = _best_of(arena, self.others(), self._seeds(VALIDATION))
             self.baseline, self.merit_of_baseline = self.best, self.merit
-            self._enter(arena, self.baseline)
+            self._enter(arena, self.best)
         else:
             leaders = self._leaders()
             self._play(self._next(leaders), arena)
-            self._let_go(leaders)
+            for one in leaders:
+                if one.rounds - one.gained >= _ROUNDS_WITHOUT_GAIN:
+                    self._change(one)
 
     def _leaders(self) -> list[Entrant]:
         """The best two; one that is not better than the baseline leads only if none is."""
@@ -202,117 +154,114 @@ class Search:
         behind = [one for one in self._active if one.rounds < share]
         return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
 
-    def _let_go(self, leaders: Sequence[Entrant]) -> None:
-        """Give a leader that gains nothing more episodes, and let it go if that is no use."""
-        for one in leaders:
-            if one.rounds - one.gained < _ROUNDS_WITHOUT_GAIN:
-                continue
-            if 1 < one.episodes < MOST_EPISODES:
-                one.episodes *= 2
-            else:
-                one.starts += 1
-                one.cma = self._cma(one.make, one.best)
-            one.gained = one.rounds
-            if one.then is not None:
-                longer = self._entrant(one.then)
-                longer.cma.mean = one.then.form.extended(one.best)
-                self._contenders.append(longer)
-                one.then = None
+    def _change(self, leader: Entrant) -> None:
+        """Give a leader that gains nothing more episodes, or a new start, which may be its last."""
+        if not leader.takes_more_episodes():
+            leader.starts += 1
+            leader.cma = self._cma(leader.best)
+        leader.gained = leader.rounds
+        if leader.then is not None:
+            (start,) = leader.then.extended(leader.best.weights[None])
+            self._contenders.append(self._entrant(leader.then.with_numbers(start)))
+            leader.then = None
 
     def _play(self, entrant: Entrant, arena: Arena) -> None:
-        entrant.play(arena, self._training(entrant.episodes), self._limits)
+        entrant.play(arena, self._training(entrant.episodes))
         self.rounds += 1
         entrant.last_round = self.rounds
         if entrant.rounds % _EVERY == 0:
-            entrant.validate(arena, self._validation, self._limits)
+            entrant.validate(arena, self._seeds(VALIDATION))
             if entrant.merit > self.merit:
-                self.best, self.merit = entrant.make.agent(entrant.best), entrant.merit
+                self.best, self.merit = entrant.best, entrant.merit
 
     def _training(self, count: int) -> list[int]:
-        return [int(seed) for seed in self._rng.integers(VALIDATION, size=count)]
+        return list(map(int, self._rng.integers(VALIDATION, size=count)))
 
-    @property
-    def _validation(self) -> range:
-        return range(VALIDATION, VALIDATION + (_VALIDATED if self.episodes > 1 else 1))
+    def _seeds(self, first: int, count: int = _VALIDATED) -> range:
+        """Seeds of a validation; one is enough if all episodes are the same."""
+        return range(first, first + (1 if self.probe.is_same else count))
 
     # Who takes part.
 
-    def _entrant(self, make: _Policies, population: int = _MANY) -> Entrant:
-        cma = self._cma(make, np.zeros(make.form.size), population)
-        return Entrant(cma, make, self.episodes)
+    def _entrant(self, agent: Agent, then: Agent | None = None) -> Entrant:
+        return Entrant(self._cma(agent), agent, self.episodes, then)
 
-    def _cma(self, make: _Policies, start: FloatArray, population: int = _MANY) -> CMA:
-        sigma = _SIGMA * (_OF_NETWORKS if make.form.hidden else 1.0)
-        sigma *= 1.0 if make.under.text is None else _OF_CORRECTIONS
-        variances = np.ones(len(start)) if len(start) > _MANY_WEIGHTS else None
-        limits = {"largest": _LARGEST, "largest_sigma": _GROWTH * sigma}
-        return CMA(start, sigma, population, self._rng, variances, **limits)
+    def _cma(self, agent: Agent) -> CMA:
+        """The search for the weights of an agent, which begins with those that it has, or 0."""
+        mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
+        sigma = _OF_NETWORKS if agent.hidden else 1.0
+        sigma *= 1.0 if agent.text is None else _OF_CORRECTIONS
+        population = _MANY if agent.observed else FEW
+        return CMA(mean, sigma, population, self._rng, largest=_LARGEST, growth=_GROWTH)
 
     def _enter(self, arena: Arena, baseline: Agent) -> None:
         """Find the scale of what is observed, and let classes of policies enter."""
-        linear = Form("linear", *self._sizes)
-        history = Form("linear with history", *self._sizes, history=True)
-        network = Form("network", *self._sizes, hidden=(16,))
-        scale = self._scale(arena, history, baseline, _MIDDLE)
-        if baseline.text is None:
-            alone = [linear, history, network]
-        else:  # only these observations are like those that were seen
-            alone = [linear, network]
-            first = self._entrant(_Policies(baseline, linear, scale))
-            first.then = _Policies(baseline, history, scale)
-            self._contenders.append(first)
-        self._contenders += [self._entrant(_Policies(_MIDDLE, form, scale)) for form in alone]
+        linear = self.probe.linear
+        history = replace(linear, name="linear with history", history=True)
+        network = replace(linear, name="network", hidden=16)
+        scale = self._scale(arena, history, baseline.text)
+        agents = [
+            replace(one, scale=scale[:, : one.features]) for one in (linear, history, network)
+        ]
+        if baseline.text is not None:
+            first, then, _ = (
+                replace(one, name=f"{baseline.name} + {one.name}", text=baseline.text)
+                for one in agents
+            )
+            self._contenders.append(self._entrant(first, then))
+            del agents[1]  # only these observations are like those that were seen
+        self._contenders += map(self._entrant, agents)
 
-    def _scale(self, arena: Arena, history: Form, *agents: Agent) -> Scale:
+    def _scale(self, arena: Arena, history: Agent, controller: str | None) -> FloatArray:
         """What observations are like while candidates add constants to what agents decide.
 
         If there is a controller, only the best candidates count: policies that are worth something
         see the like, while others may drive the process far away.
         """
-        count = history.features
-        seen: list[tuple[Merit, FloatArray]] = []
-        for agent in agents:
-            rows = history.constants(self._rng.uniform(-1, 1, (_MANY, history.acting)))
-            make = _Policies(agent, history, Scale(np.zeros(count), np.ones(count)))
+        seen: list[tuple[Merit, Any]] = []
+        for text in (controller, None):
+            rows = history.extended(self._rng.uniform(-1, 1, (_MANY, history.acting)))
             seeds = self._training(self.episodes)
-            outcome = arena.play(make, rows, seeds, lambda policy: policy.moments)
-            seen += zip(merits_of(outcome, self._limits), outcome.watched.sum(axis=1), strict=True)
+            outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
+            seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)
             self.rounds += 1
-        part = 1 if agents[0].text is None else _BEST_PART
+        part = 1 if controller is None else _BEST_PART
         best = sorted(seen, key=lambda one: one[0])[-(len(seen) // part) :]
-        moments = sum((one[1] for one in best), start=np.zeros(()))
-        return Scale.of(moments, count)
+        return scale_of(sum(moments for _, moments in best))
 
     # Who wins.
-
-    def _best_of(
-        self, arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]
-    ) -> tuple[Agent, Merit]:
-        """The best agent, the first one of equals."""
-        merits = [merits_of(one.play(arena, seeds), self._limits)[0] for one in agents]
-        best = max(range(len(agents)), key=merits.__getitem__)
-        return agents[best], merits[best]
 
     def last_validation(self) -> tuple[list[Agent], range]:
         """Who would compete if the search ended now, and the seeds of the episodes.
 
         These are the baseline and the best two searches, each by its best numbers and by its
         present mean. That may be better, without having shown it in the fewer episodes of earlier
-        validations.
+        validations. If there is one only, it need not play.
         """
         if self.baseline is None:
             agents, searches = list(self._fixed), self._tuned
         else:
             agents = [self.baseline]
             searches = sorted(self._contenders, key=lambda one: one.merit)[-2:]
-        agents += [one.make.agent(numbers) for one in searches for numbers in one.offers()]
-        most = self.rounds * FEW * self.episodes // (_PART * max(1, len(agents)))
-        count = min(_LAST, max(self.episodes, most))
-        return agents, range(_FINAL, _FINAL + (count if self.episodes > 1 else 1))
+        for one in searches:
+            if one.best:
+                agents.append(one.best)
+            if one.rounds:
+                agents.append(one.make.with_numbers(one.cma.mean))
+        if len(agents) < 2:
+            return agents, range(0)
+        most = self.rounds * FEW * self.episodes // (_PART * len(agents))
+        return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))
 
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
-        if len(agents) < 2:
-            return agents[0] if agents else None
-        return self._best_of(arena, agents, seeds)[0]
+        if seeds:
+            return _best_of(arena, agents, seeds)[0]
+        return agents[0] if agents else None
+
+
+def _best_of(arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]) -> tuple[Agent, Merit]:
+    """The best agent, the first one of equals, and its merit."""
+    merits = [one.play(arena, seeds).merits[0] for one in agents]
+    return max(zip(agents, merits, strict=True), key=lambda pair: pair[1])

@@ -4,28 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from statistics import stdev
+from statistics import variance
 from typing import Final
 
-__all__ = ["confidence", "student"]
+__all__ = ["confidence"]
 
 _Z: Final = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
 
 
-def confidence(values: Sequence[float]) -> float | None:
+def confidence(*groups: Sequence[float]) -> float | None:
     """Half the width of the 95 % confidence interval of a mean, by Student's distribution.
+
+    Args:
+        groups: The values. Of several groups, it is that of the sum of their means.
 
     Returns:
         The number; None for fewer than two values.
     """
-    count = len(values)
-    if count < 2:
+    freedom = sum(len(values) - 1 for values in groups)
+    if freedom < 1:
         return None
-    return student(count - 1) * float(stdev(values)) / math.sqrt(count)
+    return _student(freedom) * math.sqrt(sum(variance(values) / len(values) for values in groups))
 
 
-def student(freedom: int) -> float:
+def _student(freedom: int) -> float:
     """The 97.5 % quantile of Student's distribution.
 
     For one and two degrees of freedom it is a closed form. For more, see Abramowitz and Stegun,

@@ -14,7 +14,7 @@ from fmugym.export import Agent, agent_of, write_c, write_fmu, write_onnx
 from fmugym.export.building import PLATFORMS
 from fmugym.export.fmus import FMI_VERSIONS
 from fmugym.export.names import new_file
-from fmugym.search.agent import Agent as FoundAgent
+from fmugym.search.policy import Agent as FoundAgent
 from fmugym.tools.options import HELP_OF_TASK, Commands, add_command, add_json, say, say_json
 from fmugym.tools.targets import maker_of
 from fmugym.training.agents import read_agent

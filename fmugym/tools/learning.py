@@ -34,7 +34,7 @@ from fmugym.training.checkpoints import CHECKPOINT
 from fmugym.training.diary import Diary
 from fmugym.training.hyperparameters import tune
 from fmugym.training.outcome import write_curve, write_outcome
-from fmugym.training.searching import STATE, SearchSettings, search
+from fmugym.training.searching import STATE, Searching
 from fmugym.training.tracking import TRACKERS, tracker_for
 from fmugym.training.training import (
     TRAINING,
@@ -69,7 +69,7 @@ def add_train(commands: Commands) -> None:
         "--rounds", type=int, help="that the search ends with: repeats an earlier one"
     )
     command.add_argument("--steps", type=int, help="of all environments together, at most")
-    command.add_argument("--envs", type=int, help="that step together; default 512, or 8 with PPO")
+    command.add_argument("--envs", type=int, help="that step together; default 256, or 8 with PPO")
     command.add_argument("--seed", type=int, help="default 0")
     command.add_argument("--episodes", type=int, help="of a test; default 100, 4 of each scenario")
     command.add_argument(
@@ -164,7 +164,7 @@ def _search(arguments: argparse.Namespace) -> None:
     scenarios = {
         name: partial(maker_of(task, name, master), physical=True) for name in scenarios_of(task)
     }
-    settings = SearchSettings(
+    searching = Searching(
         make_env,
         scenarios or {"unseen episodes": make_env},
         arguments.output,
@@ -173,11 +173,11 @@ def _search(arguments: argparse.Namespace) -> None:
         tell=tell,
         **counts,
     )
-    total = round(settings.seconds) if isfinite(settings.seconds) else None
+    total = round(searching.seconds) if isfinite(searching.seconds) else None
     with progress(total, "train", "s") as advance:
-        settings = replace(settings, advance=_lines() if advance is no_progress else advance)
+        searching.advance = _lines() if advance is no_progress else advance
         try:
-            verdict, facts = search(settings, resume=arguments.resume)
+            facts = searching.run(resume=arguments.resume)
         except KeyboardInterrupt:
             _tell_what_is_kept(arguments.output, STATE)
             raise
@@ -185,7 +185,7 @@ def _search(arguments: argparse.Namespace) -> None:
     if arguments.json:
         say_json({"task": arguments.task, "output": arguments.output, **facts})
     else:
-        say(verdict.text())
+        say(facts["verdict"])
         options = f"; --rounds {facts['rounds']} repeats the search"
         tell(f"{arguments.output} has the agent{options if facts['rounds'] else ''}")
 

@@ -22,7 +22,7 @@ from fmugym.archive.variable import Variable
 from fmugym.declared.declarations import is_reserved
 from fmugym.errors import ConfigError, FMULoadError, plain
 from fmugym.repair.stand_in import replaceable
-from fmugym.search.guessing import guessed_controller
+from fmugym.search.guessing import both_controllers
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 from fmugym.tools.skeleton import Skeleton, guessed_bounds, literal, needs_bounds, remark
@@ -234,8 +234,8 @@ class Proposal:
         gain = (high - low) / -np.subtract(*_ends_of_setpoint(self._goal))
         times = self._skeleton.time_step, self._length()
         yield f"# Guesses: the first one if more of the action raises {of}, or else the second."
-        for name, sign in (("pi", ""), ("pi_reversed", "-")):
-            text = guessed_controller(of, self._setpoint, gain, times, sign)
+        texts = both_controllers(of, self._setpoint, gain, times)
+        for name, text in zip(("pi", "pi_reversed"), texts, strict=True):
             yield f"{name} = {_quoted(text)}"
 
     def _parameters(self) -> Iterator[str]:

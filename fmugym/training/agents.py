@@ -19,11 +19,10 @@ from fmugym.baselines import Controller
 from fmugym.checks import check_option, check_path
 from fmugym.env import FMUEnv
 from fmugym.episodes.simulation import Player, Policy, policy_of_controller
-from fmugym.errors import ConfigError, reason, shown
+from fmugym.errors import ConfigError, reading, shown
 from fmugym.extras import imported
 from fmugym.scaling import are_scaled, unscaled
-from fmugym.search.agent import AGENT, Agent
-from fmugym.search.policy import names_that_differ
+from fmugym.search.policy import AGENT, Agent, require_task
 from fmugym.signals import ordinary
 
 __all__ = [
@@ -151,12 +150,8 @@ class TrainedModel:
         """Refuse other names than those of the training, if these are known."""
         here = names_of(env)
         own = {what: self._facts.get(what, names) for what, names in here.items()}
-        told = names_that_differ(own["observations"], here["observations"])
-        if own["actions"] != here["actions"]:
-            told.append(f"it writes {', '.join(own['actions'])}, here {', '.join(here['actions'])}")
-        if told:
-            folder = shown(str(self._folder))
-            raise ConfigError(f"the agent in {folder} is for another task: {'; '.join(told)}")
+        tasks = ((one["observations"], ", ".join(one["actions"])) for one in (own, here))
+        require_task(f"the agent in {shown(str(self._folder))}", *tasks)
 
     def act(self, observation: Any, info: Any = None) -> Any:
         """Choose the best action."""
@@ -187,14 +182,8 @@ def read_agent(path: Path, algorithm: str = "PPO") -> tuple[Any, Any]:
         return Agent.load(path), None
     file = path if path.is_file() else path / _MODEL
     kind = algorithm_of(algorithm if path.is_file() else _facts_in(path)["algorithm"])
-    try:
+    with reading(f"the agent in {shown(str(path))} cannot be read"):
         return kind.load(file, device="cpu"), _normalization_in(file.parent)
-    except ConfigError:
-        raise
-    except ordinary(Exception) as error:  # a damaged file may raise anything
-        raise ConfigError(
-            f"the agent in {shown(str(path))} cannot be read: {reason(error)}"
-        ) from error
 
 
 def _facts_in(folder: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.errors import ConfigError, FMUGymError, reason, shown
+from fmugym.errors import ConfigError, FMUGymError, reading, shown
 from fmugym.signals import ordinary
 from fmugym.training.agents import algorithm_of
 
@@ -120,14 +120,8 @@ def load_checkpoint(folder: Path, algorithm: str, venv: Any) -> tuple[Any, dict[
         ConfigError: If there is none, its files are damaged, or it is of another task.
     """
     place, _ = latest_checkpoint(folder)
-    try:
+    with reading(f"the checkpoint in {shown(str(folder))} cannot be resumed"):
         return _loaded(place, algorithm, venv)
-    except FMUGymError:
-        raise
-    except ordinary(Exception) as error:  # a damaged file may raise anything
-        raise ConfigError(
-            f"the checkpoint in {shown(str(folder))} cannot be resumed: {reason(error)}"
-        ) from error
 
 
 def _loaded(place: Path, algorithm: str, venv: Any) -> tuple[Any, dict[str, Any], bool]:

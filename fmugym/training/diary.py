@@ -17,7 +17,7 @@ from fmugym.series import RecordSeries, RecordVectorSeries
 from fmugym.series.plots import COLOURS, drawing_style
 from fmugym.vector import FMUVectorEnv
 
-__all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve"]
+__all__ = ["CURVE", "EVALUATIONS", "RECORDS", "REPORT", "Diary", "curve_of", "draw_curve", "note"]
 
 EVALUATIONS: Final = "evaluations.csv"
 CURVE: Final = "evaluations.png"
@@ -100,6 +100,17 @@ class Diary:
             return RecordSeries(env, self.variables, every=self.every, path=path, most_rows=1)
 
         return wrap
+
+
+def note(folder: Path, names: Sequence[str], row: Sequence[float]) -> None:
+    """Add a row to ``evaluations.csv``, whose first columns are steps and mean reward."""
+    path = folder / EVALUATIONS
+    is_new = not path.exists()
+    with path.open("a", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if is_new:
+            writer.writerow(names)
+        writer.writerow(row)
 
 
 def curve_of(folder: Path) -> Mapping[str, list[float]]:

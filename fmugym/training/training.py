@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import inspect
 import json
 import tomllib
@@ -41,7 +40,7 @@ from fmugym.training.agents import (
     save,
 )
 from fmugym.training.checkpoints import latest_checkpoint, load_checkpoint, save_checkpoint
-from fmugym.training.diary import EVALUATIONS, RECORDS, Diary
+from fmugym.training.diary import EVALUATIONS, RECORDS, Diary, note
 from fmugym.training.tracking import Tracker
 from fmugym.vector import FMUVectorEnv
 
@@ -468,14 +467,8 @@ class _Training:
         return self._venv if hasattr(self._venv, "normalize_obs") else None
 
     def _note(self, steps: int, mean: float, scores: list[Score]) -> None:
-        names = [score.name for score in scores]
-        path = self._settings.folder / EVALUATIONS
-        is_new = not path.exists()
-        with path.open("a", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            if is_new:
-                writer.writerow(["steps", "reward", *names])
-            writer.writerow([steps, mean, *(score.mean for score in scores)])
+        names = ["steps", "reward", *(score.name for score in scores)]
+        note(self._settings.folder, names, [steps, mean, *(score.mean for score in scores)])
         if self._tracker is not None:
             each = {f"evaluation/{score.name}": score.mean for score in scores}
             self._tracker.log({"evaluation/reward": mean, **each}, steps)

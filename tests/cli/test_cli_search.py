@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 import fmugym
-from fmugym.baselines.arena import Arena, Outcome
-from fmugym.search.agent import AGENT, Agent
+from fmugym.baselines.arena import Arena
+from fmugym.search.policy import AGENT, Agent
 from fmugym.search.probe import Probe
 from fmugym.search.search import Search
+from fmugym.series.intervals import confidence
 from fmugym.tools.cli import main
-from fmugym.training.comparing import Verdict
+from fmugym.training.comparing import verdict
 
 TASK = {
     "fmu": {"bundled": "Pendulum"},
@@ -111,8 +112,8 @@ class Interruption:
             self.now = search.rounds
             advance(search, arena)
 
-        def played(arena, *arguments):
-            outcome = play(arena, *arguments)
+        def played(arena, *arguments, **options):
+            outcome = play(arena, *arguments, **options)
             if within and self.now >= self.rounds:
                 raise KeyboardInterrupt
             return outcome
@@ -181,7 +182,7 @@ class TestCourse:
 
     def test_a_search_that_time_has_ended_is_repeated(self, task, tmp_path, capsys, monkeypatch):
         """Also if the FMU was slow, so that only the baseline was tuned."""
-        monkeypatch.setattr(Probe, "round_time", lambda self, candidates, _: 0.2 * candidates)
+        monkeypatch.setattr(Probe, "round_time", lambda *_: 1.6)
         arguments = "train", task, "--episodes", "3"
         options = "--minutes", "0.2", "--output", tmp_path / "a"
         code, out, err = run(capsys, *arguments, *options)
@@ -465,17 +466,17 @@ class TestAgents:
         assert "kp=-2..-0.01 is a range" in err
 
 
-def verdict(limits=(), **returns):
-    """Of returns for each scenario, with 0.5 for each cost."""
-    outcomes = {
-        name: [
-            Outcome(np.array([one]), np.full((1, len(one), len(limits)), 0.5), np.empty(0))
-            for one in rows
-        ]
+def told(limits=(), **returns):
+    """The verdict on returns for each scenario, with 0.5 for each cost."""
+    test = {
+        name: {
+            "total_reward": sum(map(np.mean, rows)),
+            "rewards": dict(zip("abcd", rows, strict=False)),
+            "mean_costs": dict.fromkeys(dict(limits), 0.5),
+        }
         for name, rows in returns.items()
     }
-    names = [f"s{i}" for i in range(len(next(iter(returns.values()))))]
-    return Verdict(outcomes, names, dict(limits))
+    return verdict(test, dict(limits))
 
 
 class TestVerdict:
@@ -486,9 +487,11 @@ class TestVerdict:
         for scenarios, episodes in ((1, 100), (1, 2), (3, 4), (2, 3)):
             one = rng.normal([[-100.0], [-50.0], [-10.0]][:scenarios], 5.0, (scenarios, episodes))
             two = one + rng.normal(2.0, 1.0, (scenarios, episodes)) * [[1], [3], [9]][:scenarios]
-            gain, half = verdict(new=two.tolist(), old=one.tolist()).gain("new", "old")
             difference = two - one
-            assert gain == pytest.approx(difference.mean(axis=1).sum())
+            gain, half = difference.mean(axis=1).sum(), confidence(*difference.tolist())
+            size, width = (100 * x / abs(one.mean(axis=1).sum()) for x in (abs(gain), half))
+            shown = f"{size:.3g} % better than old ({size - width:.3g} to {size + width:.3g})"
+            assert shown in told(new=two.tolist(), old=one.tolist())
             error = np.sqrt((difference.var(axis=1, ddof=1) / episodes).sum())
             freedom = scenarios * (episodes - 1)
             low, high = stats.t.interval(0.95, freedom, loc=gain, scale=error)
@@ -511,7 +514,7 @@ class TestVerdict:
         ],
     )
     def test_its_line(self, new, old, facts, missing):
-        text = verdict(new=[new], old=[old], third=[old]).text()
+        text = told(new=[new], old=[old], third=[old])
         for fact in facts:
             assert fact in text
         for one in missing:
@@ -519,13 +522,11 @@ class TestVerdict:
         assert text.startswith(f"new {np.mean(new):g}, old {np.mean(old):g}, third ")
 
     def test_totals_are_sums_over_scenarios(self):
-        text = verdict(
-            new=[[-1.0, -3.0], [-10.0, -10.0]], old=[[-4.0, -4.0], [-20.0, -20.0]]
-        ).text()
+        text = told(new=[[-1.0, -3.0], [-10.0, -10.0]], old=[[-4.0, -4.0], [-20.0, -20.0]])
         assert text.startswith("new -12, old -24: 50 % better than old (32.1 to 67.9)")
 
     def test_costs_stand_beside_their_limits(self):
         limits = {"cold": 2.0, "noise": 0.25}.items()
-        text = verdict(limits, new=[[1.0, 2.0]], old=[[0.5, 0.5]]).text()
+        text = told(limits, new=[[1.0, 2.0]], old=[[0.5, 0.5]])
         assert "cold new 0.5, old 0.5 of at most 2" in text
         assert "noise new 0.5, old 0.5 of at most 0.25" in text

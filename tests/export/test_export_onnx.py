@@ -26,7 +26,7 @@ from fmugym import ConfigError
 from fmugym.export import agent_of, write_onnx
 from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import computed, interpolated
-from fmugym.search.agent import Agent
+from fmugym.search.policy import Agent
 
 onnx = pytest.importorskip("onnx", reason="needs the extra 'onnx'")
 runtime = pytest.importorskip("onnxruntime", reason="needs ONNX Runtime")

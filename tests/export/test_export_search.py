@@ -17,12 +17,12 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.baselines import controller_of as controller_from
 from fmugym.export import agent_of, write_c, write_fmu
-from fmugym.search.agent import Agent
-from fmugym.search.policy import Form, Policy
+from fmugym.search.policy import Agent, Policy
 from fmugym.tools.cli import main
 
-LINEAR = Form("linear", 0, 0)  # each task replaces the sizes
-HISTORY = Form("linear with history", 0, 0, history=True)
+UNSCALED = np.array([[0.0], [1.0]])
+LINEAR = Agent("by hand", None, 1, 1)  # each task replaces the sizes
+HISTORY = Agent("by hand", None, 1, 1, history=True)
 PAIR = {
     "variables": HEATING["variables"] | {"gains": {"name": "Q_int", "min": 0, "max": 500}},
     "agent": PRESENT | {"actions": ["u", "gains"]},
@@ -37,8 +37,8 @@ HEATERS = {
     "a change": (TASKS["change"], PID, HISTORY),
     "a rate": (TASKS["rate"], None, HISTORY),
     "levels": (TASKS["levels"], PID, LINEAR),
-    "memory": (TASKS["memory"], None, Form("network", 0, 0, hidden=(8, 4))),
-    "two actions": (PAIR, None, Form("network", 0, 0, hidden=(16,), history=True)),
+    "memory": (TASKS["memory"], None, Agent("by hand", None, 1, 1, hidden=8)),
+    "two actions": (PAIR, None, Agent("by hand", None, 1, 1, hidden=16, history=True)),
 }  # fmt: skip
 
 
@@ -52,14 +52,22 @@ def agent_for(env, text, form, seed=0):
     known, rng = Policy(None).bind(env), np.random.default_rng(seed)
     if form is None:
         return Agent("by hand", text)
-    observed = 0 if form.name == "constant" else len(known.names)
-    form = replace(form, observed=observed, acting=known.acting)
+    form = replace(form, observed=form.observed and len(known.names), acting=known.acting)
     values = gymnasium.spaces.flatten(env.observation_space, env.reset(seed=seed)[0])
     count = form.features
     mean = np.concatenate([values, 0 * values, values, np.zeros(form.acting)])[:count]
-    scale = mean + rng.normal(size=count), rng.uniform(0.5, 2, count)
+    scale = (
+        np.stack([mean + rng.normal(size=count), rng.uniform(0.5, 2, count)]) if count else UNSCALED
+    )
     weights = rng.normal(size=form.size) / 2
-    return Agent("by hand", text, form, weights, scale, known.names, str(env.action_space))
+    return replace(
+        form,
+        text=text,
+        weights=weights,
+        scale=scale,
+        names=known.names,
+        actions=str(env.action_space),
+    )
 
 
 def played(env, agent, step, steps=300, seed=1):
@@ -111,7 +119,7 @@ class Agents:
         ("text", "form"),
         [
             (None, HISTORY),
-            (None, Form("network", 0, 0, hidden=(8,))),
+            (None, Agent("by hand", None, 1, 1, hidden=8)),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", None),
             ("pid of=phi setpoint=0 kp=-8 td=0.1 offset=0.5", HISTORY),
         ],
@@ -132,7 +140,7 @@ class Agents:
     @pytest.mark.parametrize("text", [None, "pid of=T setpoint=21 kp=0.001"])
     def test_of_a_constant(self, text, tmp_path):
         env = heater({"agent": PRESENT})
-        agent = agent_for(env, text, Form("constant", 0, 0))
+        agent = agent_for(env, text, Agent("by hand", None, 0, 1))
         made = agent_of(env, agent)
         assert made.network is None
         assert [one.name for one in made.logic.measurements] == ["T_op"] * (text is not None)
