@@ -9,7 +9,7 @@ import fmugym
 from fmugym.archive import ArchiveLimits
 from fmugym.config import FOREIGN, EnvConfig
 from fmugym.declared.task import Task
-from fmugym.declared.task_fmu import system_of
+from fmugym.declared.task_fmu import fmu_of
 from fmugym.retired import RETIRED
 
 every_retired_key = pytest.mark.parametrize("key", RETIRED)
@@ -63,7 +63,7 @@ def test_in_a_task_file(key, tmp_path):
 def test_in_the_section_system(key):
     with told(key):
         task = Task.of({"system": {"components": {"a": {"bundled": "House"}}, key: 1}})
-        system = system_of(task.root.child("system"))
+        system = fmu_of(task)
     assert not hasattr(system, key)
 
 
