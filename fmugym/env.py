@@ -29,8 +29,8 @@ from fmugym.pool.licences import start_instances
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
-from fmugym.task.construction import Constructed, plan_of_reset, prepare_hooks
-from fmugym.task.episode import Episode, EpisodePlan
+from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
+from fmugym.task.episode import Episode, EpisodeDraws
 from fmugym.task.interface import readable_named
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -201,17 +201,17 @@ class FMUEnv(Constructed):
         if not inside.was_reset:
             prepare_hooks(self)  # the constructor of the class may have set some as attributes
             self._require_way(pool)
-        seed, plan = check_seed(seed), plan_of_reset(self, options)
+        seed, draws = check_seed(seed), draws_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
-        episode = plan.draw(self.np_random if generator is None else generator)
+        episode = draws.draw(self.np_random if generator is None else generator)
         inside.ended = True  # there is no episode if the FMU fails
         try:
             if inside.warm_ups is None:
-                start_instances(pool, plan.model_variables, episode.start_values, _FIRST)
+                start_instances(pool, draws.model_variables, episode.start_values, _FIRST)
                 self._begin_episode(episode)
             else:
-                self._begin_with_warm_up(inside.warm_ups, pool, plan, episode)
+                self._begin_with_warm_up(inside.warm_ups, pool, draws, episode)
             inside.was_reset, inside.ended = True, False
             observation, info = first_observation(self)
             if not inside.has_chosen:
@@ -226,14 +226,14 @@ class FMUEnv(Constructed):
         return observation, info
 
     def _begin_with_warm_up(
-        self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
+        self, warm_ups: WarmUps, pool: Pool, draws: EpisodeDraws, episode: Episode
     ) -> None:
         """Begin an episode with a warm-up, or in the state that an earlier one has led to."""
         self._begin_episode(episode)
         read = self.inside.readings
 
         def start(_: IndexArray) -> Readings:
-            start_instances(pool, plan.model_variables, starts, _FIRST)
+            start_instances(pool, draws.model_variables, starts, _FIRST)
             self._read_outputs()
             return rows_of_one(self)
 
@@ -242,7 +242,7 @@ class FMUEnv(Constructed):
             read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in values.items()})
 
         rows, starts = rows_of_one(self).variables, episode.start_values
-        warm_ups.begin(pool, plan.model_variables, starts, rows, _FIRST, start, place)
+        warm_ups.begin(pool, draws.model_variables, starts, rows, _FIRST, start, place)
         read.inputs = tuple(self.inside.input_row.tolist())
         self._read_outputs()
 

@@ -271,9 +271,9 @@ class _Assembly:
     ) -> None:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
-        self._episode = env.inside.plan.draw(rng)
+        self._episode = env.inside.draws.draw(rng)
         self._starts = {**self._episode.variables, **traced.starts}
-        self._drawn = set(env.inside.plan.drawn_names)
+        self._drawn = set(env.inside.draws.drawn_names)
         self._external = self._given(external)
         rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [

@@ -25,7 +25,7 @@ from fmugym.pool.base import FloatArray
 from fmugym.task.values import ParameterValues
 from fmugym.trial.trial_episodes import Starts
 
-__all__ = ["Draw", "Episode", "EpisodePlan"]
+__all__ = ["Draw", "Episode", "EpisodeDraws"]
 
 
 class Draw(NamedTuple):
@@ -44,7 +44,7 @@ class Episode(NamedTuple):
     """The values of one episode.
 
     Attributes:
-        start_values: The parameters in the order of the plan, shape (P, 1).
+        start_values: The parameters in their order, shape (P, 1).
         parameters: The parameters by name.
         variables: The episode variables by name.
         drawn: The parameters and variables that were drawn or overridden, by name.
@@ -56,7 +56,7 @@ class Episode(NamedTuple):
     drawn: dict[str, Any]
 
 
-class EpisodePlan:
+class EpisodeDraws:
     """The draws of an episode, prepared once so that a reset only has to draw.
 
     The parameters are drawn first, then the episode variables, each in the order of their dict. A
@@ -121,7 +121,7 @@ class EpisodePlan:
         return list(self._parameters)
 
     @cached_property
-    def draws(self) -> list[Draw]:
+    def drawn(self) -> list[Draw]:
         """The draws in their order."""
         draws = [Draw(name, None) for _, name, _ in self._random_parameters]
         for name, array in self._random_variables:
@@ -131,13 +131,13 @@ class EpisodePlan:
     @cached_property
     def drawn_names(self) -> list[str]:
         """The names of the drawn parameters and variables, in the order of the draws."""
-        return list(dict.fromkeys(draw.name for draw in self.draws))
+        return list(dict.fromkeys(draw.name for draw in self.drawn))
 
     @cached_property
     def drawn_rows(self) -> list[int]:
         """For each draw, the index of its parameter; -1 for an episode variable."""
         rows = [index for index, *_ in self._random_parameters]
-        return rows + [-1] * (len(self.draws) - len(rows))
+        return rows + [-1] * (len(self.drawn) - len(rows))
 
     def named(self, values: FloatArray) -> dict[str, Any]:
         """The drawn values of M episodes by name.
@@ -165,8 +165,8 @@ class EpisodePlan:
         """The draws for the C extension; None if only Python can draw them."""
         recipes = []
         variables: list[Any] = [self.model_variables[i] for i, *_ in self._random_parameters]
-        variables += [None] * (len(self.draws) - len(variables))
-        for draw_, one, variable in zip(self.draws, self._distributions, variables, strict=True):
+        variables += [None] * (len(self.drawn) - len(variables))
+        for draw_, one, variable in zip(self.drawn, self._distributions, variables, strict=True):
             if variable is None:
                 recipes.append(recipe_of(one, partial(check_number, draw_.name)))
             else:
@@ -208,7 +208,7 @@ class EpisodePlan:
         return Starts(self.model_variables, tuple(map(tuple, values.tolist())))
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Draw the parameters of some episodes, in the order of the plan, shape (P, count)."""
+        """Draw the parameters of some episodes, in their order, shape (P, count)."""
         return np.hstack([self.draw(rng).start_values.copy() for _ in range(count)])
 
     def draw(self, rng: np.random.Generator) -> Episode:
@@ -258,7 +258,7 @@ class EpisodePlan:
                 values[place] = checked_value(self.model_variables[index], values[place])
         for place in range(len(self._random_parameters), len(values)):
             if type(values[place]) is not float:
-                name = self.draws[place].name
+                name = self.drawn[place].name
                 values[place] = check_number(
                     f"episode variable {name!r}", values[place], may_be_boolean=True
                 )

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.codec import coded, within
 
@@ -28,25 +28,25 @@ __all__ = [
 ]
 
 
-def drawn_info(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
-        plan: What the environments in the mask have drawn from.
+        draws: What the environments in the mask have drawn from.
         drawn: What they have drawn, shape (draws, N). No caller changes it.
         mask: The environments that were reset. No caller changes it.
     """
-    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
+    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
 
 
-def late_info(plan: EpisodePlan) -> tuple[Any, ...]:
+def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
     """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
-    return LateDict, UNFILLED, partial(_told, plan)
+    return LateDict, UNFILLED, partial(_told, draws)
 
 
-def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    told = plan.told | plan.shown(drawn)
-    kinds = {name: object if name in plan.strings else None for name in told}
+def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    told = draws.told | draws.shown(drawn)
+    kinds = {name: object if name in draws.strings else None for name in told}
     return coded({n: _of_each(v, len(mask), kinds[n]) for n, v in told.items()}, mask)
 
 

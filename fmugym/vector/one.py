@@ -107,11 +107,11 @@ class Player:
     def _compile(self, env: FMUEnv) -> None:
         self._watched = tuple(_watched_in(env))
         task = _traced(env, self._numbers)
-        plan, ended = env.inside.plan, np.ones(1, np.bool_)
+        draws, ended = env.inside.draws, np.ones(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
-        self._starts = plan.constants[:, None].copy()
+        self._starts = draws.constants[:, None].copy()
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
-        memory.parameters = dict(zip(plan.parameter_names, self._starts, strict=True))
+        memory.parameters = dict(zip(draws.parameter_names, self._starts, strict=True))
         memory.hold(task)
         self._task, self.left = task, task.left
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
@@ -121,11 +121,11 @@ class Player:
 
     def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
         """Hand the programs and their arrays to the pool."""
-        plan, (shapes, form, self._divided) = env.inside.plan, Layout(task, env, 1).of_one()
+        draws, (shapes, form, self._divided) = env.inside.draws, Layout(task, env, 1).of_one()
         real, flags = np.dtype(np.float64), ((1,), np.dtype(np.bool_))
         arrays = *shapes, ((1,), real), flags, flags, flags, ((0, 1), real)
         self._pool.prepare_play(
-            plan.model_variables,
+            draws.model_variables,
             memory.programs(task),
             memory.action_group(),
             self._starts,

@@ -19,7 +19,7 @@ from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
 from fmugym.pool.form import form_of_draws
 from fmugym.signals import ordinary
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import row_of, state_of
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class EpisodeStreams:
         self._seeds: npt.NDArray[Any] = np.full(num_envs, _NONE, object)
         self._all_seeded = False
         self._generator = np.random.Generator(np.random.PCG64(0))
-        self._latest: tuple[EpisodePlan, Draws | None] | None = None
+        self._latest: tuple[EpisodeDraws, Draws | None] | None = None
 
     def seed_of(self, index: int) -> int | None:
         """The seed of an environment; None if it goes on with a stream of unknown seed."""
@@ -111,30 +111,30 @@ class EpisodeStreams:
         for index, seed in zip(indices, seeds, strict=True):
             self.states[index] = row_of(np.random.PCG64(seed).state)
 
-    def draw(self, plan: EpisodePlan, indices: IndexArray) -> FloatArray:
+    def draw(self, draws: EpisodeDraws, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
 
         Returns:
-            The values in the order of ``plan.draws``, shape (draws, M).
+            The values in the order of ``draws.drawn``, shape (draws, M).
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
         self.require_seeds()
-        draws = self.native_draws(plan)
-        values = np.empty((len(plan.draws), len(indices)))
-        if draws is not None:
-            draws.take(self.states, indices, values)
+        native = self.native_draws(draws)
+        values = np.empty((len(draws.drawn), len(indices)))
+        if native is not None:
+            native.take(self.states, indices, values)
             return values
         for place, index in enumerate(indices.tolist()):
             with self._as_generator(index) as generator:
-                values[:, place] = plan.draw_values(generator)
+                values[:, place] = draws.draw_values(generator)
         return values
 
-    def native_draws(self, plan: EpisodePlan) -> Draws | None:
-        """The draws of a plan for the C extension; None if it cannot draw them."""
-        if self._latest is None or self._latest[0] is not plan:
-            self._latest = plan, _native_draws(plan)
+    def native_draws(self, draws: EpisodeDraws) -> Draws | None:
+        """The draws for the C extension; None if it cannot draw them."""
+        if self._latest is None or self._latest[0] is not draws:
+            self._latest = draws, _native_draws(draws)
         return self._latest[1]
 
     @contextmanager
@@ -153,14 +153,14 @@ def no_draws() -> Draws:
     return _draws((), ())
 
 
-def _native_draws(plan: EpisodePlan) -> Draws | None:
-    recipes = plan.recipes if has_native_pool() else None
+def _native_draws(draws: EpisodeDraws) -> Draws | None:
+    recipes = draws.recipes if has_native_pool() else None
     if recipes is None:
         return None
     needed = {"normal": _standard_normal, "log_uniform": _exponential}
     if any(recipe.kind in needed and not needed[recipe.kind]() for recipe in recipes):
         return None
-    return _draws(recipes, plan.drawn_rows)
+    return _draws(recipes, draws.drawn_rows)
 
 
 def _draws(recipes: Sequence[Recipe], rows: Sequence[int]) -> Draws:

@@ -229,7 +229,7 @@ def test_masks_of_every_form(form):
 
 
 def test_parameters_given_before_count():
-    """Options put the constants of some episodes in the place of the plan's: the general way."""
+    """Options give some episodes other constants: the general way."""
     first, second = made(CART_POLE), made(CART_POLE)
     mask = np.array([True, True, False, False, False])
     for envs in first, second:
@@ -280,7 +280,7 @@ def test_references_do_not_leak():
     watched = (
         mask,
         options,
-        engine.env.inside.plan,
+        engine.env.inside.draws,
         CART_POLE,
         None,
         True,

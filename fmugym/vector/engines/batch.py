@@ -25,8 +25,8 @@ from fmugym.pool.licences import require_started, start_instances
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.construction import plan_of, plan_of_reset
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.construction import draws_of, draws_of_reset
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
 from fmugym.task.readings import Readings, reading
@@ -98,16 +98,16 @@ class BatchEngine(Engine):
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
-        self._make_parameters(env.inside.plan)
+        self._make_parameters(env.inside.draws)
         self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
         self._prepare(task)
         self._note_foreign(slice(None), False)
 
-    def _make_parameters(self, plan: EpisodePlan) -> None:
-        self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
-        self._drawn_rows = np.array(plan.drawn_rows, np.intp)[:, None]
+    def _make_parameters(self, draws: EpisodeDraws) -> None:
+        self._start_values = np.repeat(draws.constants[:, None], self._n, axis=1)
+        self._drawn_rows = np.array(draws.drawn_rows, np.intp)[:, None]
         self._parameters = ParameterValues(
-            zip(plan.parameter_names, self._start_values, strict=True)
+            zip(draws.parameter_names, self._start_values, strict=True)
         )
         self._known = set(self._parameters)
         strings = self.env.fmu.description.strings
@@ -117,8 +117,8 @@ class BatchEngine(Engine):
     def _prepare(self, task: TracedTask) -> None:
         """Give the pool everything it needs for steps."""
         env, memory, streams = self.env, self._memory, self._streams
-        plan, draws = env.inside.plan, streams.native_draws(env.inside.plan)
-        drawn = () if draws is None else plan.draws
+        draws, native = env.inside.draws, streams.native_draws(env.inside.draws)
+        drawn = () if native is None else draws.drawn
         self._task, self._left = task, task.left
         self._left_after = {hook for hook in task.left if hook != "_get_inputs"}
         self.way = "compiled" if task.is_compiled else "array"
@@ -129,17 +129,17 @@ class BatchEngine(Engine):
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         drawn_array = (len(drawn), self._n), real
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
-        tell = late_info(plan)
+        tell = late_info(draws)
         self._play = self._pool.prepare_play(
-            plan.model_variables,
+            draws.model_variables,
             memory.programs(task),
             memory.action_group(),
             self._start_values,
-            (no_draws() if draws is None else draws, streams.states),
+            (no_draws() if native is None else native, streams.states),
             (env.step_count, self.ended, self._limit),
             memory.surroundings(task, drawn, (StepResult, *layout.form, arrays, tell)),
         )
-        has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
+        has_all_starts = native is not None and task.variables.keys() == env.variables.keys()
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
         self._settle_starts()
@@ -148,7 +148,7 @@ class BatchEngine(Engine):
         """Decide whether the pool itself starts episodes, in its step or in a reset.
 
         Python does so where others step the FMUs, where it has to draw values or to set episode
-        variables, where something goes with resets, and where constants are not those of the plan.
+        variables, where something goes with resets, and where constants are not the usual ones.
         """
         self._pool_starts = self._may_start and not self._any_foreign
         self._starts_at_ends = self._pool_starts and not self._left_after
@@ -158,8 +158,8 @@ class BatchEngine(Engine):
         env, before = self.env, self._parameters
         self._given[name] = numbers_of(values) if values.dtype == object else values
         env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
-        env.inside.plan = plan_of(env)
-        self._make_parameters(env.inside.plan)
+        env.inside.draws = draws_of(env)
+        self._make_parameters(env.inside.draws)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
         self._prepare(self._task)
@@ -282,7 +282,7 @@ class BatchEngine(Engine):
         return row
 
     def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
-        """Note which environments have another plan's constants: from options, or an older plan."""
+        """Note which environments have other constants: from options, or from before."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
         self._settle_starts()
@@ -303,14 +303,14 @@ class BatchEngine(Engine):
         started = None if options else self.reset_by({"reset_mask": mask})
         if started is not None:
             return started
-        plan = plan_of_reset(self.env, options, "reset_mask")
-        drawn = self._streams.draw(plan, indices)
-        self._begin(mask, indices, plan, drawn)
+        draws = draws_of_reset(self.env, options, "reset_mask")
+        drawn = self._streams.draw(draws, indices)
+        self._begin(mask, indices, draws, drawn)
         try:
             observations, infos = self._seen_at_start(None, {}, mask, ORDER)
         finally:
             self.note_starts(mask)
-        return observations, infos | self._told(plan, drawn, mask.copy())
+        return observations, infos | self._told(draws, drawn, mask.copy())
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``Engine.reset_by``."""
@@ -347,11 +347,11 @@ class BatchEngine(Engine):
         finally:
             self.env.inside.in_hooks = False
 
-    def _told(self, plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    def _told(self, draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
         """What infos tell of the episodes that have started in a mask."""
         of_all = np.zeros((len(drawn), self._n))
         of_all[:, mask] = drawn
-        return drawn_info(plan, of_all, mask)
+        return drawn_info(draws, of_all, mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
@@ -363,20 +363,20 @@ class BatchEngine(Engine):
             )
 
     def _begin(
-        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, drawn: FloatArray
+        self, mask: MaskArray, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray
     ) -> None:
         """Start episodes with values that were drawn, shape (draws, M)."""
-        values = self._place_episodes(drawn, indices, plan)
+        values = self._place_episodes(drawn, indices, draws)
         self.has_moved = True
         warm_ups = self.env.inside.warm_ups
         if warm_ups is None:
-            start_instances(self._pool, plan.model_variables, values, indices, mask)
-            self._forget(indices, plan)
+            start_instances(self._pool, draws.model_variables, values, indices, mask)
+            self._forget(indices, draws)
         else:
-            self._begin_with_warm_up(warm_ups, indices, plan, values)
+            self._begin_with_warm_up(warm_ups, indices, draws, values)
 
     def _begin_with_warm_up(
-        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
+        self, warm_ups: WarmUps, indices: IndexArray, draws: EpisodeDraws, values: FloatArray
     ) -> None:
         """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
         env, pool = self.env, self._pool
@@ -384,15 +384,15 @@ class BatchEngine(Engine):
         def start(where: IndexArray) -> Readings:
             mask = np.zeros(self._n, np.bool_)
             mask[where] = True
-            start_instances(pool, plan.model_variables, values, where, mask)
+            start_instances(pool, draws.model_variables, values, where, mask)
             return some(Readings.of(env), where)
 
         rows = {name: self._row(name) for name in env.variables}
-        self._forget(indices, plan)
-        warm_ups.begin(pool, plan.model_variables, values, rows, indices, start, self._place)
+        self._forget(indices, draws)
+        warm_ups.begin(pool, draws.model_variables, values, rows, indices, start, self._place)
         env.previous_state[:, indices] = env.state[:, indices]
 
-    def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
+    def _forget(self, indices: IndexArray, draws: EpisodeDraws) -> None:
         """Reset what hooks read, as a reset of a single environment does."""
         env = self.env
         env.step_count[indices] = 0
@@ -402,35 +402,35 @@ class BatchEngine(Engine):
         env.done[indices] = False
         for row, (name, start) in zip(env.inputs, env.inside.start_inputs, strict=True):
             row[indices] = (
-                self._parameters[name][indices] if name in plan.parameter_names else start
+                self._parameters[name][indices] if name in draws.parameter_names else start
             )
 
     def _place_episodes(
-        self, drawn: FloatArray, indices: IndexArray, plan: EpisodePlan
+        self, drawn: FloatArray, indices: IndexArray, draws: EpisodeDraws
     ) -> FloatArray:
         """Write the values of episodes into the rows of the parameters and variables.
 
         Returns:
-            The parameters in the order of the plan, shape (P, N).
+            The parameters in their order, shape (P, N).
         """
-        default = plan is self.env.inside.plan
-        self._place(plan.variable_starts, indices)
+        default = draws is self.env.inside.draws
+        self._place(draws.variable_starts, indices)
         if default and not self.env.variables:
             self._start_values[self._drawn_rows, indices] = drawn
         else:
-            rows = {n: hook_results.environments_last(v) for n, v in plan.named(drawn).items()}
+            rows = {n: hook_results.environments_last(v) for n, v in draws.named(drawn).items()}
             self._place(rows, indices)
         if not default or self._any_foreign:
-            self._place(plan.constant_parameters, indices)
+            self._place(draws.constant_parameters, indices)
             self._note_foreign(indices, not default)
         if self._given:
-            self._place_given(indices, plan)
+            self._place_given(indices, draws)
         if default:
             return self._start_values
-        return np.stack([self._parameters[name] for name in plan.parameter_names])
+        return np.stack([self._parameters[name] for name in draws.parameter_names])
 
-    def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
-        constant = plan.constant_parameters.keys() - plan.told.keys()
+    def _place_given(self, indices: IndexArray, draws: EpisodeDraws) -> None:
+        constant = draws.constant_parameters.keys() - draws.told.keys()
         given = {name: self._given[name][indices] for name in self._given if name in constant}
         self._place(given, indices)
 
@@ -479,14 +479,14 @@ class BatchEngine(Engine):
         self._note_foreign(indices, self._has_other_constants(columns["parameters"]))
 
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
-        """Whether parameters that are placed are not all those of the plan."""
-        plan = self.env.inside.plan
+        """Whether parameters that are placed are not all the usual ones."""
+        draws = self.env.inside.draws
         own = all(
             (np.asarray(columns[name]) == value).all()
-            for name, value in plan.constants_shown.items()
+            for name, value in draws.constants_shown.items()
             if name in columns
         )
-        return not own or not columns.keys() <= set(plan.parameter_names)
+        return not own or not columns.keys() <= set(draws.parameter_names)
 
     @contextmanager
     def assuming(
@@ -587,20 +587,20 @@ class BatchEngine(Engine):
     @passes_refusals
     def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
         """Start the episodes in the mask, and let the FMUs of the other environments step."""
-        play, plan = self._play, self.env.inside.plan
+        play, draws = self._play, self.env.inside.draws
         if starting is None:
             play.before(actions)
             self._pool.step()
             self.add_offsets(self._pool)
             return play.after(actions)
         indices = starting.nonzero()[0]
-        drawn = self._streams.draw(plan, indices)
+        drawn = self._streams.draw(draws, indices)
         play.before(actions)
-        self._begin(starting, indices, plan, drawn)
+        self._begin(starting, indices, draws, drawn)
         self._pool.step(None, starting)
         self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
-        result.infos.update(self._told(plan, drawn, starting))
+        result.infos.update(self._told(draws, drawn, starting))
         return result, troubled, any_ended, starting
 
     def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
@@ -764,7 +764,7 @@ class BatchEngine(Engine):
         if row.dtype == np.float64:
             return row
         return row.astype(
-            hook_results.type_of_variable(self.env.inside.plan, name, row.dtype), copy=False
+            hook_results.type_of_variable(self.env.inside.draws, name, row.dtype), copy=False
         )
 
     def _restore_variables(self, mask: MaskArray) -> None:

@@ -21,7 +21,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
 from fmugym.task.actions import take_action
-from fmugym.task.construction import plan_of, prepare_hooks
+from fmugym.task.construction import draws_of, prepare_hooks
 from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -113,7 +113,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
             env.inside.interface = env.inside.interface.with_parameter(name, values, index)
-            env.inside.plan = plan_of(env)
+            env.inside.draws = draws_of(env)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]

@@ -18,7 +18,7 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
 
@@ -179,20 +179,20 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     return array if array.ndim else np.full(count, array)
 
 
-def type_of_variable(plan: EpisodePlan, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
+def type_of_variable(draws: EpisodeDraws, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
     """The type in which N environments keep an episode variable.
 
     It is the type that ``_update`` assigns if this can hold the value with which episodes start.
     Otherwise it is float64, because episodes start while others are under way.
 
     Args:
-        plan: What episodes start with.
+        draws: What episodes start with.
         name: The variable.
         assigned: The type of what ``_update`` has assigned.
     """
-    if name in plan.drawn_names:
+    if name in draws.drawn_names:
         return _FLOAT
-    start = np.asarray(plan.constant_variables[name], _FLOAT)
+    start = np.asarray(draws.constant_variables[name], _FLOAT)
     with np.errstate(all="ignore"):
         fits = start.astype(assigned).astype(_FLOAT).tobytes() == start.tobytes()
     return assigned if fits else _FLOAT

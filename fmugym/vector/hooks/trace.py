@@ -319,7 +319,7 @@ class Tracer:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
-        self._variables[name] = type_of_variable(self._env.inside.plan, name, symbols.dtype)
+        self._variables[name] = type_of_variable(self._env.inside.draws, name, symbols.dtype)
         symbols = symbols.cast(old.dtype)
         choose = self._graph.choose
         cells: Any = np.empty(old.shape, object)
