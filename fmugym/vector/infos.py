@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodeDraws
+from fmugym.task.readings import environments_first
 from fmugym.task.values import UNFILLED, LateDict
 from fmugym.vector.codec import coded, within
 
@@ -50,8 +51,9 @@ def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, 
     return coded({n: _of_each(v, len(mask), kinds[n]) for n, v in told.items()}, mask)
 
 
-def _of_each(value: Any, count: int, kind: Any) -> npt.NDArray[Any]:
-    return value if isinstance(value, np.ndarray) else np.full(count, value, kind)
+def _of_each(value: Any, count: int, kind: Any) -> Any:
+    is_drawn = isinstance(value, np.ndarray)
+    return environments_first(value) if is_drawn else np.full(count, value, kind)
 
 
 def final_infos(

@@ -20,6 +20,7 @@ from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, info_of, judged
+from fmugym.task.native_draws import no_draws
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import NUMBERS, ORDER, conclude_left
 from fmugym.vector.contents import borrowed, differs
@@ -30,7 +31,6 @@ from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.streams import no_draws
 from fmugym.vector.views import batched, column
 
 __all__ = ["Player", "player_of"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -54,27 +54,7 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
         batch: What the hooks of all read.
         which: Their indices, or a slice.
     """
-    values: Any = _rows(batch.values, which)
-    variables = EpisodeVariables(batch.variables)
-    variables.update({name: _rows(row, which) for name, row in batch.variables.items()})
-    parameters = ParameterValues((n, _rows(row, which)) for n, row in batch.parameters.items())
-    return Readings(
-        values=values,
-        out=batch.out.over(lambda: values),
-        state=values[: len(batch.state)],
-        parameters=MappingProxyType(parameters),
-        variables=variables,
-        **{name: _rows(getattr(batch, name), which) for name in _ROWS},
-    )
-
-
-def _rows(values: Any, which: Any) -> npt.NDArray[Any]:
-    return np.array(np.asarray(values)[..., which])
-
-
-_ROWS: Final = (
-    *("previous_state", "inputs", "action", "previous_action", "step_count", "done", "after_end"),
-)
+    return batch.mapped(lambda values: np.array(np.asarray(values)[..., which]))
 
 
 def column(batch: Readings, index: int) -> Readings:

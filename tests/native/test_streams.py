@@ -11,10 +11,11 @@ from vector_tools import HOOKS, Drawing
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool.form import form_of_draws
+from fmugym.task import native_draws as module
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector import streams as module
+from fmugym.vector import streams as streams_module
 from fmugym.vector.streams import EpisodeStreams
 
 SEEDS = [
@@ -49,7 +50,8 @@ class OwnUniform(Uniform):
 @pytest.fixture(params=[True, False], ids=lambda native: "native" if native else "python")
 def native(request, monkeypatch):
     """Draw with the C extension, and as if there were none."""
-    monkeypatch.setattr(module, "has_native_pool", lambda: request.param)
+    for place in (module, streams_module):
+        monkeypatch.setattr(place, "has_native_pool", lambda: request.param)
     return request.param
 
 
@@ -91,7 +93,7 @@ def test_draws_are_numpys(name, native):
     streams, draws = EpisodeStreams(3), draws_of(*distributions)
     streams.seed(seeds, np.arange(3))
     if native:
-        assert streams.native_draws(draws) is not None
+        assert draws.native is not None
     generators = [np.random.default_rng(seed) for seed in seeds]
     for indices in ([0, 1, 2], [1], [2, 0]) * 200:
         drawn = streams.draw(draws, np.array(indices))
@@ -99,6 +101,20 @@ def test_draws_are_numpys(name, native):
         assert drawn.T.tolist() == expected
     for index, generator in enumerate(generators):
         assert state_of(streams, index) == generator.bit_generator.state
+
+
+@pytest.mark.parametrize("kind", ["PCG64", "MT19937", "Philox", "SFC64"])
+def test_draws_by_a_generator_of_any_kind_are_numpys(kind, native):
+    """A single environment has a generator, which the user may replace."""
+    distributions = [*DISTRIBUTIONS.values(), *reversed(DISTRIBUTIONS.values())]
+    draws = draws_of(*distributions)
+    if native:
+        assert draws.native is not None
+    ours, theirs = (np.random.Generator(getattr(np.random, kind)(9)) for _ in range(2))
+    for _ in range(100):
+        assert draws.draw_values(ours) == [draw(d, theirs) for d in distributions]
+    assert ours.random() == theirs.random()
+    assert ours.integers(7, dtype=np.int32) == theirs.integers(7, dtype=np.int32)
 
 
 def test_many_normal_numbers(native):
@@ -116,7 +132,7 @@ def test_python_and_native_code_take_turns(native):
     """Options may have distributions that only Python draws."""
     streams = EpisodeStreams(2)
     mine, all_known = draws_of(OwnUniform(0.0, 1.0), Choice([1, 2, 3])), draws_of(Choice([5, 6, 7]))
-    assert streams.native_draws(mine) is None
+    assert mine.native is None
     streams.seed([1, 2], np.arange(2))
     generators = [np.random.default_rng(seed) for seed in (1, 2)]
     for draws in (mine, all_known, all_known, mine, all_known) * 3:
@@ -155,8 +171,8 @@ def test_an_unseeded_stream_can_be_repeated(native):
 def test_normals_are_left_to_python_where_numpys_function_is_not_found(monkeypatch):
     monkeypatch.setattr(module, "_standard_normal", lambda: 0)
     streams = EpisodeStreams(1)
-    assert streams.native_draws(draws_of(Normal(0.0, 1.0))) is None
-    assert streams.native_draws(draws_of(Uniform(0.0, 1.0))) is not None
+    assert draws_of(Normal(0.0, 1.0)).native is None
+    assert draws_of(Uniform(0.0, 1.0)).native is not None
     streams.seed([4], np.arange(1))
     drawn = streams.draw(draws_of(Normal(0.0, 1.0)), np.arange(1))
     assert drawn[0, 0] == np.random.default_rng(4).normal()
@@ -289,11 +305,25 @@ class TestGuards:
         with pytest.raises(ValueError, match="ends too early"):
             _native.Draws(bytes(33), 0)
 
+    def test_what_is_no_bit_generator(self):
+        draws = draws_of(Uniform(0, 1)).native
+        with pytest.raises(ValueError, match="PyCapsule"):
+            draws.take_from(None, np.empty(1))
+
+    def test_too_few_start_values(self):
+        from fmugym import _native
+
+        kind = _native.distributions().index("uniform")
+        table = np.array([[kind, 1, 0, 2]], np.int64)
+        draws = _native.Draws(form_of_draws(table, np.array([0.0, 1.0])), 0)
+        with pytest.raises(ValueError, match="too few rows"):
+            draws.take_from(np.random.PCG64().capsule, np.empty(1))
+
     def test_streams_that_do_not_exist(self):
         from fmugym import _native
 
         states = np.zeros((3, 6), np.uint64)
-        draws = EpisodeStreams(1).native_draws(draws_of(Uniform(0, 1)))
+        draws = draws_of(Uniform(0, 1)).native
         for index in (-1, 3, 2**62):
             with pytest.raises(IndexError, match="there is no stream"):
                 _native.seed(states, np.array([index]), bytes(4))

@@ -21,19 +21,20 @@ from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
-from fmugym.pool.licences import require_started, start_instances
+from fmugym.pool.licences import require_started
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
+from fmugym.task.beginning import Beginning
 from fmugym.task.construction import draws_of, draws_of_reset
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
-from fmugym.task.readings import Readings, reading
+from fmugym.task.native_draws import no_draws
+from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.task.warm_up import WarmUps
 from fmugym.vector.action_arrays import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
@@ -46,7 +47,7 @@ from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.rollouts import costs_in
-from fmugym.vector.streams import EpisodeStreams, no_draws
+from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     columns_of,
     place_column,
@@ -105,7 +106,6 @@ class BatchEngine(Engine):
 
     def _make_parameters(self, draws: EpisodeDraws) -> None:
         self._start_values = np.repeat(draws.constants[:, None], self._n, axis=1)
-        self._drawn_rows = np.array(draws.drawn_rows, np.intp)[:, None]
         self._parameters = ParameterValues(
             zip(draws.parameter_names, self._start_values, strict=True)
         )
@@ -117,7 +117,7 @@ class BatchEngine(Engine):
     def _prepare(self, task: TracedTask) -> None:
         """Give the pool everything it needs for steps."""
         env, memory, streams = self.env, self._memory, self._streams
-        draws, native = env.inside.draws, streams.native_draws(env.inside.draws)
+        draws, native = env.inside.draws, env.inside.draws.native
         drawn = () if native is None else draws.drawn
         self._task, self._left = task, task.left
         self._left_after = {hook for hook in task.left if hook != "_get_inputs"}
@@ -305,7 +305,7 @@ class BatchEngine(Engine):
             return started
         draws = draws_of_reset(self.env, options, "reset_mask")
         drawn = self._streams.draw(draws, indices)
-        self._begin(mask, indices, draws, drawn)
+        self._begin(indices, draws, drawn)
         try:
             observations, infos = self._seen_at_start(None, {}, mask, ORDER)
         finally:
@@ -362,77 +362,22 @@ class BatchEngine(Engine):
                 f"environment {index}: the first observation is not finite: {first}"
             )
 
-    def _begin(
-        self, mask: MaskArray, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray
-    ) -> None:
+    def _begin(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
         """Start episodes with values that were drawn, shape (draws, M)."""
-        values = self._place_episodes(drawn, indices, draws)
+        self._place_episodes(indices, draws, drawn)
         self.has_moved = True
-        warm_ups = self.env.inside.warm_ups
-        if warm_ups is None:
-            start_instances(self._pool, draws.model_variables, values, indices, mask)
-            self._forget(indices, draws)
-        else:
-            self._begin_with_warm_up(warm_ups, indices, draws, values)
+        rows = {name: self._parameters[name] for name in draws.parameter_names}
+        is_usual = draws is self.env.inside.draws
+        values = self._start_values if is_usual else np.stack(list(rows.values()))
+        _Beginning(self, draws, indices, values, rows).begin()
 
-    def _begin_with_warm_up(
-        self, warm_ups: WarmUps, indices: IndexArray, draws: EpisodeDraws, values: FloatArray
-    ) -> None:
-        """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
-        env, pool = self.env, self._pool
-
-        def start(where: IndexArray) -> Readings:
-            mask = np.zeros(self._n, np.bool_)
-            mask[where] = True
-            start_instances(pool, draws.model_variables, values, where, mask)
-            return some(Readings.of(env), where)
-
-        rows = {name: self._row(name) for name in env.variables}
-        self._forget(indices, draws)
-        warm_ups.begin(pool, draws.model_variables, values, rows, indices, start, self._place)
-        env.previous_state[:, indices] = env.state[:, indices]
-
-    def _forget(self, indices: IndexArray, draws: EpisodeDraws) -> None:
-        """Reset what hooks read, as a reset of a single environment does."""
-        env = self.env
-        env.step_count[indices] = 0
-        env.previous_state[:, indices] = env.state[:, indices]
-        no_action = np.reshape(env.inside.no_action, (*env.action.shape[:-1], 1))
-        env.action[..., indices] = env.previous_action[..., indices] = no_action
-        env.done[indices] = False
-        for row, (name, start) in zip(env.inputs, env.inside.start_inputs, strict=True):
-            row[indices] = (
-                self._parameters[name][indices] if name in draws.parameter_names else start
-            )
-
-    def _place_episodes(
-        self, drawn: FloatArray, indices: IndexArray, draws: EpisodeDraws
-    ) -> FloatArray:
-        """Write the values of episodes into the rows of the parameters and variables.
-
-        Returns:
-            The parameters in their order, shape (P, N).
-        """
-        default = draws is self.env.inside.draws
-        self._place(draws.variable_starts, indices)
-        if default and not self.env.variables:
-            self._start_values[self._drawn_rows, indices] = drawn
-        else:
-            rows = {n: hook_results.environments_last(v) for n, v in draws.named(drawn).items()}
-            self._place(rows, indices)
-        if not default or self._any_foreign:
-            self._place(draws.constant_parameters, indices)
-            self._note_foreign(indices, not default)
-        if self._given:
-            self._place_given(indices, draws)
-        if default:
-            return self._start_values
-        return np.stack([self._parameters[name] for name in draws.parameter_names])
-
-    def _place_given(self, indices: IndexArray, draws: EpisodeDraws) -> None:
-        constant = draws.constant_parameters.keys() - draws.told.keys()
-        given = {name: self._given[name][indices] for name in self._given if name in constant}
-        self._place(given, indices)
+    def _place_episodes(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
+        """Write the values of episodes into the rows of the parameters and variables."""
+        constants = draws.constant_parameters
+        self._place(draws.variable_starts | constants | draws.named(drawn), indices)
+        own = constants.keys() - draws.told.keys()
+        self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
+        self._note_foreign(indices, draws is not self.env.inside.draws)
 
     def _place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         for name, value in values.items():
@@ -596,7 +541,7 @@ class BatchEngine(Engine):
         indices = starting.nonzero()[0]
         drawn = self._streams.draw(draws, indices)
         play.before(actions)
-        self._begin(starting, indices, draws, drawn)
+        self._begin(indices, draws, drawn)
         self._pool.step(None, starting)
         self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
@@ -656,7 +601,7 @@ class BatchEngine(Engine):
         """Call this hook on arrays, before the pool takes over the actions."""
         env, read = self.env, self.env.inside.readings
         before = read.action, read.previous_action, read.previous_state
-        read.previous_action, read.action = read.action, hook_results.environments_last(actions)
+        read.previous_action, read.action = read.action, environments_last(actions)
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
@@ -896,6 +841,54 @@ class BatchEngine(Engine):
         if self.env.inside.has_info:
             infos = self._infos(np.ones(self._n, np.bool_))
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
+
+
+class _Beginning(Beginning):
+    """Episodes that begin in some environments of a batch.
+
+    Args:
+        engine: Has the rows.
+        draws, indices, values, parameters: See ``Beginning``.
+    """
+
+    def __init__(
+        self,
+        engine: BatchEngine,
+        draws: EpisodeDraws,
+        indices: IndexArray,
+        values: FloatArray,
+        parameters: Mapping[str, FloatArray],
+    ) -> None:
+        super().__init__(engine.env, draws, indices, values, parameters)
+        self._engine = engine
+
+    def show(self, **values: Any) -> None:
+        """See ``Beginning.show``."""
+        for name, value in values.items():
+            rows = getattr(self.env.inside.readings, name)
+            rows[..., self.indices] = np.asarray(value)[..., np.newaxis]
+
+    def show_inputs(self, values: list[Any]) -> None:
+        """See ``Beginning.show_inputs``."""
+        for row, value in zip(self.env.inside.readings.inputs, values, strict=True):
+            row[self.indices] = value[self.indices] if isinstance(value, np.ndarray) else value
+
+    def look(self) -> None:
+        """See ``Beginning.look``."""
+        read = self.env.inside.readings
+        read.previous_state[:, self.indices] = read.state[:, self.indices]
+
+    def readings(self, indices: IndexArray) -> Readings:
+        """See ``Beginning.readings``."""
+        return some(self.env.inside.readings, indices)
+
+    def row(self, name: str) -> FloatArray:
+        """See ``Beginning.row``."""
+        return self._engine._row(name)
+
+    def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
+        """See ``Beginning.place``."""
+        self._engine._place(values, indices)
 
 
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:

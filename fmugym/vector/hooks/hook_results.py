@@ -19,12 +19,11 @@ from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 from fmugym.task.episode import EpisodeDraws
+from fmugym.task.readings import environments_first
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
 
 __all__ = [
-    "environments_first",
-    "environments_last",
     "flags",
     "info_arrays",
     "observations",
@@ -148,16 +147,6 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
             raise _mismatch(hook, value, wanted)
         with np.errstate(over="ignore", invalid="ignore"):  # infinite is a fault, and found later
             return np.array(environments_first(array), space.dtype, order="C")
-
-
-def environments_first(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """View an array with its last axis first."""
-    return array.T if array.ndim <= 2 else np.moveaxis(array, -1, 0)  # which takes 3 us
-
-
-def environments_last(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """View an array with its first axis last."""
-    return array.T if array.ndim <= 2 else np.moveaxis(array, 0, -1)
 
 
 def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
