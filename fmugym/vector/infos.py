@@ -14,7 +14,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.task.episode import EpisodeDraws
 from fmugym.task.readings import environments_first
 from fmugym.task.values import UNFILLED, LateDict
-from fmugym.vector.codec import coded, within
+from fmugym.vector.codec import coded, mapped, within
 
 __all__ = [
     "copy_rows",
@@ -34,10 +34,12 @@ def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[
 
     Args:
         draws: What the environments in the mask have drawn from.
-        drawn: What they have drawn, shape (draws, N). No caller changes it.
+        drawn: What they have drawn, shape (draws, M).
         mask: The environments that were reset. No caller changes it.
     """
-    return {"drawn": LateDict.of(_told, draws, drawn, mask), "_drawn": mask}  # rarely read
+    of_all = np.zeros((len(drawn), len(mask)))
+    of_all[:, mask] = drawn
+    return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
 
 
 def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
@@ -100,11 +102,11 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
     """Copy the rows of environments in a mask from arrays, or dicts of arrays, to others."""
-    if isinstance(target, Mapping):
-        for name, values in target.items():
-            copy_rows(source[name], values, mask)
-    else:
-        target[mask] = source[mask]
+
+    def copy(values: npt.NDArray[Any], others: npt.NDArray[Any]) -> None:
+        values[mask] = others[mask]
+
+    mapped(copy, target, source)
 
 
 def not_finite(values: Any) -> MaskArray | None:
@@ -125,11 +127,7 @@ def not_finite(values: Any) -> MaskArray | None:
 
 def observation_of(observations: Any, index: int) -> Any:
     """A copy of the observation of one environment."""
-    if isinstance(observations, Mapping):
-        return {name: observation_of(value, index) for name, value in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(observation_of(value, index) for value in observations)
-    return observations[index].copy()
+    return mapped(lambda values: values[index].copy(), observations)
 
 
 def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

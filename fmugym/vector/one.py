@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, info_of, judged
@@ -25,7 +24,7 @@ from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import NUMBERS, ORDER, conclude_left
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.programs import compile_hooks
+from fmugym.vector.engines.programs import attempt, compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import UntraceableError
@@ -57,20 +56,7 @@ def player_of(env: FMUEnv, required: bool) -> Player | None:
     Raises:
         ConfigError: If they cannot, but must.
     """
-    try:
-        player = Player(env)
-        if required and player.left:
-            raise UntraceableError("; ".join(player.left.values()))
-    except ordinary(Exception) as reason:  # hooks may raise anything
-        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
-        if required:
-            raise ConfigError(text) from None
-        logger.info("%s. They run in Python, which is slower", text)
-        return None
-    for why in player.left.values():
-        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
-        logger.info("%s. It runs in Python, the others are compiled", text)
-    return player
+    return attempt(env, lambda: Player(env), required, "in Python")
 
 
 class Player:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables, ParameterValues
+from fmugym.task.values import EpisodeVariables
 
 __all__ = ["batched", "column", "some", "take"]
 
@@ -59,27 +58,13 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
 
 def column(batch: Readings, index: int) -> Readings:
     """Return what the hooks of one environment of a batch read, as Python's numbers."""
-    values = tuple(batch.values[:, index].tolist())
-    variables = EpisodeVariables(batch.variables)
-    variables.update(_taken(batch.variables, index))
-    return Readings(
-        values=values,
-        out=batch.out.over(lambda: values),
-        state=values[: len(batch.state)],
-        previous_state=tuple(batch.previous_state[:, index].tolist()),
-        inputs=tuple(batch.inputs[:, index].tolist()),
-        action=take(batch.action, index),
-        previous_action=take(batch.previous_action, index),
-        step_count=int(batch.step_count[index]),
-        done=bool(batch.done[index]),
-        after_end=bool(batch.after_end[index]),
-        parameters=MappingProxyType(ParameterValues(_taken(batch.parameters, index))),
-        variables=variables,
-    )
-
-
-def _taken(rows: Mapping[str, Any], index: int) -> dict[str, Any]:
-    return {name: take(row, index) for name, row in rows.items()}
+    one = batch.mapped(lambda row: take(row, index))
+    for name in ("values", "previous_state", "inputs"):
+        setattr(one, name, tuple(getattr(one, name).tolist()))
+    one.state = one.values[: len(batch.state)]
+    one.step_count = int(one.step_count)
+    one.done, one.after_end = bool(one.done), bool(one.after_end)
+    return one
 
 
 def take(values: Any, index: int) -> Any:

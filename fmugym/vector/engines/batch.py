@@ -17,7 +17,7 @@ import numpy.typing as npt
 from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
+from fmugym.fmi.status import TERMINATED_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
@@ -39,7 +39,7 @@ from fmugym.vector.action_arrays import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.engine import Engine, StepResult
+from fmugym.vector.engines.engine import Engine, StepResult, failed_in
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import hook_results
@@ -310,7 +310,7 @@ class BatchEngine(Engine):
             observations, infos = self._seen_at_start(None, {}, mask, ORDER)
         finally:
             self.note_starts(mask)
-        return observations, infos | self._told(draws, drawn, mask.copy())
+        return observations, infos | drawn_info(draws, drawn, mask.copy())
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``Engine.reset_by``."""
@@ -346,12 +346,6 @@ class BatchEngine(Engine):
             return observations, infos
         finally:
             self.env.inside.in_hooks = False
-
-    def _told(self, draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-        """What infos tell of the episodes that have started in a mask."""
-        of_all = np.zeros((len(drawn), self._n))
-        of_all[:, mask] = drawn
-        return drawn_info(draws, of_all, mask)
 
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
@@ -545,7 +539,7 @@ class BatchEngine(Engine):
         self._pool.step(None, starting)
         self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
-        result.infos.update(self._told(draws, drawn, starting))
+        result.infos.update(drawn_info(draws, drawn, starting))
         return result, troubled, any_ended, starting
 
     def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
@@ -577,7 +571,7 @@ class BatchEngine(Engine):
         horizon = len(actions)
         shape = horizon, self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        seen = self._arrays_of_steps(horizon)
+        seen = self._new_arrays(horizon)
         self.has_moved = True
         arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
         offsets = np.empty(0) if self.offsets is None else self.offsets
@@ -585,15 +579,6 @@ class BatchEngine(Engine):
             return None
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
         return observations, *judged, costs_in(infos, judged[0].shape)
-
-    def _arrays_of_steps(self, horizon: int) -> Any:
-        """Make the arrays of many steps, with a first axis for the steps."""
-        arrays = self._new_arrays()
-        if isinstance(arrays, tuple):
-            return tuple(_for_steps(array, horizon) for array in arrays)
-        if isinstance(arrays, dict):
-            return {name: _for_steps(array, horizon) for name, array in arrays.items()}
-        return _for_steps(arrays, horizon)
 
     # Hooks without a program.
 
@@ -650,7 +635,7 @@ class BatchEngine(Engine):
     ) -> StepResult:
         """Call the hooks that are not compiled, in their order."""
         env, left = self.env, self._left
-        self._idle = self._failed(self._pool.statuses) if troubled else None
+        self._idle = failed_in(self._pool.statuses) if troubled else None
         if started is not None:
             self._idle = started if self._idle is None else self._idle | started
         env.inside.in_hooks = True
@@ -728,14 +713,6 @@ class BatchEngine(Engine):
             infos |= hook_results.info_arrays(self._pool.info(), mask)
         return infos
 
-    def _stopped(self, statuses: StatusArray) -> MaskArray:
-        stopped: MaskArray = statuses == TERMINATED_CODE
-        return stopped
-
-    def _failed(self, statuses: StatusArray) -> MaskArray:
-        failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
-        return failed
-
     def _mend(
         self,
         result: StepResult,
@@ -779,7 +756,7 @@ class BatchEngine(Engine):
         wrong: tuple[MaskArray | None, MaskArray | None],
     ) -> None:
         """Handle FMUs that failed or asked to stop, and numbers that are not finite."""
-        stopped, failed = self._stopped(statuses), self._failed(statuses)
+        stopped, failed = statuses == TERMINATED_CODE, failed_in(statuses)
         if stopped.any():
             result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
@@ -920,7 +897,3 @@ def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
     return row
-
-
-def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
-    return np.empty((horizon, *array.shape), array.dtype)

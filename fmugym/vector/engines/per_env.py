@@ -29,7 +29,7 @@ from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
-from fmugym.vector.codec import gathered
+from fmugym.vector.codec import gathered, mapped
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult
 
@@ -313,11 +313,7 @@ def _concluded(env: FMUEnv, status: int, values: tuple[float, ...]) -> Result:
 
 def _copied(observation: Any) -> Any:
     """Copy the arrays of an observation, whose memory may serve the next hook."""
-    if type(observation) is np.ndarray:
-        return observation.copy()
-    if isinstance(observation, dict):
-        return {name: _copied(part) for name, part in observation.items()}
-    return observation
+    return mapped(lambda part: part.copy() if type(part) is np.ndarray else part, observation)
 
 
 def _misfit(space: Any, observations: Sequence[Any]) -> ConfigError:

@@ -90,7 +90,7 @@ def _rows_of(value: Any, length: int, wanted: str) -> Any:
 def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]:
     """Turn a number, or an array of N numbers, into an array of shape (N,); it may be a view."""
     given(value, hook)
-    try:
+    with _expected(hook, value, wanted):
         array = np.asarray(value)
         if array.dtype == object:  # decimals, fractions and the like
             numbers = [number_of(hook, one, may_be_boolean=True) for one in array.flat]
@@ -99,11 +99,7 @@ def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]
             array = array.reshape(count)
         if array.dtype.kind in _NUMBERS:
             return np.broadcast_to(array, (count,))
-    except FMUGymError:
-        raise
-    except ordinary(Exception):  # it makes no array, or its own methods fail
-        raise _mismatch(hook, value, wanted) from None
-    raise _mismatch(hook, value, wanted)
+        raise _mismatch(hook, value, wanted)
 
 
 @contextmanager
