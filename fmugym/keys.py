@@ -168,19 +168,18 @@ def checked(kind: AnyKind, value: Any) -> Any:
     return result
 
 
-def found_mistakes(kind: AnyKind, value: Any, keys: Keys = ()) -> tuple[Any, list[Mistake]]:
+def found_mistakes(kind: AnyKind, value: Any) -> tuple[Any, list[Mistake]]:
     """Check a value, and find everything that is wrong with it.
 
     Args:
         kind: What it may be.
         value: As the user gave it.
-        keys: Those that lead to it.
 
     Returns:
         The value as in ``checked``, as far as it is right, and the mistakes.
     """
     reading = _Reading([])
-    return reading.read(kind, keys, value), reading.mistakes
+    return reading.read(kind, (), value), reading.mistakes
 
 
 class _Reading(NamedTuple):

@@ -459,15 +459,9 @@ class BatchEngine(Engine):
 
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
-        self.env.inside.in_hooks = True
-        try:
-            observations = self._observe()
-        finally:
-            self.env.inside.in_hooks = False
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
-        self._require_finite_start(observations, mask)
-        return observations
+        return self._seen_at_start(None, {}, mask, ("_get_observation",))[0]
 
     # Steps.
 
