@@ -361,8 +361,7 @@ class BatchEngine(Engine):
         self._place_episodes(indices, draws, drawn)
         self.has_moved = True
         rows = {name: self._parameters[name] for name in draws.parameter_names}
-        is_usual = draws is self.env.inside.draws
-        values = self._start_values if is_usual else np.stack(list(rows.values()))
+        values = np.array([*rows.values()]).reshape(len(rows), self._n)
         _Beginning(self, draws, indices, values, rows).begin()
 
     def _place_episodes(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:

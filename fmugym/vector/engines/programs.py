@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
@@ -19,14 +19,11 @@ from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import DifferenceError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 
-if TYPE_CHECKING:
-    from fmugym.vector.one import Player
-
 __all__ = ["attempt", "compile_hooks", "find_programs"]
 
 logger = logging.getLogger(__name__)
 
-_Made = TypeVar("_Made", TracedTask, "Player")
+_Made = TypeVar("_Made")
 
 _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
@@ -54,7 +51,7 @@ def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) 
 
     Args:
         env: The environment.
-        make: Compiles its hooks.
+        make: Compiles its hooks; what it returns has in ``left`` those that cannot be compiled.
         required: Whether hooks that cannot be compiled are an error.
         where: How such hooks are called: ``"on arrays"``, for example.
 
@@ -66,7 +63,7 @@ def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) 
     """
     name = type(env).__name__
     try:
-        made = make()
+        made: Any = make()
     except ordinary(Exception) as reason:  # hooks may raise anything
         text = f"the hooks of {name} cannot be compiled: {reason}"
         if required:
@@ -78,7 +75,7 @@ def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) 
         if required:
             raise ConfigError(text)
         logger.info("%s. It runs %s, the others are compiled", text, where)
-    return made
+    return cast(_Made, made)
 
 
 def compile_hooks(
