@@ -62,10 +62,10 @@ def _pools(stack: ExitStack, make_env: Callable[[], Any], count: int) -> list[An
     for options in ({"isolation": "none"}, {"isolation": "process", "workers": 1}):
         env = make_with_pool(make_env, count, threads=1, **options)
         stack.callback(env.close)
-        plan = env.inside.plan
+        draws = env.inside.draws
         pools.append(env.inside.pool)
         env.inside.pool.reset(
-            plan.model_variables, np.repeat(plan.constants[:, None], count, axis=1)
+            draws.model_variables, np.repeat(draws.constants[:, None], count, axis=1)
         )
     return pools
 

@@ -76,8 +76,8 @@ def _pool(stack: ExitStack, path: Path, size: int) -> Any:
         lambda: PushedCartPoleEnv(path), size, isolation="process", workers=1, threads=1
     )
     stack.callback(env.close)
-    plan = env.inside.plan
-    env.inside.pool.reset(plan.model_variables, np.repeat(plan.constants[:, None], size, axis=1))
+    draws = env.inside.draws
+    env.inside.pool.reset(draws.model_variables, np.repeat(draws.constants[:, None], size, axis=1))
     return env.inside.pool
 
 

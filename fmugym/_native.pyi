@@ -134,6 +134,17 @@ class Draws:
             values: Filled, float64, shape (draws, M).
         """
 
+    def take_from(self, bits: object, start_values: Array, /) -> list[float]:
+        """Draw an episode by a bit generator of numpy.
+
+        Args:
+            bits: Its ``capsule``; the caller holds its ``lock``.
+            start_values: Gets those that are drawn, float64, shape (P,).
+
+        Returns:
+            The values in the order of the draws.
+        """
+
 @final
 class Snapshot:
     """The FMU states of a pool, freed with the last reference to this object."""

@@ -24,21 +24,17 @@ from fmugym.errors import (
 )
 from fmugym.fmi.status import WARNING_CODE
 from fmugym.pool import Pool
-from fmugym.pool.bundle import IndexArray
-from fmugym.pool.licences import start_instances
 from fmugym.systems import FMUSystem
 from fmugym.task.actions import take_action
 from fmugym.task.alone import alone
-from fmugym.task.construction import Constructed, plan_of_reset, prepare_hooks
-from fmugym.task.episode import Episode, EpisodePlan
+from fmugym.task.beginning import FIRST, BeginningOfOne
+from fmugym.task.construction import Constructed, draws_of_reset, prepare_hooks
 from fmugym.task.interface import readable_named
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
-from fmugym.task.readings import Readings
 from fmugym.task.saving import columns_of, place_columns, require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot, scope_of
 from fmugym.task.starting import start_time_of
-from fmugym.task.warm_up import WarmUps, rows_of_one
 
 __all__ = [
     "FMI1CSEnv",
@@ -55,9 +51,6 @@ _ARGUMENTS: Final = (
 )
 
 _WAYS: Final = ("auto", "compiled", "python")
-
-_FIRST: Final = np.zeros(1, np.int64)
-"""The index of the only instance."""
 
 _PLAYERS: Final = "fmugym.vector.one"
 """The module of players is imported late: it needs this one, and takes a while."""
@@ -201,17 +194,13 @@ class FMUEnv(Constructed):
         if not inside.was_reset:
             prepare_hooks(self)  # the constructor of the class may have set some as attributes
             self._require_way(pool)
-        seed, plan = check_seed(seed), plan_of_reset(self, options)
+        seed, draws = check_seed(seed), draws_of_reset(self, options)
         super().reset(seed=seed)
         generator = self._np_random
-        episode = plan.draw(self.np_random if generator is None else generator)
+        episode = draws.draw(self.np_random if generator is None else generator)
         inside.ended = True  # there is no episode if the FMU fails
         try:
-            if inside.warm_ups is None:
-                start_instances(pool, plan.model_variables, episode.start_values, _FIRST)
-                self._begin_episode(episode)
-            else:
-                self._begin_with_warm_up(inside.warm_ups, pool, plan, episode)
+            BeginningOfOne(self, draws, episode).begin()
             inside.was_reset, inside.ended = True, False
             observation, info = first_observation(self)
             if not inside.has_chosen:
@@ -224,27 +213,6 @@ class FMUEnv(Constructed):
         if self.render_mode == "human":
             self.render()
         return observation, info
-
-    def _begin_with_warm_up(
-        self, warm_ups: WarmUps, pool: Pool, plan: EpisodePlan, episode: Episode
-    ) -> None:
-        """Begin an episode with a warm-up, or in the state that an earlier one has led to."""
-        self._begin_episode(episode)
-        read = self.inside.readings
-
-        def start(_: IndexArray) -> Readings:
-            start_instances(pool, plan.model_variables, starts, _FIRST)
-            self._read_outputs()
-            return rows_of_one(self)
-
-        def place(written: Mapping[str, Any], _: IndexArray) -> None:
-            values = {name: row[..., 0] for name, row in written.items()}
-            read.variables.update({n: v.item() if v.ndim == 0 else v for n, v in values.items()})
-
-        rows, starts = rows_of_one(self).variables, episode.start_values
-        warm_ups.begin(pool, plan.model_variables, starts, rows, _FIRST, start, place)
-        read.inputs = tuple(self.inside.input_row.tolist())
-        self._read_outputs()
 
     def _obstacle(self, pool: Pool) -> str | None:
         """What keeps the pool from calling hooks, whatever they compute."""
@@ -267,29 +235,6 @@ class FMUEnv(Constructed):
             self.inside.player = import_module(_PLAYERS).player_of(
                 self, self.inside.way == "compiled"
             )
-
-    def _begin_episode(self, episode: Episode) -> None:
-        inside = self.inside
-        if inside.player is not None:
-            inside.player.begin(inside)
-        read = inside.readings
-        read.parameters = episode.parameters
-        if episode.variables:
-            read.variables.update(episode.variables)
-        read.step_count = 0
-        read.action = read.previous_action = inside.no_action
-        given = episode.parameters.get
-        read.inputs = tuple([given(name, start) for name, start in inside.start_inputs])
-        read.done = read.after_end = False
-        self._read_outputs()
-        inside.pictured = None, 0.0
-
-    def _read_outputs(self) -> None:
-        """Let hooks read the outputs of an episode that has not stepped yet."""
-        inside = self.inside
-        read = inside.readings
-        read.values = tuple(inside.output_row.tolist())
-        read.state = read.previous_state = read.values[: inside.output_count]
 
     def step(self, action: Any) -> Result:
         """Write the action to the FMU, simulate one time step and evaluate the hooks.
@@ -386,7 +331,7 @@ class FMUEnv(Constructed):
         if not self.inside.was_reset:
             raise SimulationError("save_state was called before the first reset")
         self.inside.keep()
-        bundle = pool.save_instances(_FIRST)
+        bundle = pool.save_instances(FIRST)
         return Snapshot(scope_of(self), columns_of(self), bundle)
 
     @alone
@@ -411,7 +356,7 @@ class FMUEnv(Constructed):
         require_saving(pool)
         self.inside.keep()
         self.inside.ended = True  # there is no episode if the FMU fails
-        if pool.restore_instances(snapshot.bundle, _FIRST, _FIRST)[0] > WARNING_CODE:
+        if pool.restore_instances(snapshot.bundle, FIRST, FIRST)[0] > WARNING_CODE:
             raise SimulationError(pool.failure(0))
         place_columns(self, columns, 0)
         observation = first_observation(self)[0]

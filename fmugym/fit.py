@@ -141,12 +141,12 @@ class _Plant:
         if not isinstance(env, FMUEnv):
             raise ConfigError(f"expected an environment of fmugym, got {shown(env)}")
         self.env, self._columns = env, columns
-        plan = env.inside.plan
-        typical = np.median(plan.draw_starts(np.random.default_rng(0), 101), axis=1).tolist()
-        pairs = zip(plan.model_variables, typical, strict=True)
+        draws = env.inside.draws
+        typical = np.median(draws.draw_starts(np.random.default_rng(0), 101), axis=1).tolist()
+        pairs = zip(draws.model_variables, typical, strict=True)
         given = {v.name: value for v, value in pairs if not is_start_time(v)}
         self.given: dict[str, Any] = given | {
-            name: value for name, value in plan.constants_shown.items() if name in plan.strings
+            name: value for name, value in draws.constants_shown.items() if name in draws.strings
         }
 
     def trajectories(self, log: PlantLog) -> Iterator[Trajectory]:

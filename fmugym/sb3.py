@@ -229,11 +229,11 @@ class FMUVecEnv(VecEnv):
         if name in self._set_parameters:
             return self._set_parameters[name]
         env = self.vector_env.inside.prototype
-        if name in env.inside.plan.drawn_names:
+        if name in env.inside.draws.drawn_names:
             raise ConfigError(f"{name!r} is drawn in each episode: set it for all environments")
         variable = env.fmu.variable(name)
         start = variable.start or "" if variable.kind == "string" else variable.start_number
-        return [env.inside.plan.constants_shown.get(name, start)] * self.num_envs
+        return [env.inside.draws.constants_shown.get(name, start)] * self.num_envs
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any

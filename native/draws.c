@@ -65,12 +65,7 @@ bool draws_fit(const Draws *draws, size_t rows) {
     return true;
 }
 
-static double uniform(Stream *stream, const double *numbers) {
-    const double scaled = numbers[1] * stream_next_double(stream);
-    return numbers[0] + scaled;
-}
-
-/* The functions that numpy calls for normal distributions. */
+/* The functions of a bit generator. */
 
 static uint64_t next_64(void *stream) {
     return stream_next_64(stream);
@@ -84,11 +79,18 @@ static double next_double(void *stream) {
     return stream_next_double(stream);
 }
 
-static double normal(const Draws *draws, Stream *stream, const double *numbers) {
-    BitGenerator bits = {stream, next_64, next_32, next_double, next_64};
+BitGenerator bits_of(Stream *stream) {
+    return (BitGenerator){stream, next_64, next_32, next_double, next_64};
+}
 
+static double uniform(BitGenerator *bits, const double *numbers) {
+    const double scaled = numbers[1] * bits->next_double(bits->state);
+    return numbers[0] + scaled;
+}
+
+static double normal(const Draws *draws, BitGenerator *bits, const double *numbers) {
     for (;;) {
-        const double scaled = numbers[1] * draws->standard_normal(&bits);
+        const double scaled = numbers[1] * draws->standard_normal(bits);
         const double value = numbers[0] + scaled;
         if (numbers[2] <= value && value <= numbers[3] && isfinite(value)) {
             return value;
@@ -97,23 +99,23 @@ static double normal(const Draws *draws, Stream *stream, const double *numbers) 
 }
 
 /* An index below count, by the method of D. Lemire, "Fast Random Integer Generation in an
- * Interval" (2019). A single value needs no number of the stream. */
-static size_t bounded(Stream *stream, uint32_t count) {
+ * Interval" (2019). A single value needs no number. */
+static size_t bounded(BitGenerator *bits, uint32_t count) {
     if (count == 1) {
         return 0;
     }
     const uint32_t threshold = (UINT32_MAX - (count - 1)) % count;
-    uint64_t scaled = (uint64_t)stream_next_32(stream) * count;
+    uint64_t scaled = (uint64_t)bits->next_uint32(bits->state) * count;
 
     while ((uint32_t)scaled < threshold) {
-        scaled = (uint64_t)stream_next_32(stream) * count;
+        scaled = (uint64_t)bits->next_uint32(bits->state) * count;
     }
     return (size_t)(scaled >> 32);
 }
 
 /* The first value whose cumulated probability is above a uniform number. */
-static double weighted(Stream *stream, const double *cumulated, size_t count) {
-    const double number = stream_next_double(stream);
+static double weighted(BitGenerator *bits, const double *cumulated, size_t count) {
+    const double number = bits->next_double(bits->state);
     size_t low = 0, high = count - 1;
 
     while (low < high) {
@@ -128,30 +130,38 @@ static double weighted(Stream *stream, const double *cumulated, size_t count) {
 }
 
 /* The place of a choice stays for the draws that take the same row. */
-static double take(const Draws *draws, const Draw *draw, Stream *stream, size_t *place) {
+static double take(const Draws *draws, const Draw *draw, BitGenerator *bits, size_t *place) {
     const double *numbers = draws->numbers + draw->first;
 
     switch (draw->kind) {
     case KIND_UNIFORM:
-        return uniform(stream, numbers);
+        return uniform(bits, numbers);
     case KIND_LOG_UNIFORM:
-        return draws->exponential(uniform(stream, numbers));
+        return draws->exponential(uniform(bits, numbers));
     case KIND_NORMAL:
-        return normal(draws, stream, numbers);
+        return normal(draws, bits, numbers);
     case KIND_CHOICE:
-        *place = bounded(stream, (uint32_t)draw->count);
+        *place = bounded(bits, (uint32_t)draw->count);
         return numbers[*place];
     case KIND_SAME_ROW:
         return numbers[*place];
     default:
-        return weighted(stream, numbers, (size_t)draw->count / 2);
+        return weighted(bits, numbers, (size_t)draw->count / 2);
     }
 }
 
-void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride) {
+void draws_take(const Draws *draws, BitGenerator *bits, double *values, size_t stride) {
     size_t place = 0;
 
     for (size_t i = 0; i < draws->count; i++) {
-        values[i * stride] = take(draws, &draws->draws[i], stream, &place);
+        values[i * stride] = take(draws, &draws->draws[i], bits, &place);
+    }
+}
+
+void draws_start(const Draws *draws, const double *values, double *start_values, size_t stride) {
+    for (size_t i = 0; i < draws->count; i++) {
+        if (draws->draws[i].row >= 0) {
+            start_values[(size_t)draws->draws[i].row * stride] = values[i * stride];
+        }
     }
 }

@@ -59,7 +59,13 @@ bool draws_are_sound(const Draws *draws, size_t number_of_numbers);
 /* Whether all rows are below this number. */
 bool draws_fit(const Draws *draws, size_t rows);
 
+/* The bit generator whose numbers are those of a stream. */
+BitGenerator bits_of(Stream *stream);
+
 /* Draws the values of an episode, which lie stride values apart. */
-void draws_take(const Draws *draws, Stream *stream, double *values, size_t stride);
+void draws_take(const Draws *draws, BitGenerator *bits, double *values, size_t stride);
+
+/* Sets the start values among the values of an episode, all of which lie stride values apart. */
+void draws_start(const Draws *draws, const double *values, double *start_values, size_t stride);
 
 #endif

@@ -54,19 +54,14 @@ void play_foresee(const Play *play, size_t index) {
 
 void play_draw(const Turn *turn, size_t index) {
     const Play *play = turn->play;
-    const Draws *d = play->draws;
     double *values = turn->drawn + index;
 
     if (turn->drawn == NULL) { /* as in rollouts: no episode that has ended is followed */
         return;
     }
-    draws_take(d, &play->streams[index], values, play->count);
-    for (size_t i = 0; i < d->count; i++) {
-        if (d->draws[i].row >= 0) {
-            play->start_values[(size_t)d->draws[i].row * play->count + index] =
-                values[i * play->count];
-        }
-    }
+    BitGenerator bits = bits_of(&play->streams[index]);
+    draws_take(play->draws, &bits, values, play->count);
+    draws_start(play->draws, values, play->start_values + index, play->count);
 }
 
 static Source source_of(const Turn *turn) {

@@ -246,7 +246,7 @@ class TestFitted:
 
     def test_rows_are_drawn_whole_by_all_environments(self, document):
         with fmugym.load(document) as env:
-            assert env.inside.plan.recipes[-1].kind == "same_row"
+            assert env.inside.draws.recipes[-1].kind == "same_row"
             single = [drawn(env, seed) for seed in range(20)]
         assert all(one["c"] == pytest.approx(0.5 * one["l"], rel=1e-12) for one in single)
         assert len({one["l"] for one in single}) > 10
@@ -265,7 +265,7 @@ class TestFitted:
 
         document["parameters"] = {"b": Own()}
         with fmugym.load(document) as env:
-            assert env.inside.plan.recipes is None
+            assert env.inside.draws.recipes is None
             values = drawn(env, 3)
             again = env.reset(seed=3, options={"model_parameters": {"l": 0.1}})[1]["drawn"]
         assert values["c"] == pytest.approx(0.5 * values["l"], rel=1e-12)

@@ -111,8 +111,10 @@ def numbers_of(texts: Iterable[str | None]) -> npt.NDArray[np.float64]:
     return np.array([np.nan if text is None else number_of(text) for text in texts])
 
 
-def texts_of(numbers: Any) -> npt.NDArray[np.object_]:
-    """The texts that an array of numbers stands for, as an array of the same shape."""
+def texts_of(numbers: Any) -> Any:
+    """The text that a number stands for; of an array of numbers, an array of the same shape."""
+    if isinstance(numbers, float):
+        return text_of(numbers)
     flat = np.ravel(numbers).tolist()
     return np.array([text_of(number) for number in flat], object).reshape(np.shape(numbers))
 

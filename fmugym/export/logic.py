@@ -32,7 +32,7 @@ from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.symbolic import element_names
 from fmugym.vector.hooks.symbols import LANES, as_symbols, loaded, spread
 from fmugym.vector.hooks.tables import tables_in
-from fmugym.vector.hooks.trace import SeenArray, Tracer
+from fmugym.vector.hooks.trace import Tracer
 
 __all__ = ["Kept", "Logic", "Parameter", "logic_of"]
 
@@ -216,11 +216,9 @@ class _ControllerTracer(Tracer):
         )
 
     def _observed(self) -> tuple[int, ...]:
-        seen: list[SeenArray] = []
-        observed: list[Store] = []
         self._contents = Contents(self._env)
-        self._call("_get_observation", lambda v: self._see_observation(v, seen, observed))
-        return tuple(store.node for store in observed)
+        parts = self._call("_get_observation", lambda value: list(self._see_observation(value)))
+        return tuple(int(node) for _, nodes, _ in parts for node in nodes.reshape(-1))
 
     def _decided(self, observation: Iterable[int]) -> tuple[npt.NDArray[Any], list[list[int]]]:
         """The nodes of the action, and of what the agent remembers then."""
@@ -271,9 +269,9 @@ class _Assembly:
     ) -> None:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
-        self._episode = env.inside.plan.draw(rng)
+        self._episode = env.inside.draws.draw(rng)
         self._starts = {**self._episode.variables, **traced.starts}
-        self._drawn = set(env.inside.plan.drawn_names)
+        self._drawn = set(env.inside.draws.drawn_names)
         self._external = self._given(external)
         rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
         self._inputs = [

@@ -105,7 +105,7 @@ class _Perturbation:
         self._everywhere = np.arange(envs.num_envs)
         given = {
             name: column[0]
-            for name, column in start.columns_for(self._episodes.scope)["parameters"].items()
+            for name, column in self._episodes.columns_of(start)["parameters"].items()
             if column[0] is not None and name not in {*states.values(), START_TIME.name}
         }
         fixed = [env.inside.interface.parameter(name, value) for name, value in given.items()]

@@ -559,7 +559,7 @@ def form_of_program(
 
 
 def form_of_draws(table: Any, numbers: Any) -> bytes:
-    """The form of the draws of an episode; see ``fmugym.vector.streams``.
+    """The form of the draws of an episode; see ``fmugym.task.native_draws``.
 
     Args:
         table: For each its kind, the row of the start value that it sets or -1, and the place and

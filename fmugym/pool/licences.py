@@ -14,7 +14,7 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.errors import FMUGymError, LicenceError, SimulationError
 from fmugym.fmi.status import WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.base import FloatArray, Pool
 from fmugym.pool.bundle import IndexArray
 
 __all__ = [
@@ -105,7 +105,6 @@ def start_instances(
     variables: tuple[Variable, ...],
     values: FloatArray,
     indices: IndexArray,
-    mask: MaskArray | None = None,
 ) -> None:
     """Reset instances for new episodes.
 
@@ -114,11 +113,14 @@ def start_instances(
         variables: The start variables.
         values: Their values, shape (P, N).
         indices: The instances, shape (M,).
-        mask: The same as a mask of shape (N,); None for all.
 
     Raises:
         SimulationError: If one fails, see ``require_started``.
     """
+    mask = None
+    if len(indices) < pool.num_instances:
+        mask = np.zeros(pool.num_instances, np.bool_)
+        mask[indices] = True
     _, statuses = pool.reset(variables, values, mask)
     if np.count_nonzero(statuses):
         require_started(pool, indices)

@@ -27,7 +27,7 @@ from fmugym.systems import FMUSystem
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.actions import elements_of, no_action
 from fmugym.task.alone import alone
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.hooks import Hooks, misspelt_hooks
 from fmugym.task.input_writer import InputWriter
 from fmugym.task.inside import Inside, OwnHooks
@@ -40,7 +40,7 @@ from fmugym.task.results import finiteness_of
 from fmugym.task.values import EpisodeVariables, NamedTexts, NamedValues
 from fmugym.task.warm_up import WarmUp, WarmUps
 
-__all__ = ["Constructed", "plan_of", "plan_of_reset", "prepare_hooks", "require_construction"]
+__all__ = ["Constructed", "draws_of", "draws_of_reset", "prepare_hooks", "require_construction"]
 
 _FASTEST_FPS: Final = 1_000_000
 
@@ -105,7 +105,7 @@ class Constructed(Pictured):
             self.fmu,
             self.inside.spec,
             self.config,
-            self.inside.plan,
+            self.inside.draws,
             self.logger,
             backend,
             isolation,
@@ -196,7 +196,7 @@ class Constructed(Pictured):
         )
 
     def _prepare_episodes(self) -> None:
-        self.inside.plan = plan_of(self)
+        self.inside.draws = draws_of(self)
         self.inside.step_limit = _step_limit(
             self.config, self.inside.spec, self.inside.warm_up_steps
         )
@@ -254,7 +254,7 @@ def _let_stop_time_end_episodes(env: Constructed) -> None:
         vars(env)["_is_truncated"] = _StopTime(env, hook)
 
 
-def plan_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodePlan:
+def draws_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> EpisodeDraws:
     """Prepare the draws of an environment's episodes.
 
     Args:
@@ -268,7 +268,7 @@ def plan_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episod
     given = {name: as_distribution(repr(name), value) for name, value in overrides.items()}
     own = interface.start_values(given)
     parameters = {**interface.parameters, **own}
-    return EpisodePlan(
+    return EpisodeDraws(
         tuple(map(interface.parameter, parameters, parameters.values())),
         parameters,
         env.config.episode_variables,
@@ -276,9 +276,9 @@ def plan_of(env: Constructed, overrides: Mapping[str, Any] = _NOTHING) -> Episod
     )
 
 
-def plan_of_reset(
+def draws_of_reset(
     env: Constructed, options: Mapping[str, Any] | None, *also_known: str
-) -> EpisodePlan:
+) -> EpisodeDraws:
     """Prepare the draws of the episodes that a reset with options begins.
 
     Args:
@@ -290,15 +290,15 @@ def plan_of_reset(
         ConfigError: If an option does not fit.
     """
     if options is None:
-        return env.inside.plan
+        return env.inside.draws
     options = check_mapping("the options of reset", options)
     for name in options:
         if name not in env.reset_options:
             raise unknown_name("reset option", name, (*env.reset_options, *also_known))
     if not options:
-        return env.inside.plan
+        return env.inside.draws
     parameters = env._get_episode_parameters(options)
-    return plan_of(env, check_mapping("what _get_episode_parameters returned", parameters))
+    return draws_of(env, check_mapping("what _get_episode_parameters returned", parameters))
 
 
 _checked: Final[WeakSet[type[Any]]] = WeakSet()

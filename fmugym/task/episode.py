@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property, partial
-from itertools import islice
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from fmugym.archive.texts import number_of, text_of, texts_of
+from fmugym.archive.texts import number_of, texts_of
 from fmugym.archive.variable import Variable, checked_value
 from fmugym.checks import check_number
-from fmugym.distributions import (
-    Recipe,
-    Uniform,
-    draw_all,
-    is_distribution,
-    recipe_of,
-    together,
-)
+from fmugym.distributions import Recipe, draw_all, is_distribution, recipe_of, together
 from fmugym.pool.base import FloatArray
+from fmugym.task.native_draws import native_draws
 from fmugym.task.values import ParameterValues
 from fmugym.trial.trial_episodes import Starts
 
-__all__ = ["Draw", "Episode", "EpisodePlan"]
+if TYPE_CHECKING:
+    from fmugym._native import Draws
+
+__all__ = ["Draw", "Episode", "EpisodeDraws"]
 
 
 class Draw(NamedTuple):
@@ -44,7 +40,7 @@ class Episode(NamedTuple):
     """The values of one episode.
 
     Attributes:
-        start_values: The parameters in the order of the plan, shape (P, 1).
+        start_values: The parameters in their order, shape (P, 1).
         parameters: The parameters by name.
         variables: The episode variables by name.
         drawn: The parameters and variables that were drawn or overridden, by name.
@@ -56,7 +52,7 @@ class Episode(NamedTuple):
     drawn: dict[str, Any]
 
 
-class EpisodePlan:
+class EpisodeDraws:
     """The draws of an episode, prepared once so that a reset only has to draw.
 
     The parameters are drawn first, then the episode variables, each in the order of their dict. A
@@ -91,27 +87,24 @@ class EpisodePlan:
         pairs = zip(model_variables, parameters.values(), strict=True)
         self.constants = np.array([_constant(v, value) for v, value in pairs], np.float64)
         self.told = {name: parameters[name] for name in overridden}
-        self._random_parameters = [
-            (index, name, not _always_fits(value, model_variables[index]))
+        self._random_parameters = {
+            name: index
             for index, (name, value) in enumerate(parameters.items())
             if is_distribution(value)
-        ]
+        }
         strings = (v.name for v in model_variables if v.kind == "string")
         self.strings = frozenset(strings)
-        self._all_fit = not any(may_not_fit for *_, may_not_fit in self._random_parameters)
         self._arrays = {n: _DrawnArray.of(v) for n, v in episode_variables.items() if is_drawn(v)}
         self._variables.update((name, array.constants) for name, array in self._arrays.items())
-        self._random_variables = [
-            (name, self._arrays.get(name))
+        self._random_variables = {
+            name: self._arrays.get(name)
             for name, value in episode_variables.items()
             if is_distribution(value) or name in self._arrays
-        ]
-        self._distributions = [parameters[name] for _, name, _ in self._random_parameters]
-        for name, array in self._random_variables:
+        }
+        self._distributions = [parameters[name] for name in self._random_parameters]
+        for name, array in self._random_variables.items():
             own = [episode_variables[name]] if array is None else array.distributions
             self._distributions.extend(own)
-        uniform = [d for d in self._distributions if type(d) is Uniform]
-        self._limits = [(d.low, d.high - d.low) for d in uniform]
         self._start_values = self.constants.reshape(-1, 1).copy()
         self._starts: Any = self._start_values.reshape(-1).data  # faster to write to
 
@@ -121,32 +114,38 @@ class EpisodePlan:
         return list(self._parameters)
 
     @cached_property
-    def draws(self) -> list[Draw]:
+    def drawn(self) -> list[Draw]:
         """The draws in their order."""
-        draws = [Draw(name, None) for _, name, _ in self._random_parameters]
-        for name, array in self._random_variables:
+        draws = [Draw(name, None) for name in self._random_parameters]
+        for name, array in self._random_variables.items():
             draws.extend(Draw(name, e) for e in ([None] if array is None else array.elements))
         return draws
 
     @cached_property
     def drawn_names(self) -> list[str]:
         """The names of the drawn parameters and variables, in the order of the draws."""
-        return list(dict.fromkeys(draw.name for draw in self.draws))
+        return [*self._random_parameters, *self._random_variables]
 
     @cached_property
     def drawn_rows(self) -> list[int]:
         """For each draw, the index of its parameter; -1 for an episode variable."""
-        rows = [index for index, *_ in self._random_parameters]
-        return rows + [-1] * (len(self.draws) - len(rows))
+        rows = list(self._random_parameters.values())
+        return rows + [-1] * (len(self.drawn) - len(rows))
 
-    def named(self, values: FloatArray) -> dict[str, Any]:
-        """The drawn values of M episodes by name.
+    @cached_property
+    def native(self) -> Draws | None:
+        """The draws for the C extension; None if only Python can make them."""
+        return native_draws(self.recipes, self.drawn_rows)
+
+    def named(self, values: Sequence[Any] | FloatArray) -> dict[str, Any]:
+        """The drawn values of one episode, or of M, by name.
 
         Args:
-            values: In the order of the draws, shape (draws, M).
+            values: In the order of the draws: numbers, or an array of shape (draws, M).
 
         Returns:
-            For each name, an array of shape (M,), or (M, ...) for a variable that is an array.
+            For each name a number or an array of shape (M,). For a variable that is an array, one
+            of its shape, or with a last axis for the episodes.
         """
         if not self._arrays:
             return dict(zip(self.drawn_names, values, strict=True))
@@ -156,7 +155,7 @@ class EpisodePlan:
             array = self._arrays.get(name)
             count = 1 if array is None else len(array.elements)
             rows = values[place : place + count]
-            named[name] = rows[0] if array is None else array.of_episodes(rows)
+            named[name] = rows[0] if array is None else array.filled(rows)
             place += count
         return named
 
@@ -164,9 +163,9 @@ class EpisodePlan:
     def recipes(self) -> list[Recipe] | None:
         """The draws for the C extension; None if only Python can draw them."""
         recipes = []
-        variables: list[Any] = [self.model_variables[i] for i, *_ in self._random_parameters]
-        variables += [None] * (len(self.draws) - len(variables))
-        for draw_, one, variable in zip(self.draws, self._distributions, variables, strict=True):
+        variables: list[Any] = [self.model_variables[i] for i in self._random_parameters.values()]
+        variables += [None] * (len(self.drawn) - len(variables))
+        for draw_, one, variable in zip(self.drawn, self._distributions, variables, strict=True):
             if variable is None:
                 recipes.append(recipe_of(one, partial(check_number, draw_.name)))
             else:
@@ -174,10 +173,12 @@ class EpisodePlan:
         known = [recipe for recipe in recipes if recipe is not None]
         return together(self._distributions, known) if len(known) == len(recipes) else None
 
-    def shown(self, values: FloatArray) -> dict[str, Any]:
-        """The same as ``named``, but Strings are texts: arrays of objects."""
+    def shown(self, values: Sequence[Any] | FloatArray) -> dict[str, Any]:
+        """The same as ``named``, but Strings are texts, or arrays of them."""
         named = self.named(values)
-        return named | {n: texts_of(named[n]) for n in self.strings & named.keys()}
+        if self.strings:
+            named.update((n, texts_of(named[n])) for n in self.strings & named.keys())
+        return named
 
     @cached_property
     def constant_parameters(self) -> dict[str, Any]:
@@ -194,7 +195,7 @@ class EpisodePlan:
     @cached_property
     def constant_variables(self) -> dict[str, Any]:
         """The episode variables that are not drawn, and arrays with 0 for drawn elements."""
-        drawn = {name for name, array in self._random_variables if array is None}
+        drawn = {name for name, array in self._random_variables.items() if array is None}
         return {name: value for name, value in self._variables.items() if name not in drawn}
 
     @cached_property
@@ -208,7 +209,7 @@ class EpisodePlan:
         return Starts(self.model_variables, tuple(map(tuple, values.tolist())))
 
     def draw_starts(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """Draw the parameters of some episodes, in the order of the plan, shape (P, count)."""
+        """Draw the parameters of some episodes, in their order, shape (P, count)."""
         return np.hstack([self.draw(rng).start_values.copy() for _ in range(count)])
 
     def draw(self, rng: np.random.Generator) -> Episode:
@@ -217,59 +218,48 @@ class EpisodePlan:
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        if not self._random_parameters and not self._random_variables:
-            return self._episode(self._parameters.copy(), self._variables.copy(), {})
-        values = iter(self.draw_values(rng))
         parameters, variables = self._parameters.copy(), self._variables.copy()
         drawn: dict[str, Any] = {}
-        starts = self._starts
-        for (index, name, _), value in zip(self._random_parameters, values, strict=False):
-            drawn[name] = starts[index] = value
-        for name in self.strings & drawn.keys() if self.strings else ():
-            drawn[name] = text_of(drawn[name])
-        parameters.update(drawn)
-        for name, array in self._random_variables:
-            own = next(values) if array is None else array.of_episode(values)
-            drawn[name] = variables[name] = own
-        return self._episode(parameters, variables, drawn)
+        if self._distributions:
+            drawn = self.shown(self.draw_values(rng))
+            for name in self._random_parameters:
+                parameters[name] = drawn[name]
+            for name in self._random_variables:
+                variables[name] = drawn[name]
+        told = self.told | drawn
+        return Episode(self._start_values, MappingProxyType(parameters), variables, told)
 
     def draw_values(self, rng: np.random.Generator) -> list[float]:
-        """Draw one episode.
+        """Draw the values of one episode; its parameters become start values.
 
-        A single call makes all draws if they are uniform. The results equal those of single draws,
-        because ``rng.uniform(low, high)`` is ``low + (high - low) * rng.random()``.
+        Python draws the same numbers where the C extension cannot.
 
         Returns:
-            The drawn values in the order of ``draws``.
+            The drawn values in the order of ``drawn``.
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
-        if len(self._limits) < len(self._distributions):
-            values = draw_all(self._distributions, rng)
-        else:
-            fractions = rng.random(len(self._limits)).tolist()
-            pairs = zip(self._limits, fractions, strict=True)
-            values = [low + width * fraction for (low, width), fraction in pairs]
-            if self._all_fit:
-                return values
-        for place, (index, _, may_not_fit) in enumerate(self._random_parameters):
-            if may_not_fit:
-                values[place] = checked_value(self.model_variables[index], values[place])
+        if self.told or self.native is None:  # options serve for one reset: not worth preparing
+            values = self._drawn_by(rng)
+            for index, value in zip(self._random_parameters.values(), values, strict=False):
+                self._starts[index] = value
+            return values
+        bits = rng.bit_generator
+        with bits.lock:
+            return self.native.take_from(bits.capsule, self._starts)
+
+    def _drawn_by(self, rng: np.random.Generator) -> list[float]:
+        values = draw_all(self._distributions, rng)
+        for place, index in enumerate(self._random_parameters.values()):
+            variable = self.model_variables[index]
+            if type(values[place]) is not float or not _is_double(variable):
+                values[place] = checked_value(variable, values[place])
         for place in range(len(self._random_parameters), len(values)):
             if type(values[place]) is not float:
-                name = self.draws[place].name
-                values[place] = check_number(
-                    f"episode variable {name!r}", values[place], may_be_boolean=True
-                )
+                what = f"episode variable {self.drawn[place].name!r}"
+                values[place] = check_number(what, values[place], may_be_boolean=True)
         return values
-
-    def _episode(
-        self, parameters: dict[str, Any], variables: dict[str, Any], drawn: dict[str, Any]
-    ) -> Episode:
-        if self.told:
-            drawn = self.told | drawn
-        return Episode(self._start_values, MappingProxyType(parameters), variables, drawn)
 
 
 class _DrawnArray(NamedTuple):
@@ -294,18 +284,13 @@ class _DrawnArray(NamedTuple):
         shaped = _unchangeable(np.array(constants, np.float64).reshape(value.shape))
         return cls(shaped, elements, [flat[place] for place in elements])
 
-    def of_episode(self, values: Iterator[float]) -> FloatArray:
-        """The array of one episode, of the next of these values."""
-        array = self.constants.copy()
-        array.reshape(-1)[self.elements] = list(islice(values, len(self.elements)))
-        return _unchangeable(array)
-
-    def of_episodes(self, rows: FloatArray) -> FloatArray:
-        """The arrays of M episodes, shape (M, ...), of rows of drawn values."""
-        count = rows.shape[1]
-        arrays = np.repeat(self.constants[None], count, axis=0)
-        arrays.reshape(count, -1)[:, self.elements] = rows.T
-        return arrays
+    def filled(self, drawn: Any) -> FloatArray:
+        """The array of one episode, or of M on the last axis, of numbers or rows of shape (M,)."""
+        rows = np.asarray(drawn)
+        flat = np.empty((self.constants.size, *rows.shape[1:]))
+        flat.T[...] = self.constants.reshape(-1)
+        flat[self.elements] = rows
+        return _unchangeable(flat.reshape(*self.constants.shape, *rows.shape[1:]))
 
 
 def _unchangeable(array: FloatArray) -> FloatArray:
@@ -325,11 +310,13 @@ def _constant(variable: Variable, value: Any) -> float:
     return number_of(value) if variable.kind == "string" else value
 
 
-def _always_fits(distribution: Any, variable: Variable) -> bool:
-    return type(distribution) is Uniform and variable.kind == "real"
+def _is_double(variable: Variable) -> bool:
+    """Whether any float that a distribution draws is a value of the variable."""
+    return variable.type in {"Real", "Float64"}
 
 
 def _recipe_of(distribution: Any, variable: Variable) -> Recipe | None:
-    recipe = recipe_of(distribution, partial(checked_value, variable))
+    convert = float if _is_double(variable) else partial(checked_value, variable)
+    recipe = recipe_of(distribution, convert)
     discrete = recipe is not None and recipe.kind in {"choice", "weighted"}
     return recipe if discrete or variable.kind == "real" else None

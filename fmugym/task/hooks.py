@@ -19,7 +19,7 @@ from fmugym.config import EnvConfig
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.task import spaces as fmu_spaces
 from fmugym.task.inside import Inside
-from fmugym.task.readings import read_by
+from fmugym.task.readings import environments_first, read_by
 from fmugym.task.values import NamedValues
 
 if TYPE_CHECKING:
@@ -55,13 +55,6 @@ def misspelt_hooks(cls: type[Any], base: type[Any]) -> dict[str, str]:
         if near and hooks[near[0]][1] == len(signature(methods[name]).parameters):
             found[name] = hooks[near[0]][0]
     return found
-
-
-def _environments_first(values: Any) -> Any:
-    """View an array with its last axis first."""
-    if type(values) is np.ndarray and values.ndim <= 2:
-        return values.T  # moveaxis takes ten times as long
-    return np.moveaxis(values, -1, 0)
 
 
 def _with_copied_goals(observation: Any) -> Any:
@@ -148,7 +141,7 @@ class Hooks(gymnasium.Env[Any, Any], ABC):
                 "'desired_goal'"
             ) from None
         if not isinstance(self.done, bool):
-            achieved, desired = _environments_first(achieved), _environments_first(desired)
+            achieved, desired = environments_first(achieved), environments_first(desired)
         return self._goal_reward(achieved, desired)
 
     def _reward_and_observation(self) -> tuple[Any, Any]:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.base import FloatArray
 from fmugym.task.alone import Guard, make_guard
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import Future
 from fmugym.task.input_writer import InputWriter
 from fmugym.task.interface import Interface
@@ -81,7 +81,7 @@ class Inside:
         pool_tells: Whether the pool adds to the info of a step.
         player: Steps the environment if its hooks are compiled; or None.
         has_chosen: Whether it is known if there is a player.
-        plan: What is drawn for an episode.
+        draws: What is drawn for an episode.
         quantities: Lists what a declared task has names for; None for other tasks.
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
@@ -137,7 +137,7 @@ class Inside:
     own: OwnHooks
     own_names: frozenset[str]
     pictured: tuple[float | None, float]
-    plan: EpisodePlan
+    draws: EpisodeDraws
     player: Any
     pool: Pool
     pool_observes: bool

@@ -22,7 +22,7 @@ from fmugym.pool import Pool, PoolSpec
 from fmugym.pool.spec import ISOLATIONS
 from fmugym.signals import ordinary
 from fmugym.systems import FMUSystem
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.starting import structural_values
 from fmugym.trial.opening import make_pool
 
@@ -136,7 +136,7 @@ class PoolOpening:
         fmu: The FMU; closed with the pool.
         spec: What to do at each reset and step.
         config: The environment's config.
-        plan: The draws of its episodes, for the trial of resets.
+        draws: The draws of its episodes, for the trial of resets.
         log: The logger that gets the FMU's messages.
         backend: See ``FMUEnv``.
         isolation: See ``FMUEnv``.
@@ -148,7 +148,7 @@ class PoolOpening:
     fmu: FMU
     spec: PoolSpec
     config: EnvConfig
-    plan: EpisodePlan
+    draws: EpisodeDraws
     log: logging.Logger
     backend: Any
     isolation: str | None
@@ -179,7 +179,7 @@ class PoolOpening:
             "isolation": self.isolation or self.config.isolation,
             "call_timeout": self.config.foreign.call_timeout,
             "reset_method": self.config.foreign.reset_method,
-            "starts": self.plan.starts(),
+            "starts": self.draws.starts(),
             "spare": most is None or num_instances < most,
         }
         options = own | options

@@ -5,12 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
 from typing import Any, Final
 
-from fmugym.errors import ConfigError
-from fmugym.task.values import EpisodeVariables, NamedValues
+import numpy as np
+import numpy.typing as npt
 
-__all__ = ["READINGS", "NoReadings", "Readings", "read_by", "reading"]
+from fmugym.errors import ConfigError
+from fmugym.task.values import EpisodeVariables, NamedValues, ParameterValues
+
+__all__ = [
+    "READINGS",
+    "NoReadings",
+    "Readings",
+    "environments_first",
+    "environments_last",
+    "read_by",
+    "reading",
+]
 
 
 @dataclass(slots=True)
@@ -49,6 +61,22 @@ class Readings:
         present: Readings = env.inside.readings
         return replace(present)
 
+    def mapped(self, each: Callable[[Any], Any]) -> Readings:
+        """The same readings with what a function makes of each value."""
+        variables = EpisodeVariables(self.variables)
+        variables.update({name: each(value) for name, value in self.variables.items()})
+        parameters = ParameterValues((n, each(value)) for n, value in self.parameters.items())
+        result = replace(
+            self,
+            values=each(self.values),
+            parameters=MappingProxyType(parameters),
+            variables=variables,
+            **{name: each(getattr(self, name)) for name in _ROWS},
+        )
+        result.state = result.values[: len(self.state)]
+        result.out = self.out.over(lambda: result.values)
+        return result
+
     def take_back(self, before: tuple[Any, Any, Any, Any]) -> None:
         """Return to before an action was taken, if the FMU has not stepped.
 
@@ -56,6 +84,12 @@ class Readings:
             before: ``action``, ``previous_action``, ``previous_state`` and ``inputs`` of then.
         """
         self.action, self.previous_action, self.previous_state, self.inputs = before
+
+
+_ROWS: Final = (
+    *("previous_state", "inputs", "action", "previous_action", "step_count", "done", "after_end"),
+)
+"""Those that are neither mappings nor outputs."""
 
 
 class NoReadings:
@@ -89,6 +123,18 @@ def read_by(name: str, get: Callable[[Any], Any]) -> Any:
         setattr(env.inside.readings, name, value)
 
     return property(get, put)
+
+
+def environments_first(values: Any) -> Any:
+    """View an array with its last axis first."""
+    if type(values) is np.ndarray and values.ndim <= 2:
+        return values.T  # moveaxis takes ten times as long
+    return np.moveaxis(values, -1, 0)
+
+
+def environments_last(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """View an array with its first axis last."""
+    return values.T if values.ndim <= 2 else np.moveaxis(values, 0, -1)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fmugym.archive.texts import text_of, texts_of
+from fmugym.archive.texts import texts_of
 from fmugym.errors import ConfigError, UnknownParameterError, shown, unknown_name
 from fmugym.signals import ordinary
 
@@ -137,7 +137,7 @@ class NamedTexts(NamedValues):
         return self._shown(name, value) if name in self.strings else value
 
     def _shown(self, name: str, value: Any) -> Any:
-        return texts_of(value) if isinstance(value, np.ndarray) else text_of(value)
+        return texts_of(value)
 
     def over(self, get_values: Callable[[], Sequence[Any]]) -> NamedTexts:
         """See ``NamedValues.over``."""

@@ -5,34 +5,30 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from threading import Lock
-from types import MappingProxyType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.archive.variable import Variable
 from fmugym.pool import Pool
-from fmugym.pool.base import FloatArray
 from fmugym.pool.bundle import Bundle, IndexArray, SaveMethod
 from fmugym.pool.licences import require_started
 from fmugym.pool.state_files import StateFiles, essence
 from fmugym.task.readings import Readings, reading
 from fmugym.task.spaces import to_input_types
-from fmugym.task.values import EpisodeVariables, ParameterValues
 from fmugym.trial.known import state_files
 
-__all__ = ["WarmUp", "WarmUps", "rows_of_one"]
+if TYPE_CHECKING:
+    from fmugym.task.beginning import Beginning
+
+__all__ = ["WarmUp", "WarmUps"]
 
 _MOST_BYTES: Final = 2**28
 """The size of all warmed-up states in memory; the ones that were not used for longest go first."""
 
 _FAILED: Final = "the warm-up failed: "
-
-_OF_LAST_AXIS: Final = ("values", "previous_state", "inputs", "action", "previous_action")
 
 
 class WarmUp(ABC):
@@ -122,63 +118,40 @@ class WarmUps:
         self._keys: dict[int, bytes] = {}
         self._has_told = False
 
-    def begin(
-        self,
-        pool: Pool,
-        variables: Sequence[Variable],
-        values: FloatArray,
-        rows: Mapping[str, Any],
-        indices: IndexArray,
-        start: Callable[[IndexArray], Readings],
-        place: Callable[[Mapping[str, Any], IndexArray], None],
-    ) -> None:
+    def begin(self, beginning: Beginning) -> None:
         """Bring new episodes to where their warm-ups lead; known states take the place of steps.
 
         Args:
-            pool: The pool that the episodes begin in; ``pool.inputs`` then has the last inputs.
-            variables: The start variables of the episodes.
-            values: Their values, shape (P, N).
-            rows: The episode variables by name, environments on the last axis.
-            indices: The environments, shape (M,).
-            start: Resets the FMUs of some environments, and returns what their hooks read,
-                environments on the last axis.
-            place: Writes episode variables, by name and with environments on the last axis, of some
-                environments.
+            beginning: The episodes; their pool then has the last inputs.
 
         Raises:
             SimulationError: If an FMU fails or refuses a state.
             ConfigError: If an input does not fit its type.
         """
-        left = indices.tolist()
+        pool, left = beginning.pool, beginning.indices.tolist()
         while left:
-            found = self._find(pool, variables, values, rows, left)
+            found = self._find(beginning, left)
             first = self._distinct(index for index in left if index not in found)
             if first:
                 where = np.array(first)
-                place(self._run(pool, start(where), where), where)
+                beginning.place(self._run(pool, beginning.start(where), where), where)
             for written, where in self._restore(pool, found):
-                place(written, where)
+                beginning.place(written, where)
             left = [index for index in left if index not in found and index not in first]
 
     # States that are known
 
-    def _find(
-        self,
-        pool: Pool,
-        variables: Sequence[Variable],
-        values: FloatArray,
-        rows: Mapping[str, Any],
-        indices: Iterable[int],
-    ) -> Found:
+    def _find(self, beginning: Beginning, indices: Iterable[int]) -> Found:
         """Look for states that warm-ups of new episodes lead to."""
         self._keys = {}
-        if not self.warm_up.caches or not self._can_keep(pool):
+        if not self.warm_up.caches or not self._can_keep(beginning.pool):
             return {}
-        names = repr([variable.name for variable in variables]).encode()
+        names = repr([one.name for one in beginning.draws.model_variables]).encode()
+        rows = [np.asarray(beginning.row(name)) for name in self.warm_up.depends_on]
         found = {}
         for index in indices:
-            own = [np.asarray(rows[name])[..., index] for name in self.warm_up.depends_on]
-            parts = [names, values[:, index].tobytes(), *(np.float64(v).tobytes() for v in own)]
+            own = (np.float64(row[..., index]).tobytes() for row in rows)
+            parts = [names, beginning.values[:, index].tobytes(), *own]
             key = self._key(parts)
             warmed = _memory.find(key) or self._read(key)
             if warmed is None:
@@ -306,26 +279,3 @@ class WarmUps:
             return None
         _memory.keep(key, found)
         return found
-
-
-def rows_of_one(env: Any) -> Readings:
-    """What the hooks of a single environment read, as arrays of one environment."""
-    readings = Readings.of(env)
-    rows: dict[str, Any] = {name: _row(getattr(readings, name)) for name in _OF_LAST_AXIS}
-    variables = EpisodeVariables(readings.variables)
-    variables.update({name: _row(value) for name, value in readings.variables.items()})
-    return replace(
-        readings,
-        **rows,
-        state=rows["values"][: env.inside.output_count],
-        parameters=MappingProxyType(
-            ParameterValues((n, _row(v)) for n, v in readings.parameters.items())
-        ),
-        variables=variables,
-        step_count=np.zeros(1, np.int64),
-        done=np.zeros(1, np.bool_),
-    )
-
-
-def _row(value: Any) -> npt.NDArray[Any]:
-    return np.asarray(value)[..., np.newaxis]

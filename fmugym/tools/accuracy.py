@@ -84,8 +84,8 @@ class Replay:
         """Play the beginning of an episode with random actions, and keep what the FMU got."""
         env.action_space.seed(0)
         env.reset(seed=0)
-        plan, pool = env.inside.plan, env.inside.pool
-        pairs = zip(plan.model_variables, plan.parameter_names, strict=True)
+        draws, pool = env.inside.draws, env.inside.pool
+        pairs = zip(draws.model_variables, draws.parameter_names, strict=True)
         starts = [checked_value(variable, env.parameters[name]) for variable, name in pairs]
         inputs: list[Any] = []
         fails = False
@@ -98,7 +98,7 @@ class Replay:
         rows = np.array(inputs, np.float64).reshape(len(inputs), len(pool.inputs))
         if fails:  # with other settings it may go on
             rows = np.resize(rows, (_STEPS, len(pool.inputs)))
-        return cls(env.inside.opening, plan.model_variables, np.array([starts]).T, rows)
+        return cls(env.inside.opening, draws.model_variables, np.array([starts]).T, rows)
 
     @property
     def spec(self) -> PoolSpec:

@@ -164,14 +164,14 @@ def _share(env: FMUEnv, seconds: float, took: float) -> float | None:
     episode may have, so that they stay near states that occur.
     """
     pool = env.inside.pool
-    variables = tuple(env.inside.plan.model_variables)
+    variables = tuple(env.inside.draws.model_variables)
     rng = np.random.default_rng(0)
     limit = min(env.inside.step_limit, 1000)
     best = float("inf")
     end = perf_counter() + seconds / 2
     try:
         while perf_counter() < end:
-            pool.reset(variables, env.inside.plan.draw_starts(rng, pool.num_instances))
+            pool.reset(variables, env.inside.draws.draw_starts(rng, pool.num_instances))
             begin = perf_counter()
             for _ in range(limit):
                 pool.step(None)

@@ -13,7 +13,6 @@ from fmugym.checks import (
     check_count,
     check_mapping,
     check_number,
-    check_option,
     check_seed,
     integer_of,
 )
@@ -27,12 +26,10 @@ __all__ = [
     "POOL_OPTIONS",
     "UnknownAttributeError",
     "autoreset_mode_of",
-    "checked_hooks",
     "checked_mask",
     "checked_num_envs",
     "checked_pool_options",
     "checked_seeds",
-    "checked_step_limit",
     "split_options",
 ]
 
@@ -78,26 +75,6 @@ def _bytes_of_memory() -> int:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except ordinary(AttributeError, ValueError, OSError):  # Windows
         return 2**40
-
-
-def checked_step_limit(value: Any) -> int | None:
-    """Check ``max_episode_steps``.
-
-    Raises:
-        ConfigError: If it is neither None nor a positive integer.
-    """
-    if value is None:
-        return None
-    return check_count("max_episode_steps", value)
-
-
-def checked_hooks(way: Any) -> str:
-    """Check the name of a way of calling hooks.
-
-    Raises:
-        ConfigError: If there is none of this name.
-    """
-    return check_option("way of calling hooks", way, HOOKS)
 
 
 def autoreset_mode_of(mode: Any) -> AutoresetMode:

@@ -10,7 +10,7 @@ import numpy as np
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.signals import ordinary
-from fmugym.task.construction import plan_of
+from fmugym.task.construction import draws_of
 from fmugym.task.starting import checked_column, spread
 from fmugym.vector.arguments import UnknownAttributeError
 from fmugym.vector.calls import TOGETHER, checked_name, require_settable
@@ -100,7 +100,7 @@ class Attributes:
 
     def _set_parameter(self, name: str, values: Sequence[Any]) -> None:
         """Set a parameter of all environments, from their next episodes on."""
-        plan_of(self._prototype, {name: values[0]})  # it refuses what cannot be set
+        draws_of(self._prototype, {name: values[0]})  # it refuses what cannot be set
         scalars = self._prototype.fmu.description.scalars(name)
         rows = [spread(name, scalars, value) for value in values]
         columns = {

@@ -8,8 +8,9 @@ a dict of such arrays, with a mask of its own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -20,7 +21,17 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
 
-__all__ = ["coded", "gathered", "handed_out", "with_masks", "within"]
+__all__ = ["coded", "gathered", "handed_out", "mapped", "with_masks", "within"]
+
+
+def mapped(function: Callable[..., Any], *trees: Any) -> Any:
+    """Apply a function to the values at the same place of dicts and tuples of values."""
+    first = trees[0]
+    if isinstance(first, Mapping):
+        return {name: mapped(function, *(tree[name] for tree in trees)) for name in first}
+    if type(first) is tuple:
+        return tuple(mapped(function, *parts) for parts in zip(*trees, strict=True))
+    return function(*trees)
 
 
 def within(mask: MaskArray, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -41,14 +52,7 @@ def with_masks(values: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
 
 def coded(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
     """Make infos of the environments in a mask from arrays of all environments."""
-    return with_masks(_within_all(rows, mask), mask)
-
-
-def _within_all(rows: Mapping[str, Any], mask: MaskArray) -> dict[str, Any]:
-    return {
-        name: _within_all(row, mask) if isinstance(row, Mapping) else within(mask, row)
-        for name, row in rows.items()
-    }
+    return with_masks(mapped(partial(within, mask), rows), mask)
 
 
 def gathered(infos: Mapping[int, Mapping[str, Any]], count: int) -> dict[str, Any]:

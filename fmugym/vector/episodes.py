@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,11 +44,6 @@ class Episodes:
         self._everywhere = np.arange(pool.num_instances)
         self.started = self.is_ready = False
 
-    @cached_property
-    def scope(self) -> dict[str, str]:
-        """Where snapshots fit, see ``scope_of``."""
-        return scope_of(self._prototype)
-
     def save(self, indices: IndexArray) -> Snapshot:
         """Save the episodes of some environments.
 
@@ -57,7 +51,7 @@ class Episodes:
             SimulationError: If real systems stand in for the FMUs, or if an FMU fails.
         """
         bundle = self._pool.save_instances(indices)
-        return Snapshot(self.scope, self._engine.columns(indices), bundle)
+        return Snapshot(scope_of(self._prototype), self._engine.columns(indices), bundle)
 
     def columns_of(self, snapshot: Snapshot) -> Columns:
         """What hooks read in the episodes of a snapshot.
@@ -65,7 +59,7 @@ class Episodes:
         Raises:
             ConfigError: If the snapshot is of another FMU or config.
         """
-        return snapshot.columns_for(self.scope)
+        return snapshot.columns_for(scope_of(self._prototype))
 
     def place(self, snapshot: Snapshot, sources: IndexArray) -> None:
         """Let all environments go on from episodes of a snapshot that fits.

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.pool.base import FloatArray, MaskArray
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
+from fmugym.task.readings import environments_first
 from fmugym.task.values import UNFILLED, LateDict
-from fmugym.vector.codec import coded, within
+from fmugym.vector.codec import coded, mapped, within
 
 __all__ = [
     "copy_rows",
@@ -28,30 +29,33 @@ __all__ = [
 ]
 
 
-def drawn_info(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+def drawn_info(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
     """The info of a reset.
 
     Args:
-        plan: What the environments in the mask have drawn from.
-        drawn: What they have drawn, shape (draws, N). No caller changes it.
+        draws: What the environments in the mask have drawn from.
+        drawn: What they have drawn, shape (draws, M).
         mask: The environments that were reset. No caller changes it.
     """
-    return {"drawn": LateDict.of(_told, plan, drawn, mask), "_drawn": mask}  # rarely read
+    of_all = np.zeros((len(drawn), len(mask)))
+    of_all[:, mask] = drawn
+    return {"drawn": LateDict.of(_told, draws, of_all, mask), "_drawn": mask}  # rarely read
 
 
-def late_info(plan: EpisodePlan) -> tuple[Any, ...]:
+def late_info(draws: EpisodeDraws) -> tuple[Any, ...]:
     """How the C extension makes ``"drawn"`` of ``drawn_info`` from drawn values and a mask."""
-    return LateDict, UNFILLED, partial(_told, plan)
+    return LateDict, UNFILLED, partial(_told, draws)
 
 
-def _told(plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-    told = plan.told | plan.shown(drawn)
-    kinds = {name: object if name in plan.strings else None for name in told}
+def _told(draws: EpisodeDraws, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
+    told = draws.told | draws.shown(drawn)
+    kinds = {name: object if name in draws.strings else None for name in told}
     return coded({n: _of_each(v, len(mask), kinds[n]) for n, v in told.items()}, mask)
 
 
-def _of_each(value: Any, count: int, kind: Any) -> npt.NDArray[Any]:
-    return value if isinstance(value, np.ndarray) else np.full(count, value, kind)
+def _of_each(value: Any, count: int, kind: Any) -> Any:
+    is_drawn = isinstance(value, np.ndarray)
+    return environments_first(value) if is_drawn else np.full(count, value, kind)
 
 
 def final_infos(
@@ -98,11 +102,11 @@ def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 def copy_rows(source: Any, target: Any, mask: MaskArray) -> None:
     """Copy the rows of environments in a mask from arrays, or dicts of arrays, to others."""
-    if isinstance(target, Mapping):
-        for name, values in target.items():
-            copy_rows(source[name], values, mask)
-    else:
-        target[mask] = source[mask]
+
+    def copy(values: npt.NDArray[Any], others: npt.NDArray[Any]) -> None:
+        values[mask] = others[mask]
+
+    mapped(copy, target, source)
 
 
 def not_finite(values: Any) -> MaskArray | None:
@@ -123,11 +127,7 @@ def not_finite(values: Any) -> MaskArray | None:
 
 def observation_of(observations: Any, index: int) -> Any:
     """A copy of the observation of one environment."""
-    if isinstance(observations, Mapping):
-        return {name: observation_of(value, index) for name, value in observations.items()}
-    if isinstance(observations, tuple):
-        return tuple(observation_of(value, index) for value in observations)
-    return observations[index].copy()
+    return mapped(lambda values: values[index].copy(), observations)
 
 
 def observations_of(observations: Any, mask: MaskArray) -> npt.NDArray[Any]:

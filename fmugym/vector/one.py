@@ -16,21 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError
 from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
 from fmugym.task.judging import Result, after_step, info_of, judged
+from fmugym.task.native_draws import no_draws
 from fmugym.task.readings import READINGS, Readings, reading
 from fmugym.task.step import NUMBERS, ORDER, conclude_left
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
-from fmugym.vector.engines.programs import compile_hooks
+from fmugym.vector.engines.programs import attempt, compile_hooks
 from fmugym.vector.hooks.check import find_difference, sample_states, states_around
 from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.program import UntraceableError
 from fmugym.vector.hooks.purity import names_in_hooks, require_pure
 from fmugym.vector.hooks.trace import TracedTask
-from fmugym.vector.streams import no_draws
 from fmugym.vector.views import batched, column
 
 __all__ = ["Player", "player_of"]
@@ -57,20 +56,7 @@ def player_of(env: FMUEnv, required: bool) -> Player | None:
     Raises:
         ConfigError: If they cannot, but must.
     """
-    try:
-        player = Player(env)
-        if required and player.left:
-            raise UntraceableError("; ".join(player.left.values()))
-    except ordinary(Exception) as reason:  # hooks may raise anything
-        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
-        if required:
-            raise ConfigError(text) from None
-        logger.info("%s. They run in Python, which is slower", text)
-        return None
-    for why in player.left.values():
-        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
-        logger.info("%s. It runs in Python, the others are compiled", text)
-    return player
+    return attempt(env, lambda: Player(env), required, "in Python")
 
 
 class Player:
@@ -107,11 +93,11 @@ class Player:
     def _compile(self, env: FMUEnv) -> None:
         self._watched = tuple(_watched_in(env))
         task = _traced(env, self._numbers)
-        plan, ended = env.inside.plan, np.ones(1, np.bool_)
+        draws, ended = env.inside.draws, np.ones(1, np.bool_)
         self._rows = batched(env, 1, self._pool.outputs, self._pool.inputs)
-        self._starts = plan.constants[:, None].copy()
+        self._starts = draws.constants[:, None].copy()
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
-        memory.parameters = dict(zip(plan.parameter_names, self._starts, strict=True))
+        memory.parameters = dict(zip(draws.parameter_names, self._starts, strict=True))
         memory.hold(task)
         self._task, self.left = task, task.left
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
@@ -121,11 +107,11 @@ class Player:
 
     def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
         """Hand the programs and their arrays to the pool."""
-        plan, (shapes, form, self._divided) = env.inside.plan, Layout(task, env, 1).of_one()
+        draws, (shapes, form, self._divided) = env.inside.draws, Layout(task, env, 1).of_one()
         real, flags = np.dtype(np.float64), ((1,), np.dtype(np.bool_))
         arrays = *shapes, ((1,), real), flags, flags, flags, ((0, 1), real)
         self._pool.prepare_play(
-            plan.model_variables,
+            draws.model_variables,
             memory.programs(task),
             memory.action_group(),
             self._starts,

@@ -17,6 +17,7 @@ from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 from fmugym.task.snapshot import Columns
 from fmugym.vector.action_arrays import checked_actions, is_array_space
+from fmugym.vector.codec import mapped
 from fmugym.vector.engines.engine import Engine, StepResult
 from fmugym.vector.infos import copy_rows
 
@@ -75,7 +76,7 @@ class Rollout(_Steps):
         horizon = len(rewards)
         first = ends.argmax(axis=0) + 1 if horizon else np.zeros(rewards.shape[1], np.int64)
         lengths = np.where(ends.any(axis=0), first, horizon)
-        turned = _mapped(lambda arrays: np.swapaxes(arrays[0], 0, 1), [observations])
+        turned = mapped(lambda array: np.swapaxes(array, 0, 1), observations)
         runs = np.arange(horizon)[:, np.newaxis] < lengths
         found = cls(turned, rewards.T, terminated.T, truncated.T, lengths)
         found.costs = {name: np.where(runs, paid, 0.0).T for name, paid in costs.items()}
@@ -106,22 +107,12 @@ def _names(costs: Iterable[Mapping[str, FloatArray]]) -> list[str]:
     return list(dict.fromkeys(name for told in costs for name in told))
 
 
-def _mapped(function: Callable[[list[Any]], Any], trees: Sequence[Any]) -> Any:
-    """Apply a function to the arrays at the same place of several observations."""
-    first = trees[0]
-    if isinstance(first, dict):
-        return {name: _mapped(function, [tree[name] for tree in trees]) for name in first}
-    if isinstance(first, tuple):
-        return tuple(_mapped(function, list(parts)) for parts in zip(*trees, strict=True))
-    return function(list(trees))
-
-
 def joined_rollouts(parts: Sequence[Rollout], count: int) -> Rollout:
     """Put rollouts together, and keep the first candidates."""
     if len(parts) == 1 and len(parts[0].rewards) == count:
         return parts[0]
     joined = Rollout._make(
-        _mapped(lambda arrays: np.concatenate(arrays)[:count], part)
+        mapped(lambda *arrays: np.concatenate(arrays)[:count], *part)
         for part in zip(*parts, strict=True)
     )
     joined.costs = {
@@ -375,7 +366,7 @@ def roll_out_by_steps(
         results.append(result)
     costs = [costs_in(result.infos, result.rewards.shape) for result in results]
     return Rollout.of(
-        _mapped(np.stack, [result.observations for result in results]),
+        mapped(lambda *arrays: np.stack(arrays), *(result.observations for result in results)),
         np.stack([result.rewards for result in results]),
         np.stack([result.terminated for result in results]),
         np.stack([result.truncated for result in results]),

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-import functools
-import math
 import secrets
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
@@ -14,19 +10,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from fmugym.distributions import Recipe
 from fmugym.pool import has_native_pool
 from fmugym.pool.base import FloatArray
-from fmugym.pool.form import form_of_draws
-from fmugym.signals import ordinary
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import row_of, state_of
 
 if TYPE_CHECKING:
-    from fmugym._native import Draws
     from fmugym.vector.vector_saving import Which
 
-__all__ = ["EpisodeStreams", "no_draws"]
+__all__ = ["EpisodeStreams"]
 
 IndexArray = npt.NDArray[np.intp]
 
@@ -56,7 +48,6 @@ class EpisodeStreams:
         self._seeds: npt.NDArray[Any] = np.full(num_envs, _NONE, object)
         self._all_seeded = False
         self._generator = np.random.Generator(np.random.PCG64(0))
-        self._latest: tuple[EpisodePlan, Draws | None] | None = None
 
     def seed_of(self, index: int) -> int | None:
         """The seed of an environment; None if it goes on with a stream of unknown seed."""
@@ -111,31 +102,24 @@ class EpisodeStreams:
         for index, seed in zip(indices, seeds, strict=True):
             self.states[index] = row_of(np.random.PCG64(seed).state)
 
-    def draw(self, plan: EpisodePlan, indices: IndexArray) -> FloatArray:
+    def draw(self, draws: EpisodeDraws, indices: IndexArray) -> FloatArray:
         """Draw one episode for each of some environments.
 
         Returns:
-            The values in the order of ``plan.draws``, shape (draws, M).
+            The values in the order of ``draws.drawn``, shape (draws, M).
 
         Raises:
             ConfigError: If a drawn value does not fit its variable's type.
         """
         self.require_seeds()
-        draws = self.native_draws(plan)
-        values = np.empty((len(plan.draws), len(indices)))
-        if draws is not None:
-            draws.take(self.states, indices, values)
+        values = np.empty((len(draws.drawn), len(indices)))
+        if draws.native is not None:
+            draws.native.take(self.states, indices, values)
             return values
         for place, index in enumerate(indices.tolist()):
             with self._as_generator(index) as generator:
-                values[:, place] = plan.draw_values(generator)
+                values[:, place] = draws.draw_values(generator)
         return values
-
-    def native_draws(self, plan: EpisodePlan) -> Draws | None:
-        """The draws of a plan for the C extension; None if it cannot draw them."""
-        if self._latest is None or self._latest[0] is not plan:
-            self._latest = plan, _native_draws(plan)
-        return self._latest[1]
 
     @contextmanager
     def _as_generator(self, index: int) -> Iterator[np.random.Generator]:
@@ -146,56 +130,3 @@ class EpisodeStreams:
             yield self._generator
         finally:
             self.states[index] = row_of(bits.state)
-
-
-def no_draws() -> Draws:
-    """Draws of the C extension that are none, because Python starts the episodes."""
-    return _draws((), ())
-
-
-def _native_draws(plan: EpisodePlan) -> Draws | None:
-    recipes = plan.recipes if has_native_pool() else None
-    if recipes is None:
-        return None
-    needed = {"normal": _standard_normal, "log_uniform": _exponential}
-    if any(recipe.kind in needed and not needed[recipe.kind]() for recipe in recipes):
-        return None
-    return _draws(recipes, plan.drawn_rows)
-
-
-def _draws(recipes: Sequence[Recipe], rows: Sequence[int]) -> Draws:
-    from fmugym import _native
-
-    known = _native.distributions()
-    counts = [len(recipe.numbers) for recipe in recipes]
-    firsts = np.cumsum([0, *counts])[:-1]
-    columns = [known.index(recipe.kind) for recipe in recipes], rows, firsts, counts
-    table = np.array(columns, np.int64).reshape(4, -1).T
-    numbers = np.array([number for recipe in recipes for number in recipe.numbers])
-    return _native.Draws(form_of_draws(table, numbers), _standard_normal(), _exponential())
-
-
-@functools.cache
-def _standard_normal() -> int:
-    """The address of numpy's function for normal distributions; 0 if it cannot be found.
-
-    numpy's documentation, "Extending via CFFI", finds the functions of its ``distributions.h`` in
-    the same way. It keeps the values those of the numpy at hand.
-    """
-    return _address(np.random._generator.__file__, "random_standard_normal")
-
-
-@functools.cache
-def _exponential() -> int:
-    """The address of the C library's ``exp``, which ``math.exp`` calls; 0 if it cannot be found."""
-    if sys.platform == "win32":
-        return _address("ucrtbase", "exp")
-    return _address(getattr(math, "__file__", None), "exp")  # or it is a part of Python itself
-
-
-def _address(library: str | None, name: str) -> int:
-    try:
-        function = getattr(ctypes.CDLL(library), name)
-    except ordinary(AttributeError, OSError):  # the system does not export it
-        return 0
-    return ctypes.cast(function, ctypes.c_void_p).value or 0

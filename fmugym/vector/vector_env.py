@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import CloudpickleWrapper, batch_space
 
-from fmugym.checks import check_misplaced
+from fmugym.checks import check_count, check_misplaced, check_option
 from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import MaskArray
 from fmugym.signals import ordinary
@@ -21,12 +21,11 @@ from fmugym.task.construction import prepare_hooks, require_construction
 from fmugym.task.saving import require_saving
 from fmugym.task.snapshot import Snapshot, checked_snapshot
 from fmugym.vector.arguments import (
+    HOOKS,
     autoreset_mode_of,
-    checked_hooks,
     checked_num_envs,
     checked_pool_options,
     checked_seeds,
-    checked_step_limit,
     split_options,
 )
 from fmugym.vector.attributes import Attributes
@@ -118,7 +117,8 @@ class FMUVectorEnv(VectorEnv[Any, Any, Any]):
             )
         self.num_envs = checked_num_envs(num_envs)
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
-        way, limit = checked_hooks(hooks), checked_step_limit(max_episode_steps)
+        way, limit = check_option("way of calling hooks", hooks, HOOKS), max_episode_steps
+        limit = None if limit is None else check_count("max_episode_steps", limit)
         options = checked_pool_options(pool_options, self.num_envs)
         try:
             self.inside.maker = EnvMaker(make_env)

@@ -50,5 +50,5 @@ class VectorInside:
 
         That moment is within a step in the mode ``SAME_STEP``.
         """
-        self.engine.leave_starts()
+        self.engine.starts_at_ends = False
         self.at_ends.append(look)

@@ -12,9 +12,9 @@ from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
+from fmugym.task.readings import environments_first, environments_last
 from fmugym.task.saving import READ, read_columns
 from fmugym.task.snapshot import Columns, Snapshot
-from fmugym.vector.hooks.hook_results import environments_first, environments_last
 
 __all__ = [
     "Which",

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.task.readings import Readings
-from fmugym.task.values import EpisodeVariables, ParameterValues
+from fmugym.task.values import EpisodeVariables
 
 __all__ = ["batched", "column", "some", "take"]
 
@@ -54,52 +53,18 @@ def some(batch: Readings, which: npt.NDArray[np.intp] | slice = slice(None)) -> 
         batch: What the hooks of all read.
         which: Their indices, or a slice.
     """
-    values: Any = _rows(batch.values, which)
-    variables = EpisodeVariables(batch.variables)
-    variables.update({name: _rows(row, which) for name, row in batch.variables.items()})
-    parameters = ParameterValues((n, _rows(row, which)) for n, row in batch.parameters.items())
-    return Readings(
-        values=values,
-        out=batch.out.over(lambda: values),
-        state=values[: len(batch.state)],
-        parameters=MappingProxyType(parameters),
-        variables=variables,
-        **{name: _rows(getattr(batch, name), which) for name in _ROWS},
-    )
-
-
-def _rows(values: Any, which: Any) -> npt.NDArray[Any]:
-    return np.array(np.asarray(values)[..., which])
-
-
-_ROWS: Final = (
-    *("previous_state", "inputs", "action", "previous_action", "step_count", "done", "after_end"),
-)
+    return batch.mapped(lambda values: np.array(np.asarray(values)[..., which]))
 
 
 def column(batch: Readings, index: int) -> Readings:
     """Return what the hooks of one environment of a batch read, as Python's numbers."""
-    values = tuple(batch.values[:, index].tolist())
-    variables = EpisodeVariables(batch.variables)
-    variables.update(_taken(batch.variables, index))
-    return Readings(
-        values=values,
-        out=batch.out.over(lambda: values),
-        state=values[: len(batch.state)],
-        previous_state=tuple(batch.previous_state[:, index].tolist()),
-        inputs=tuple(batch.inputs[:, index].tolist()),
-        action=take(batch.action, index),
-        previous_action=take(batch.previous_action, index),
-        step_count=int(batch.step_count[index]),
-        done=bool(batch.done[index]),
-        after_end=bool(batch.after_end[index]),
-        parameters=MappingProxyType(ParameterValues(_taken(batch.parameters, index))),
-        variables=variables,
-    )
-
-
-def _taken(rows: Mapping[str, Any], index: int) -> dict[str, Any]:
-    return {name: take(row, index) for name, row in rows.items()}
+    one = batch.mapped(lambda row: take(row, index))
+    for name in ("values", "previous_state", "inputs"):
+        setattr(one, name, tuple(getattr(one, name).tolist()))
+    one.state = one.values[: len(batch.state)]
+    one.step_count = int(one.step_count)
+    one.done, one.after_end = bool(one.done), bool(one.after_end)
+    return one
 
 
 def take(values: Any, index: int) -> Any:

@@ -116,7 +116,8 @@ static bool draw_chosen(const Draws *draws, const Chosen *chosen, const Py_buffe
         if (stream == NULL) {
             return false;
         }
-        draws_take(draws, stream, (double *)values->buf + i, (size_t)count);
+        BitGenerator bits = bits_of(stream);
+        draws_take(draws, &bits, (double *)values->buf + i, (size_t)count);
     }
     return true;
 }
@@ -139,8 +140,52 @@ static PyObject *draws_take_all(PyObject *object, PyObject *args) {
     return done ? Py_NewRef(Py_None) : NULL;
 }
 
+static PyObject *list_of(const double *values, size_t count) {
+    PyObject *list = PyList_New((Py_ssize_t)count);
+
+    for (size_t i = 0; i < count && list != NULL; i++) {
+        PyList_SetItem(list, (Py_ssize_t)i, PyFloat_FromDouble(values[i]));
+    }
+    return list;
+}
+
+static PyObject *take_from(const Draws *draws, BitGenerator *bits, const Py_buffer *starts) {
+    double *values = PyMem_Malloc(draws->count * sizeof *values + 1);
+
+    if (values == NULL) {
+        return PyErr_NoMemory();
+    }
+    draws_take(draws, bits, values, 1);
+    draws_start(draws, values, starts->buf, 1);
+    PyObject *list = list_of(values, draws->count);
+    PyMem_Free(values);
+    return list;
+}
+
+static PyObject *draws_take_from(PyObject *object, PyObject *args) {
+    const Draws *draws = &((PyDraws *)object)->draws;
+    PyObject *capsule, *array, *result = NULL;
+    Py_buffer starts = {0};
+
+    if (!PyArg_ParseTuple(args, "OO:take_from", &capsule, &array)) {
+        return NULL;
+    }
+    BitGenerator *bits = PyCapsule_GetPointer(capsule, "BitGenerator");
+    if (bits != NULL && take_vector(array, &starts, WRITTEN, "start_values", ITEM_FLOAT64,
+                                    ANY_LENGTH)) {
+        if (draws_fit(draws, (size_t)starts.shape[0])) {
+            result = take_from(draws, bits, &starts);
+        } else {
+            PyErr_SetString(PyExc_ValueError, "start_values has too few rows");
+        }
+    }
+    release_buffer(&starts);
+    return result;
+}
+
 static PyMethodDef methods[] = {
     {"take", draws_take_all, METH_VARARGS, NULL},
+    {"take_from", draws_take_from, METH_VARARGS, NULL},
     {NULL, NULL, 0, NULL},
 };
 

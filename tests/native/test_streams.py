@@ -11,10 +11,11 @@ from vector_tools import HOOKS, Drawing
 from fmugym import Choice, LogUniform, Normal, Uniform
 from fmugym.distributions import draw
 from fmugym.pool.form import form_of_draws
-from fmugym.task.episode import EpisodePlan
+from fmugym.task import native_draws as module
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.saving import state_of as generator_state_of
 from fmugym.vector import FMUVectorEnv
-from fmugym.vector import streams as module
+from fmugym.vector import streams as streams_module
 from fmugym.vector.streams import EpisodeStreams
 
 SEEDS = [
@@ -49,12 +50,13 @@ class OwnUniform(Uniform):
 @pytest.fixture(params=[True, False], ids=lambda native: "native" if native else "python")
 def native(request, monkeypatch):
     """Draw with the C extension, and as if there were none."""
-    monkeypatch.setattr(module, "has_native_pool", lambda: request.param)
+    for place in (module, streams_module):
+        monkeypatch.setattr(place, "has_native_pool", lambda: request.param)
     return request.param
 
 
-def plan_of(*distributions):
-    return EpisodePlan((), {}, {f"v{i}": value for i, value in enumerate(distributions)})
+def draws_of(*distributions):
+    return EpisodeDraws((), {}, {f"v{i}": value for i, value in enumerate(distributions)})
 
 
 def state_of(streams, index):
@@ -71,15 +73,15 @@ def test_seeds_of_any_size(native):
 
 
 def test_some_are_seeded_and_the_others_go_on(native):
-    streams, plan = EpisodeStreams(4), plan_of(Uniform(0.0, 1.0))
+    streams, draws = EpisodeStreams(4), draws_of(Uniform(0.0, 1.0))
     everyone = np.arange(4)
     streams.seed([3, 4, 5, 6], everyone)
-    streams.draw(plan, everyone)
+    streams.draw(draws, everyone)
     streams.seed([9, None, 2**70, 7], np.array([0, 1, 2]))
     expected = [np.random.default_rng(seed) for seed in (9, 4, 2**70, 6)]
     for index in (1, 3):
         expected[index].random()
-    drawn = streams.draw(plan, everyone)
+    drawn = streams.draw(draws, everyone)
     assert drawn[0].tolist() == [generator.random() for generator in expected]
 
 
@@ -88,40 +90,54 @@ def test_draws_are_numpys(name, native):
     """One after another, mixed with others that leave half a number over or none."""
     distributions = [DISTRIBUTIONS[name], Choice([1, 2, 3]), DISTRIBUTIONS[name], Uniform(0, 1)]
     seeds = [5, 6, 2**100]
-    streams, plan = EpisodeStreams(3), plan_of(*distributions)
+    streams, draws = EpisodeStreams(3), draws_of(*distributions)
     streams.seed(seeds, np.arange(3))
     if native:
-        assert streams.native_draws(plan) is not None
+        assert draws.native is not None
     generators = [np.random.default_rng(seed) for seed in seeds]
     for indices in ([0, 1, 2], [1], [2, 0]) * 200:
-        drawn = streams.draw(plan, np.array(indices))
+        drawn = streams.draw(draws, np.array(indices))
         expected = [[draw(d, generators[index]) for d in distributions] for index in indices]
         assert drawn.T.tolist() == expected
     for index, generator in enumerate(generators):
         assert state_of(streams, index) == generator.bit_generator.state
 
 
+@pytest.mark.parametrize("kind", ["PCG64", "MT19937", "Philox", "SFC64"])
+def test_draws_by_a_generator_of_any_kind_are_numpys(kind, native):
+    """A single environment has a generator, which the user may replace."""
+    distributions = [*DISTRIBUTIONS.values(), *reversed(DISTRIBUTIONS.values())]
+    draws = draws_of(*distributions)
+    if native:
+        assert draws.native is not None
+    ours, theirs = (np.random.Generator(getattr(np.random, kind)(9)) for _ in range(2))
+    for _ in range(100):
+        assert draws.draw_values(ours) == [draw(d, theirs) for d in distributions]
+    assert ours.random() == theirs.random()
+    assert ours.integers(7, dtype=np.int32) == theirs.integers(7, dtype=np.int32)
+
+
 def test_many_normal_numbers(native):
     """The tail and the wedges of the ziggurat are reached about once in a hundred draws."""
     count = 200_000 if native else 200
-    streams, plan = EpisodeStreams(count), plan_of(Normal(0.0, 1.0))
+    streams, draws = EpisodeStreams(count), draws_of(Normal(0.0, 1.0))
     streams.seed(list(range(count)), np.arange(count))
-    drawn = streams.draw(plan, np.arange(count))[0]
+    drawn = streams.draw(draws, np.arange(count))[0]
     for index in range(0, count, max(1, count // 5000)):
         assert drawn[index] == np.random.default_rng(index).normal()
     assert abs(drawn.mean()) < 4 / math.sqrt(count)
 
 
 def test_python_and_native_code_take_turns(native):
-    """A plan of options may have distributions that only Python draws."""
+    """Options may have distributions that only Python draws."""
     streams = EpisodeStreams(2)
-    mine, all_known = plan_of(OwnUniform(0.0, 1.0), Choice([1, 2, 3])), plan_of(Choice([5, 6, 7]))
-    assert streams.native_draws(mine) is None
+    mine, all_known = draws_of(OwnUniform(0.0, 1.0), Choice([1, 2, 3])), draws_of(Choice([5, 6, 7]))
+    assert mine.native is None
     streams.seed([1, 2], np.arange(2))
     generators = [np.random.default_rng(seed) for seed in (1, 2)]
-    for plan in (mine, all_known, all_known, mine, all_known) * 3:
-        drawn = streams.draw(plan, np.arange(2))
-        assert drawn.T.tolist() == [plan.draw_values(generator) for generator in generators]
+    for draws in (mine, all_known, all_known, mine, all_known) * 3:
+        drawn = streams.draw(draws, np.arange(2))
+        assert drawn.T.tolist() == [draws.draw_values(generator) for generator in generators]
 
 
 def test_a_failed_draw_leaves_the_stream_where_numpy_left_it(native):
@@ -133,21 +149,21 @@ def test_a_failed_draw_leaves_the_stream_where_numpy_left_it(native):
     streams = EpisodeStreams(1)
     streams.seed([8], np.arange(1))
     with pytest.raises(Exception, match="no value today"):
-        streams.draw(plan_of(Failing()), np.arange(1))
+        streams.draw(draws_of(Failing()), np.arange(1))
     generator = np.random.default_rng(8)
     generator.random()
-    assert streams.draw(plan_of(Uniform(0, 1)), np.arange(1))[0, 0] == generator.random()
+    assert streams.draw(draws_of(Uniform(0, 1)), np.arange(1))[0, 0] == generator.random()
 
 
 def test_unseeded_streams_differ(native):
-    plan = plan_of(Uniform(0.0, 1.0))
-    first, second = (EpisodeStreams(50).draw(plan, np.arange(50)) for _ in range(2))
+    draws = draws_of(Uniform(0.0, 1.0))
+    first, second = (EpisodeStreams(50).draw(draws, np.arange(50)) for _ in range(2))
     assert len({*first[0].tolist(), *second[0].tolist()}) == 100
 
 
 def test_an_unseeded_stream_can_be_repeated(native):
-    plan, streams = plan_of(Uniform(0.0, 1.0)), EpisodeStreams(1)
-    drawn = streams.draw(plan, np.arange(1))[0, 0]
+    draws, streams = draws_of(Uniform(0.0, 1.0)), EpisodeStreams(1)
+    drawn = streams.draw(draws, np.arange(1))[0, 0]
     assert streams.seed_of(0).bit_length() > 64
     assert np.random.default_rng(streams.seed_of(0)).random() == drawn
 
@@ -155,10 +171,10 @@ def test_an_unseeded_stream_can_be_repeated(native):
 def test_normals_are_left_to_python_where_numpys_function_is_not_found(monkeypatch):
     monkeypatch.setattr(module, "_standard_normal", lambda: 0)
     streams = EpisodeStreams(1)
-    assert streams.native_draws(plan_of(Normal(0.0, 1.0))) is None
-    assert streams.native_draws(plan_of(Uniform(0.0, 1.0))) is not None
+    assert draws_of(Normal(0.0, 1.0)).native is None
+    assert draws_of(Uniform(0.0, 1.0)).native is not None
     streams.seed([4], np.arange(1))
-    drawn = streams.draw(plan_of(Normal(0.0, 1.0)), np.arange(1))
+    drawn = streams.draw(draws_of(Normal(0.0, 1.0)), np.arange(1))
     assert drawn[0, 0] == np.random.default_rng(4).normal()
 
 
@@ -173,8 +189,8 @@ def test_normals_are_left_to_python_where_numpys_function_is_not_found(monkeypat
 )
 def test_what_may_not_fit_is_checked_draw_by_draw(distribution, variable):
     env = Drawing()
-    plan = EpisodePlan((env.fmu.variable(variable),), {variable: distribution}, {})
-    assert plan.recipes is None
+    draws = EpisodeDraws((env.fmu.variable(variable),), {variable: distribution}, {})
+    assert draws.recipes is None
     env.close()
 
 
@@ -289,11 +305,25 @@ class TestGuards:
         with pytest.raises(ValueError, match="ends too early"):
             _native.Draws(bytes(33), 0)
 
+    def test_what_is_no_bit_generator(self):
+        draws = draws_of(Uniform(0, 1)).native
+        with pytest.raises(ValueError, match="PyCapsule"):
+            draws.take_from(None, np.empty(1))
+
+    def test_too_few_start_values(self):
+        from fmugym import _native
+
+        kind = _native.distributions().index("uniform")
+        table = np.array([[kind, 1, 0, 2]], np.int64)
+        draws = _native.Draws(form_of_draws(table, np.array([0.0, 1.0])), 0)
+        with pytest.raises(ValueError, match="too few rows"):
+            draws.take_from(np.random.PCG64().capsule, np.empty(1))
+
     def test_streams_that_do_not_exist(self):
         from fmugym import _native
 
         states = np.zeros((3, 6), np.uint64)
-        draws = EpisodeStreams(1).native_draws(plan_of(Uniform(0, 1)))
+        draws = draws_of(Uniform(0, 1)).native
         for index in (-1, 3, 2**62):
             with pytest.raises(IndexError, match="there is no stream"):
                 _native.seed(states, np.array([index]), bytes(4))

@@ -179,7 +179,7 @@ def test_verdict(make_fmu, version, quirk, caplog):
     path = make_fmu(quirk.token, version)
     envs = make_vector(path, probe_timeout=quirk.probe_timeout)
     inside = envs.get_attr("inside")[0]
-    spec, starts = inside.spec, inside.plan.starts()
+    spec, starts = inside.spec, inside.draws.starts()
     envs.close()
     fmu = fmugym.FMU(path, probe_timeout=quirk.probe_timeout)
     verdict = examine(fmu, spec, starts, several=True, must_survive=False)

@@ -181,7 +181,7 @@ ACTION = np.float32([0.004])
 
 def test_each_hook_is_named_once(caplog):
     env = Both()
-    with caplog.at_level(logging.INFO, logger="fmugym.vector.one"):
+    with caplog.at_level(logging.INFO, logger="fmugym.vector"):
         for _ in range(3):
             env.reset(seed=5)
             env.step(env.action_space.sample())

@@ -229,7 +229,7 @@ def test_masks_of_every_form(form):
 
 
 def test_parameters_given_before_count():
-    """Options put the constants of some episodes in the place of the plan's: the general way."""
+    """Options give some episodes other constants: the general way."""
     first, second = made(CART_POLE), made(CART_POLE)
     mask = np.array([True, True, False, False, False])
     for envs in first, second:
@@ -240,6 +240,16 @@ def test_parameters_given_before_count():
     assert play_both(first, second, 20) >= 5
     first.close()
     second.close()
+
+
+def test_options_that_give_no_parameter():
+    """The FMU gets no start value at all."""
+    envs = FMUVectorEnv(lambda: Drawing(model_parameters={}), 2)
+    usual, _ = envs.reset(seed=1)
+    observations, infos = envs.reset(seed=1, options={"model_parameters": {}})
+    assert observations.tolist() == usual.tolist()
+    assert infos["drawn"] == {}
+    envs.close()
 
 
 class Dividing(Drawing):
@@ -280,7 +290,7 @@ def test_references_do_not_leak():
     watched = (
         mask,
         options,
-        engine.env.inside.plan,
+        engine.env.inside.draws,
         CART_POLE,
         None,
         True,

@@ -17,28 +17,29 @@ import numpy.typing as npt
 from fmugym.archive.texts import numbers_of
 from fmugym.env import FMUEnv
 from fmugym.errors import ConfigError, SimulationError, shown
-from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
+from fmugym.fmi.status import TERMINATED_CODE
 from fmugym.pool.base import FloatArray, MaskArray, Played, StatusArray
 from fmugym.pool.extension import passes_refusals, require_refusal
 from fmugym.pool.health import fault_rates
-from fmugym.pool.licences import require_started, start_instances
+from fmugym.pool.licences import require_started
 from fmugym.signals import ordinary
 from fmugym.task import judging
 from fmugym.task import spaces as fmu_spaces
-from fmugym.task.construction import plan_of, plan_of_reset
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.beginning import Beginning
+from fmugym.task.construction import draws_of, draws_of_reset
+from fmugym.task.episode import EpisodeDraws
 from fmugym.task.future import assumed
 from fmugym.task.hooks import Hooks
-from fmugym.task.readings import Readings, reading
+from fmugym.task.native_draws import no_draws
+from fmugym.task.readings import Readings, environments_last, reading
 from fmugym.task.snapshot import Columns
 from fmugym.task.step import ORDER, conclude_left
 from fmugym.task.values import ParameterValues, ShownParameters
-from fmugym.task.warm_up import WarmUps
 from fmugym.vector.action_arrays import checked_actions
 from fmugym.vector.calls import MethodCall, attribute
 from fmugym.vector.codec import coded, with_masks
 from fmugym.vector.column import PoolColumn
-from fmugym.vector.engines.engine import Engine, StepResult
+from fmugym.vector.engines.engine import Engine, StepResult, failed_in
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import compile_hooks
 from fmugym.vector.hooks import hook_results
@@ -46,7 +47,7 @@ from fmugym.vector.hooks.memory import Memory
 from fmugym.vector.hooks.trace import TracedTask
 from fmugym.vector.infos import copy_rows, drawn_info, late_info, not_finite, observation_of
 from fmugym.vector.rollouts import costs_in
-from fmugym.vector.streams import EpisodeStreams, no_draws
+from fmugym.vector.streams import EpisodeStreams
 from fmugym.vector.vector_saving import (
     columns_of,
     place_column,
@@ -98,16 +99,15 @@ class BatchEngine(Engine):
         env.inside.was_reset = True  # for the calls on single environments
         self._columns: dict[str, npt.NDArray[Any]] = {}
         self._given: dict[str, npt.NDArray[Any]] = {}
-        self._make_parameters(env.inside.plan)
+        self._make_parameters(env.inside.draws)
         self._memory = Memory(env, env.inside.readings, self.ended, self._columns)
         self._prepare(task)
         self._note_foreign(slice(None), False)
 
-    def _make_parameters(self, plan: EpisodePlan) -> None:
-        self._start_values = np.repeat(plan.constants[:, None], self._n, axis=1)
-        self._drawn_rows = np.array(plan.drawn_rows, np.intp)[:, None]
+    def _make_parameters(self, draws: EpisodeDraws) -> None:
+        self._start_values = np.repeat(draws.constants[:, None], self._n, axis=1)
         self._parameters = ParameterValues(
-            zip(plan.parameter_names, self._start_values, strict=True)
+            zip(draws.parameter_names, self._start_values, strict=True)
         )
         self._known = set(self._parameters)
         strings = self.env.fmu.description.strings
@@ -117,8 +117,8 @@ class BatchEngine(Engine):
     def _prepare(self, task: TracedTask) -> None:
         """Give the pool everything it needs for steps."""
         env, memory, streams = self.env, self._memory, self._streams
-        plan, draws = env.inside.plan, streams.native_draws(env.inside.plan)
-        drawn = () if draws is None else plan.draws
+        draws, native = env.inside.draws, env.inside.draws.native
+        drawn = () if native is None else draws.drawn
         self._task, self._left = task, task.left
         self._left_after = {hook for hook in task.left if hook != "_get_inputs"}
         self.way = "compiled" if task.is_compiled else "array"
@@ -129,17 +129,17 @@ class BatchEngine(Engine):
         flags, real = ((self._n,), _BOOL), np.dtype(np.float64)
         drawn_array = (len(drawn), self._n), real
         arrays = *layout.shapes, ((self._n,), real), flags, flags, flags, drawn_array
-        tell = late_info(plan)
+        tell = late_info(draws)
         self._play = self._pool.prepare_play(
-            plan.model_variables,
+            draws.model_variables,
             memory.programs(task),
             memory.action_group(),
             self._start_values,
-            (no_draws() if draws is None else draws, streams.states),
+            (no_draws() if native is None else native, streams.states),
             (env.step_count, self.ended, self._limit),
             memory.surroundings(task, drawn, (StepResult, *layout.form, arrays, tell)),
         )
-        has_all_starts = draws is not None and task.variables.keys() == env.variables.keys()
+        has_all_starts = native is not None and task.variables.keys() == env.variables.keys()
         is_free = env.inside.warm_ups is None and not self._pool.retries_resets
         self._may_start = self._pool.plays_alone and has_all_starts and is_free
         self._settle_starts()
@@ -148,7 +148,7 @@ class BatchEngine(Engine):
         """Decide whether the pool itself starts episodes, in its step or in a reset.
 
         Python does so where others step the FMUs, where it has to draw values or to set episode
-        variables, where something goes with resets, and where constants are not those of the plan.
+        variables, where something goes with resets, and where constants are not the usual ones.
         """
         self._pool_starts = self._may_start and not self._any_foreign
         self._starts_at_ends = self._pool_starts and not self._left_after
@@ -158,8 +158,8 @@ class BatchEngine(Engine):
         env, before = self.env, self._parameters
         self._given[name] = numbers_of(values) if values.dtype == object else values
         env.inside.interface = env.inside.interface.with_parameter(name, values, 0)
-        env.inside.plan = plan_of(env)
-        self._make_parameters(env.inside.plan)
+        env.inside.draws = draws_of(env)
+        self._make_parameters(env.inside.draws)
         for known in before.keys() & self._parameters.keys():
             self._parameters[known][:] = before[known]
         self._prepare(self._task)
@@ -282,7 +282,7 @@ class BatchEngine(Engine):
         return row
 
     def _note_foreign(self, indices: IndexArray | slice, foreign: bool) -> None:
-        """Note which environments have another plan's constants: from options, or an older plan."""
+        """Note which environments have other constants: from options, or from before."""
         self._foreign[indices] = foreign
         self._any_foreign = bool(self._foreign.any())
         self._settle_starts()
@@ -303,14 +303,14 @@ class BatchEngine(Engine):
         started = None if options else self.reset_by({"reset_mask": mask})
         if started is not None:
             return started
-        plan = plan_of_reset(self.env, options, "reset_mask")
-        drawn = self._streams.draw(plan, indices)
-        self._begin(mask, indices, plan, drawn)
+        draws = draws_of_reset(self.env, options, "reset_mask")
+        drawn = self._streams.draw(draws, indices)
+        self._begin(indices, draws, drawn)
         try:
             observations, infos = self._seen_at_start(None, {}, mask, ORDER)
         finally:
             self.note_starts(mask)
-        return observations, infos | self._told(plan, drawn, mask.copy())
+        return observations, infos | drawn_info(draws, drawn, mask.copy())
 
     def reset_by(self, options: Any) -> tuple[Any, dict[str, Any]] | None:
         """See ``Engine.reset_by``."""
@@ -347,12 +347,6 @@ class BatchEngine(Engine):
         finally:
             self.env.inside.in_hooks = False
 
-    def _told(self, plan: EpisodePlan, drawn: FloatArray, mask: MaskArray) -> dict[str, Any]:
-        """What infos tell of the episodes that have started in a mask."""
-        of_all = np.zeros((len(drawn), self._n))
-        of_all[:, mask] = drawn
-        return drawn_info(plan, of_all, mask)
-
     def _require_finite_start(self, observations: Any, mask: MaskArray) -> None:
         wrong = not_finite(observations)
         if wrong is not None and (wrong & mask).any():
@@ -362,77 +356,21 @@ class BatchEngine(Engine):
                 f"environment {index}: the first observation is not finite: {first}"
             )
 
-    def _begin(
-        self, mask: MaskArray, indices: IndexArray, plan: EpisodePlan, drawn: FloatArray
-    ) -> None:
+    def _begin(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
         """Start episodes with values that were drawn, shape (draws, M)."""
-        values = self._place_episodes(drawn, indices, plan)
+        self._place_episodes(indices, draws, drawn)
         self.has_moved = True
-        warm_ups = self.env.inside.warm_ups
-        if warm_ups is None:
-            start_instances(self._pool, plan.model_variables, values, indices, mask)
-            self._forget(indices, plan)
-        else:
-            self._begin_with_warm_up(warm_ups, indices, plan, values)
+        rows = {name: self._parameters[name] for name in draws.parameter_names}
+        values = np.array([*rows.values()]).reshape(len(rows), self._n)
+        _Beginning(self, draws, indices, values, rows).begin()
 
-    def _begin_with_warm_up(
-        self, warm_ups: WarmUps, indices: IndexArray, plan: EpisodePlan, values: FloatArray
-    ) -> None:
-        """Begin episodes with a warm-up, or in the states that earlier ones have led to."""
-        env, pool = self.env, self._pool
-
-        def start(where: IndexArray) -> Readings:
-            mask = np.zeros(self._n, np.bool_)
-            mask[where] = True
-            start_instances(pool, plan.model_variables, values, where, mask)
-            return some(Readings.of(env), where)
-
-        rows = {name: self._row(name) for name in env.variables}
-        self._forget(indices, plan)
-        warm_ups.begin(pool, plan.model_variables, values, rows, indices, start, self._place)
-        env.previous_state[:, indices] = env.state[:, indices]
-
-    def _forget(self, indices: IndexArray, plan: EpisodePlan) -> None:
-        """Reset what hooks read, as a reset of a single environment does."""
-        env = self.env
-        env.step_count[indices] = 0
-        env.previous_state[:, indices] = env.state[:, indices]
-        no_action = np.reshape(env.inside.no_action, (*env.action.shape[:-1], 1))
-        env.action[..., indices] = env.previous_action[..., indices] = no_action
-        env.done[indices] = False
-        for row, (name, start) in zip(env.inputs, env.inside.start_inputs, strict=True):
-            row[indices] = (
-                self._parameters[name][indices] if name in plan.parameter_names else start
-            )
-
-    def _place_episodes(
-        self, drawn: FloatArray, indices: IndexArray, plan: EpisodePlan
-    ) -> FloatArray:
-        """Write the values of episodes into the rows of the parameters and variables.
-
-        Returns:
-            The parameters in the order of the plan, shape (P, N).
-        """
-        default = plan is self.env.inside.plan
-        self._place(plan.variable_starts, indices)
-        if default and not self.env.variables:
-            self._start_values[self._drawn_rows, indices] = drawn
-        else:
-            rows = {n: hook_results.environments_last(v) for n, v in plan.named(drawn).items()}
-            self._place(rows, indices)
-        if not default or self._any_foreign:
-            self._place(plan.constant_parameters, indices)
-            self._note_foreign(indices, not default)
-        if self._given:
-            self._place_given(indices, plan)
-        if default:
-            return self._start_values
-        return np.stack([self._parameters[name] for name in plan.parameter_names])
-
-    def _place_given(self, indices: IndexArray, plan: EpisodePlan) -> None:
-        constant = plan.constant_parameters.keys() - plan.told.keys()
-        given = {name: self._given[name][indices] for name in self._given if name in constant}
-        self._place(given, indices)
+    def _place_episodes(self, indices: IndexArray, draws: EpisodeDraws, drawn: FloatArray) -> None:
+        """Write the values of episodes into the rows of the parameters and variables."""
+        constants = draws.constant_parameters
+        self._place(draws.variable_starts | constants | draws.named(drawn), indices)
+        own = constants.keys() - draws.told.keys()
+        self._place({n: row[indices] for n, row in self._given.items() if n in own}, indices)
+        self._note_foreign(indices, draws is not self.env.inside.draws)
 
     def _place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
         for name, value in values.items():
@@ -479,14 +417,14 @@ class BatchEngine(Engine):
         self._note_foreign(indices, self._has_other_constants(columns["parameters"]))
 
     def _has_other_constants(self, columns: Mapping[str, Any]) -> bool:
-        """Whether parameters that are placed are not all those of the plan."""
-        plan = self.env.inside.plan
+        """Whether parameters that are placed are not all the usual ones."""
+        draws = self.env.inside.draws
         own = all(
             (np.asarray(columns[name]) == value).all()
-            for name, value in plan.constants_shown.items()
+            for name, value in draws.constants_shown.items()
             if name in columns
         )
-        return not own or not columns.keys() <= set(plan.parameter_names)
+        return not own or not columns.keys() <= set(draws.parameter_names)
 
     @contextmanager
     def assuming(
@@ -520,15 +458,9 @@ class BatchEngine(Engine):
 
     def observe(self, indices: IndexArray) -> Any:
         """See ``Engine.observe``."""
-        self.env.inside.in_hooks = True
-        try:
-            observations = self._observe()
-        finally:
-            self.env.inside.in_hooks = False
         mask = np.zeros(self._n, np.bool_)
         mask[indices] = True
-        self._require_finite_start(observations, mask)
-        return observations
+        return self._seen_at_start(None, {}, mask, ("_get_observation",))[0]
 
     # Steps.
 
@@ -587,20 +519,20 @@ class BatchEngine(Engine):
     @passes_refusals
     def _step_pool(self, actions: Any, starting: MaskArray | None) -> Played:
         """Start the episodes in the mask, and let the FMUs of the other environments step."""
-        play, plan = self._play, self.env.inside.plan
+        play, draws = self._play, self.env.inside.draws
         if starting is None:
             play.before(actions)
             self._pool.step()
             self.add_offsets(self._pool)
             return play.after(actions)
         indices = starting.nonzero()[0]
-        drawn = self._streams.draw(plan, indices)
+        drawn = self._streams.draw(draws, indices)
         play.before(actions)
-        self._begin(starting, indices, plan, drawn)
+        self._begin(indices, draws, drawn)
         self._pool.step(None, starting)
         self.add_offsets(self._pool, starting)
         result, troubled, any_ended, _ = play.after(actions)
-        result.infos.update(self._told(plan, drawn, starting))
+        result.infos.update(drawn_info(draws, drawn, starting))
         return result, troubled, any_ended, starting
 
     def _converted(self, actions: Any, error: Exception) -> npt.NDArray[Any]:
@@ -632,7 +564,7 @@ class BatchEngine(Engine):
         horizon = len(actions)
         shape = horizon, self._n
         judged = np.empty(shape), np.empty(shape, _BOOL), np.empty(shape, _BOOL)
-        seen = self._arrays_of_steps(horizon)
+        seen = self._new_arrays(horizon)
         self.has_moved = True
         arrays = tuple(seen.values()) if isinstance(seen, dict) else seen
         offsets = np.empty(0) if self.offsets is None else self.offsets
@@ -641,22 +573,13 @@ class BatchEngine(Engine):
         observations, infos = (seen, {}) if self._divided is None else self._divided(seen)
         return observations, *judged, costs_in(infos, judged[0].shape)
 
-    def _arrays_of_steps(self, horizon: int) -> Any:
-        """Make the arrays of many steps, with a first axis for the steps."""
-        arrays = self._new_arrays()
-        if isinstance(arrays, tuple):
-            return tuple(_for_steps(array, horizon) for array in arrays)
-        if isinstance(arrays, dict):
-            return {name: _for_steps(array, horizon) for name, array in arrays.items()}
-        return _for_steps(arrays, horizon)
-
     # Hooks without a program.
 
     def _call_get_inputs(self, actions: npt.NDArray[Any], resetting: MaskArray | None) -> None:
         """Call this hook on arrays, before the pool takes over the actions."""
         env, read = self.env, self.env.inside.readings
         before = read.action, read.previous_action, read.previous_state
-        read.previous_action, read.action = read.action, hook_results.environments_last(actions)
+        read.previous_action, read.action = read.action, environments_last(actions)
         read.previous_state, env.inside.in_hooks = read.state.copy(), True
         try:
             self._write_inputs(env._get_inputs(), resetting)
@@ -705,7 +628,7 @@ class BatchEngine(Engine):
     ) -> StepResult:
         """Call the hooks that are not compiled, in their order."""
         env, left = self.env, self._left
-        self._idle = self._failed(self._pool.statuses) if troubled else None
+        self._idle = failed_in(self._pool.statuses) if troubled else None
         if started is not None:
             self._idle = started if self._idle is None else self._idle | started
         env.inside.in_hooks = True
@@ -764,7 +687,7 @@ class BatchEngine(Engine):
         if row.dtype == np.float64:
             return row
         return row.astype(
-            hook_results.type_of_variable(self.env.inside.plan, name, row.dtype), copy=False
+            hook_results.type_of_variable(self.env.inside.draws, name, row.dtype), copy=False
         )
 
     def _restore_variables(self, mask: MaskArray) -> None:
@@ -782,14 +705,6 @@ class BatchEngine(Engine):
         if self.env.inside.pool_tells:
             infos |= hook_results.info_arrays(self._pool.info(), mask)
         return infos
-
-    def _stopped(self, statuses: StatusArray) -> MaskArray:
-        stopped: MaskArray = statuses == TERMINATED_CODE
-        return stopped
-
-    def _failed(self, statuses: StatusArray) -> MaskArray:
-        failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
-        return failed
 
     def _mend(
         self,
@@ -834,7 +749,7 @@ class BatchEngine(Engine):
         wrong: tuple[MaskArray | None, MaskArray | None],
     ) -> None:
         """Handle FMUs that failed or asked to stop, and numbers that are not finite."""
-        stopped, failed = self._stopped(statuses), self._failed(statuses)
+        stopped, failed = statuses == TERMINATED_CODE, failed_in(statuses)
         if stopped.any():
             result.infos.update(with_masks({"fmu_terminated": stopped}, stopped))
         reasons = {index: self._pool.failure(index) for index in np.flatnonzero(failed).tolist()}
@@ -898,6 +813,54 @@ class BatchEngine(Engine):
             copy_rows(infos, {name: result.infos[name] for name in infos}, mask)
 
 
+class _Beginning(Beginning):
+    """Episodes that begin in some environments of a batch.
+
+    Args:
+        engine: Has the rows.
+        draws, indices, values, parameters: See ``Beginning``.
+    """
+
+    def __init__(
+        self,
+        engine: BatchEngine,
+        draws: EpisodeDraws,
+        indices: IndexArray,
+        values: FloatArray,
+        parameters: Mapping[str, FloatArray],
+    ) -> None:
+        super().__init__(engine.env, draws, indices, values, parameters)
+        self._engine = engine
+
+    def show(self, **values: Any) -> None:
+        """See ``Beginning.show``."""
+        for name, value in values.items():
+            rows = getattr(self.env.inside.readings, name)
+            rows[..., self.indices] = np.asarray(value)[..., np.newaxis]
+
+    def show_inputs(self, values: list[Any]) -> None:
+        """See ``Beginning.show_inputs``."""
+        for row, value in zip(self.env.inside.readings.inputs, values, strict=True):
+            row[self.indices] = value[self.indices] if isinstance(value, np.ndarray) else value
+
+    def look(self) -> None:
+        """See ``Beginning.look``."""
+        read = self.env.inside.readings
+        read.previous_state[:, self.indices] = read.state[:, self.indices]
+
+    def readings(self, indices: IndexArray) -> Readings:
+        """See ``Beginning.readings``."""
+        return some(self.env.inside.readings, indices)
+
+    def row(self, name: str) -> FloatArray:
+        """See ``Beginning.row``."""
+        return self._engine._row(name)
+
+    def place(self, values: Mapping[str, Any], indices: IndexArray) -> None:
+        """See ``Beginning.place``."""
+        self._engine._place(values, indices)
+
+
 def _indices(rows: MaskArray | None, mask: MaskArray) -> list[int]:
     """The indices of the environments in both masks; None stands for an empty mask."""
     return [] if rows is None else np.flatnonzero(rows & mask).tolist()
@@ -927,7 +890,3 @@ def _row_of(name: str, values: list[Any]) -> npt.NDArray[Any]:
     if row.ndim != 1 or row.dtype.kind not in "biuf":
         raise ConfigError(f"{name!r} can hold one number for each environment, got {shown(values)}")
     return row
-
-
-def _for_steps(array: npt.NDArray[Any], horizon: int) -> npt.NDArray[Any]:
-    return np.empty((horizon, *array.shape), array.dtype)

@@ -12,11 +12,17 @@ import numpy.typing as npt
 
 from fmugym.env import FMUEnv
 from fmugym.fmi.status import TERMINATED_CODE, WARNING_CODE
-from fmugym.pool.base import FloatArray, MaskArray, Pool
+from fmugym.pool.base import FloatArray, MaskArray, Pool, StatusArray
 from fmugym.pool.bundle import IndexArray
 from fmugym.task.snapshot import Columns
 
-__all__ = ["Engine", "StepResult"]
+__all__ = ["Engine", "StepResult", "failed_in"]
+
+
+def failed_in(statuses: StatusArray) -> MaskArray:
+    """Where FMUs have failed; that one has asked to stop is no failure."""
+    failed: MaskArray = (statuses > WARNING_CODE) & (statuses != TERMINATED_CODE)
+    return failed
 
 
 class StepResult(NamedTuple):
@@ -59,7 +65,7 @@ class Engine(ABC):
             idle: Which instances have not stepped, shape (N,); None if all have.
         """
         if self.offsets is not None:
-            failed = (pool.statuses > WARNING_CODE) & (pool.statuses != TERMINATED_CODE)
+            failed = failed_in(pool.statuses)
             left_out = failed if idle is None else failed | idle
             pool.outputs += np.where(left_out, 0.0, self.offsets[:, np.newaxis])
 
@@ -67,10 +73,6 @@ class Engine(ABC):
         """Note which episodes a step has ended."""
         np.logical_or(terminated, truncated, out=self.ended)
         self.any_ended = bool(np.count_nonzero(self.ended))
-
-    def leave_starts(self) -> None:
-        """Leave the start of episodes to ``reset`` from now on, also in the mode ``SAME_STEP``."""
-        self.starts_at_ends = False
 
     def note_starts(self, mask: MaskArray) -> None:
         """Note which episodes have started."""

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from fmugym.env import FMUEnv
-from fmugym.vector.codec import with_masks
+from fmugym.vector.codec import mapped, with_masks
 from fmugym.vector.hooks.trace import TracedTask
 
 __all__ = ["Layout"]
@@ -49,9 +50,12 @@ class Layout:
         observations, infos = self._nested(range(len(self._paths)))
         self.form = 0 if self.names is None else _pairs(observations), _pairs(infos)
 
-    def new_arrays(self) -> Any:
-        """Make the arrays of a step: one, or a tuple or dict of those that the program stores."""
-        arrays = tuple(np.empty(shape, dtype) for shape, dtype in self.shapes)
+    def new_arrays(self, steps: int) -> Any:
+        """Make the arrays of many steps: one, or a tuple or dict of those that programs store.
+
+        Their first axis is for the steps.
+        """
+        arrays = tuple(np.empty((steps, *shape), dtype) for shape, dtype in self.shapes)
         if self.names is None:
             return arrays[0]
         return dict(zip(self.names, arrays, strict=True)) if self.names else arrays
@@ -87,14 +91,12 @@ class Layout:
 
 def _of_one(tree: dict[int, Any]) -> tuple[Any, Any]:
     """The observation and the info of a single environment."""
-    return _first(tree[0]), _first(tree[1])
+    return mapped(_first, tree[0]), mapped(_first, tree[1])
 
 
-def _first(tree: Any) -> Any:
-    """The arrays of a tree, without their first axis of one; what has no other is a number."""
-    if isinstance(tree, dict):
-        return {name: _first(part) for name, part in tree.items()}
-    return tree[0].copy() if tree.ndim > 1 else tree.item()
+def _first(array: npt.NDArray[Any]) -> Any:
+    """An array without its first axis of one; if it has no other, a number."""
+    return array[0].copy() if array.ndim > 1 else array.item()
 
 
 def _pairs(tree: Any) -> Any:

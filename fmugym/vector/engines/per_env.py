@@ -21,7 +21,7 @@ from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.bundle import IndexArray
 from fmugym.signals import ordinary
 from fmugym.task.actions import take_action
-from fmugym.task.construction import plan_of, prepare_hooks
+from fmugym.task.construction import draws_of, prepare_hooks
 from fmugym.task.future import assumed
 from fmugym.task.judging import Result, first_observation, judged
 from fmugym.task.pictures import note_for_picture
@@ -29,7 +29,7 @@ from fmugym.task.saving import columns_of, place_columns
 from fmugym.task.snapshot import Columns, stacked
 from fmugym.vector.action_arrays import checked_actions, is_array_space
 from fmugym.vector.calls import attribute
-from fmugym.vector.codec import gathered
+from fmugym.vector.codec import gathered, mapped
 from fmugym.vector.column import PoolColumn
 from fmugym.vector.engines.engine import Engine, StepResult
 
@@ -113,7 +113,7 @@ class PerEnvEngine(Engine):
         """See ``Engine.set_parameter``."""
         for index, env in enumerate(self._envs):
             env.inside.interface = env.inside.interface.with_parameter(name, values, index)
-            env.inside.plan = plan_of(env)
+            env.inside.draws = draws_of(env)
 
     def reset(
         self, mask: MaskArray, seeds: Sequence[int | None] | None, options: Mapping[str, Any]
@@ -313,11 +313,7 @@ def _concluded(env: FMUEnv, status: int, values: tuple[float, ...]) -> Result:
 
 def _copied(observation: Any) -> Any:
     """Copy the arrays of an observation, whose memory may serve the next hook."""
-    if type(observation) is np.ndarray:
-        return observation.copy()
-    if isinstance(observation, dict):
-        return {name: _copied(part) for name, part in observation.items()}
-    return observation
+    return mapped(lambda part: part.copy() if type(part) is np.ndarray else part, observation)
 
 
 def _misfit(space: Any, observations: Sequence[Any]) -> ConfigError:

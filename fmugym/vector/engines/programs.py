@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy.typing as npt
 
@@ -19,15 +19,17 @@ from fmugym.vector.hooks.compare import require_same
 from fmugym.vector.hooks.program import DifferenceError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 
-__all__ = ["compile_hooks", "find_programs"]
+__all__ = ["attempt", "compile_hooks", "find_programs"]
 
 logger = logging.getLogger(__name__)
+
+_Made = TypeVar("_Made")
 
 _WILD_SCALES = (-0.3, 10.0, 300.0, -1e5)
 """Magnitudes of other states that programs are compared with hooks on."""
 
 
-def find_programs(env: FMUEnv, required: bool = False) -> TracedTask:
+def find_programs(env: FMUEnv, required: bool) -> TracedTask:
     """Compile the hooks of an environment, and compare the programs with the hooks on arrays.
 
     Args:
@@ -37,20 +39,43 @@ def find_programs(env: FMUEnv, required: bool = False) -> TracedTask:
     Raises:
         ConfigError: If the programs are required, but the hooks cannot be compiled.
     """
+
+    def make() -> TracedTask:
+        return compile_hooks(env, [sample_states(env, s) for s in ((1.0,), _WILD_SCALES)])
+
+    return attempt(env, make, required, "on arrays") or TracedTask.without_programs(env)
+
+
+def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) -> _Made | None:
+    """Compile hooks; the log tells which ones cannot be compiled, and why.
+
+    Args:
+        env: The environment.
+        make: Compiles its hooks; what it returns has in ``left`` those that cannot be compiled.
+        required: Whether hooks that cannot be compiled are an error.
+        where: How such hooks are called: ``"on arrays"``, for example.
+
+    Returns:
+        None if none can be compiled.
+
+    Raises:
+        ConfigError: If all are required, but one cannot be compiled.
+    """
+    name = type(env).__name__
     try:
-        task = compile_hooks(env, [sample_states(env, s) for s in ((1.0,), _WILD_SCALES)])
+        made: Any = make()
     except ordinary(Exception) as reason:  # hooks may raise anything
-        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
+        text = f"the hooks of {name} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
-        logger.info("%s. They run on arrays, which is slower", text)
-        return TracedTask.without_programs(env, str(reason))
-    for why in task.left.values():
-        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
+        logger.info("%s. They run %s, which is slower", text, where)
+        return None
+    for why in made.left.values():
+        text = f"a hook of {name} cannot be compiled: {why}"
         if required:
             raise ConfigError(text)
-        logger.info("%s. It runs on arrays, the others are compiled", text)
-    return task
+        logger.info("%s. It runs %s, the others are compiled", text, where)
+    return cast(_Made, made)
 
 
 def compile_hooks(

@@ -155,15 +155,15 @@ Visited = tuple[FloatArray, FloatArray, FloatArray]
 
 def _visit_states(env: FMUEnv, rng: np.random.Generator) -> list[Visited]:
     """Run short episodes with small inputs; a slow FMU would take long for more."""
-    pool, plan = env.inside.pool, env.inside.plan
+    pool, draws = env.inside.pool, env.inside.draws
     if pool.is_real:
         return _imagine_states(pool, rng)
     mask = np.zeros(pool.num_instances, np.bool_)
     mask[0] = True
     visited: list[Visited] = []
     for _ in range(_EPISODES):
-        start_values = plan.draw(rng).start_values
-        pool.reset(plan.model_variables, np.repeat(start_values, len(mask), axis=1), mask)
+        start_values = draws.draw(rng).start_values
+        pool.reset(draws.model_variables, np.repeat(start_values, len(mask), axis=1), mask)
         for _ in range(_STEPS):
             before = pool.outputs[:, 0].copy()
             pool.inputs[:, 0] = 0.1 * rng.uniform(size=len(pool.inputs))
@@ -212,7 +212,7 @@ def _place_sample(
     batch.done[index] = bool(rng.integers(2))
     for actions in (batch.action, batch.previous_action):
         actions[..., index] = sample_of(env.action_space, rng)
-    episode = env.inside.plan.draw(rng)
+    episode = env.inside.draws.draw(rng)
     for name, value in {**episode.parameters, **episode.variables}.items():
         rows.setdefault(name, []).append(value)
 

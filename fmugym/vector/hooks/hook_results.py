@@ -18,13 +18,12 @@ from fmugym.checks import check_mapping, number_of
 from fmugym.errors import ConfigError, FMUGymError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
-from fmugym.task.episode import EpisodePlan
+from fmugym.task.episode import EpisodeDraws
+from fmugym.task.readings import environments_first
 from fmugym.task.results import given
 from fmugym.vector.codec import coded
 
 __all__ = [
-    "environments_first",
-    "environments_last",
     "flags",
     "info_arrays",
     "observations",
@@ -91,7 +90,7 @@ def _rows_of(value: Any, length: int, wanted: str) -> Any:
 def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]:
     """Turn a number, or an array of N numbers, into an array of shape (N,); it may be a view."""
     given(value, hook)
-    try:
+    with _expected(hook, value, wanted):
         array = np.asarray(value)
         if array.dtype == object:  # decimals, fractions and the like
             numbers = [number_of(hook, one, may_be_boolean=True) for one in array.flat]
@@ -100,11 +99,7 @@ def _numbers(hook: str, value: Any, count: int, wanted: str) -> npt.NDArray[Any]
             array = array.reshape(count)
         if array.dtype.kind in _NUMBERS:
             return np.broadcast_to(array, (count,))
-    except FMUGymError:
-        raise
-    except ordinary(Exception):  # it makes no array, or its own methods fail
-        raise _mismatch(hook, value, wanted) from None
-    raise _mismatch(hook, value, wanted)
+        raise _mismatch(hook, value, wanted)
 
 
 @contextmanager
@@ -150,16 +145,6 @@ def observations(value: Any, space: spaces.Space[Any], count: int) -> Any:
             return np.array(environments_first(array), space.dtype, order="C")
 
 
-def environments_first(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """View an array with its last axis first."""
-    return array.T if array.ndim <= 2 else np.moveaxis(array, -1, 0)  # which takes 3 us
-
-
-def environments_last(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """View an array with its first axis last."""
-    return array.T if array.ndim <= 2 else np.moveaxis(array, 0, -1)
-
-
 def _shape_of(space: spaces.Space[Any]) -> tuple[int, ...]:
     return space.shape or ()
 
@@ -179,20 +164,20 @@ def variable(name: str, value: Any, count: int) -> npt.NDArray[Any]:
     return array if array.ndim else np.full(count, array)
 
 
-def type_of_variable(plan: EpisodePlan, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
+def type_of_variable(draws: EpisodeDraws, name: str, assigned: np.dtype[Any]) -> np.dtype[Any]:
     """The type in which N environments keep an episode variable.
 
     It is the type that ``_update`` assigns if this can hold the value with which episodes start.
     Otherwise it is float64, because episodes start while others are under way.
 
     Args:
-        plan: What episodes start with.
+        draws: What episodes start with.
         name: The variable.
         assigned: The type of what ``_update`` has assigned.
     """
-    if name in plan.drawn_names:
+    if name in draws.drawn_names:
         return _FLOAT
-    start = np.asarray(plan.constant_variables[name], _FLOAT)
+    start = np.asarray(draws.constant_variables[name], _FLOAT)
     with np.errstate(all="ignore"):
         fits = start.astype(assigned).astype(_FLOAT).tobytes() == start.tobytes()
     return assigned if fits else _FLOAT

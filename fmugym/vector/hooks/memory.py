@@ -133,11 +133,11 @@ class Memory:
             drawn: What the pool draws.
             results: How it makes results, or None.
         """
-        env, plan = self._env, self._env.inside.plan
-        names = plan.parameter_names
+        env, draws = self._env, self._env.inside.draws
+        names = draws.parameter_names
         flat = {name: row.reshape(-1, self._n) for name, row in self.variables.items()}
         before = {name: row.reshape(-1, self._n) for name, row in self.before.items()}
-        constants = plan.constant_variables
+        constants = draws.constant_variables
         return {
             "kept": self.kept,
             "done": self._done,

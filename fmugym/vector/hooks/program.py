@@ -186,9 +186,7 @@ class Program:
     results: tuple[int, ...]
 
     def loads(self, kind: str) -> bool:
-        """Whether the program loads or stores rows, or runs operations, of this kind."""
-        if kind in OPERATIONS:
-            return bool((self.code[:, 0] == OPERATIONS.index(kind)).any())
+        """Whether the program loads or stores rows of this kind."""
         return any(row[0] == kind for row in self.rows)
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> Program:

@@ -347,21 +347,22 @@ def loaded(graph: Graph, kind: str, names: npt.NDArray[Any], dtype: npt.DTypeLik
         names: What each element is, an array of objects.
         dtype: Their type.
     """
-    cells = empty((*names.shape, LANES), object)
+    nodes = empty(names.shape, np.int64)
     for place in np.ndindex(names.shape):
-        for lane in range(LANES):
-            what: Any = names[place]
-            cells[(*place, lane)] = graph.load(kind, what, dtype, lane)
-    return Symbols(graph, cells, dtype, writeable=False)
+        what: Any = names[place]
+        nodes[place] = graph.load(kind, what, dtype, None).node
+    return spread(graph, nodes, dtype, writeable=False)
 
 
-def spread(graph: Graph, nodes: npt.NDArray[Any], dtype: np.dtype[Any]) -> Symbols:
+def spread(
+    graph: Graph, nodes: npt.NDArray[Any], dtype: npt.DTypeLike, writeable: bool = True
+) -> Symbols:
     """Symbols of nodes, the environments on the last axis."""
     cells = empty((*nodes.shape, LANES), object)
     for place in np.ndindex(nodes.shape):
         for lane in range(LANES):
             cells[(*place, lane)] = Cell(int(nodes[place]), lane)
-    return Symbols(graph, cells, dtype)
+    return Symbols(graph, cells, dtype, writeable)
 
 
 @contextmanager

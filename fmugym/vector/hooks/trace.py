@@ -27,7 +27,7 @@ from fmugym.vector.hooks.graph import Graph
 from fmugym.vector.hooks.hook_results import type_of_variable
 from fmugym.vector.hooks.lowering import Store, compile_graph
 from fmugym.vector.hooks.patches import exclusive, numpy_of
-from fmugym.vector.hooks.program import TYPES, Program, UntraceableError, letter_of
+from fmugym.vector.hooks.program import TYPES, Program, UntraceableError
 from fmugym.vector.hooks.symbolic import element_names, symbolic_readings
 from fmugym.vector.hooks.symbols import (
     LANES,
@@ -68,6 +68,10 @@ class SeenArray:
     dtype: np.dtype[Any]
 
 
+_Seen = tuple[tuple[str, ...], npt.NDArray[Any], np.dtype[Any]]
+"""The path and the type of a ``SeenArray``, and the nodes of the values in it."""
+
+
 @dataclass(frozen=True)
 class TracedTask:
     """The programs of a task.
@@ -94,7 +98,7 @@ class TracedTask:
     tolerance: float = 0.0
 
     @classmethod
-    def without_programs(cls, env: FMUEnv, reason: str = "") -> TracedTask:
+    def without_programs(cls, env: FMUEnv) -> TracedTask:
         """A task whose hooks all run on arrays; a program only passes on that an FMU stops."""
         inside, graph, flag = env.inside, Graph(), np.dtype(np.bool_)
         idle = {
@@ -106,7 +110,7 @@ class TracedTask:
         stopped = graph.load("stopped", None, flag, None)
         others = graph.constant(False, flag), graph.constant(0.0, np.dtype(np.float64))
         judgement = compile_graph(graph, [], [cell.node for cell in (stopped, *others)], 0)
-        left = {hook: reason for hook in ORDER if not idle.get(hook, False)}
+        left = {hook: "" for hook in ORDER if not idle.get(hook, False)}
         return cls(compile_graph(Graph(), [], [], 0), judgement, (), {}, (), left)
 
     def with_tables(self, tables: Mapping[bytes, npt.NDArray[Any]]) -> TracedTask:
@@ -319,7 +323,7 @@ class Tracer:
             if symbols.size != 1:
                 raise UntraceableError(f"_update changes the shape of {name!r}")
             symbols = symbols.like(np.broadcast_to(symbols.cells.reshape(()), old.shape))
-        self._variables[name] = type_of_variable(self._env.inside.plan, name, symbols.dtype)
+        self._variables[name] = type_of_variable(self._env.inside.draws, name, symbols.dtype)
         symbols = symbols.cast(old.dtype)
         choose = self._graph.choose
         cells: Any = np.empty(old.shape, object)
@@ -350,83 +354,55 @@ class Tracer:
 
     def _trace_seen(self) -> tuple[list[SeenArray], list[Store]]:
         """Trace the info if there is one, and the observation unless the pool makes it."""
-        env = self._env
-        infos = self._seen("_get_info", self._see_info) if env.inside.has_info else ([], [])
-        if env.inside.pool_observes and not infos[0]:
-            return infos
-        seen, stores = self._seen("_get_observation", self._see_observation)
-        shift = len(seen)
-        moved = [s._replace(slot=(s.slot[0] + shift, *s.slot[1:])) for s in infos[1]]
-        return seen + infos[0], stores + moved
+        inside = self._env.inside
+        parts = self._seen("_get_info", self._see_info) if inside.has_info else []
+        if not inside.pool_observes or parts:
+            parts = self._seen("_get_observation", self._see_observation) + parts
+        return [SeenArray(path, nodes.shape, dtype) for path, nodes, dtype in parts], _stores(parts)
 
-    def _seen(self, name: str, see: Callable[..., None]) -> tuple[list[SeenArray], list[Store]]:
-        """The arrays that a hook fills; none if it is left to numpy."""
-        seen: list[SeenArray] = []
-        stores: list[Store] = []
+    def _seen(self, name: str, see: Callable[[Any], Iterator[_Seen]]) -> list[_Seen]:
+        """What a hook fills arrays with; nothing if it is left to numpy."""
         try:
-            self._call(name, lambda value: see(value, seen, stores))
-            compile_graph(self._graph, stores, [], len(seen))
+            parts: list[_Seen] = self._call(name, lambda value: list(see(value)))
+            compile_graph(self._graph, _stores(parts), [], len(parts))
         except UntraceableError as reason:
             self._left[name] = str(reason)
-            return [], []
-        return seen, stores
+            return []
+        return parts
 
-    def _see_observation(self, value: Any, seen: list[SeenArray], stores: list[Store]) -> None:
-        self._see(("observation",), value, self._env.observation_space, seen, stores)
+    def _see_observation(self, value: Any) -> Iterator[_Seen]:
+        return self._see(("observation",), value, self._env.observation_space)
 
-    def _see(
-        self,
-        path: tuple[str, ...],
-        value: Any,
-        space: Any,
-        seen: list[SeenArray],
-        stores: list[Store],
-    ) -> None:
+    def _see(self, path: tuple[str, ...], value: Any, space: Any) -> Iterator[_Seen]:
         if isinstance(space, spaces.Dict):
             if not isinstance(value, Mapping) or value.keys() != space.spaces.keys():
                 raise UntraceableError("the observation has other keys than its space")
             for name in space.spaces:
-                self._see((*path, name), value[name], space[name], seen, stores)
+                yield from self._see((*path, name), value[name], space[name])
             return
-        nodes = self._nodes_of_seen(value, space.shape or (), space.dtype)
-        self._note_seen(path, nodes, np.dtype(space.dtype), seen, stores)
-
-    def _nodes_of_seen(self, value: Any, shape: tuple[int, ...], dtype: Any) -> npt.NDArray[Any]:
-        symbols = as_symbols(self._graph, value)
+        shape, symbols = space.shape or (), as_symbols(self._graph, value)
         if symbols.shape != (*shape, LANES):
             raise UntraceableError(f"the observation has the shape {symbols.shape}")
-        return self._nodes(symbols, shape, dtype)
+        yield path, self._nodes(symbols, shape, space.dtype), np.dtype(space.dtype)
 
-    def _see_info(
-        self,
-        value: Any,
-        seen: list[SeenArray],
-        stores: list[Store],
-        path: tuple[str, ...] = ("info",),
-    ) -> None:
+    def _see_info(self, value: Any, path: tuple[str, ...] = ("info",)) -> Iterator[_Seen]:
         for name, part in dict(value).items():
             if isinstance(part, Mapping):
-                self._see_info(part, seen, stores, (*path, name))
+                yield from self._see_info(part, (*path, name))
                 continue
             symbols = as_symbols(self._graph, part)
             if symbols.ndim == 0:
                 symbols = symbols.like(np.broadcast_to(symbols.cells, (LANES,)))
-            self._note_seen((*path, name), same_for_all(symbols), symbols.dtype, seen, stores)
+            yield (*path, name), same_for_all(symbols), symbols.dtype
 
-    def _note_seen(
-        self,
-        path: tuple[str, ...],
-        nodes: npt.NDArray[Any],
-        dtype: np.dtype[Any],
-        seen: list[SeenArray],
-        stores: list[Store],
-    ) -> None:
-        letter_of(dtype)
-        flat = nodes.reshape(-1)
-        stores += [
-            Store(int(n), None, (len(seen), place, flat.size)) for place, n in enumerate(flat)
-        ]
-        seen.append(SeenArray(path, nodes.shape, dtype))
+
+def _stores(parts: list[_Seen]) -> list[Store]:
+    """The values to store in one array after the other."""
+    return [
+        Store(int(node), None, (number, place, nodes.size))
+        for number, (_, nodes, _) in enumerate(parts)
+        for place, node in enumerate(nodes.reshape(-1))
+    ]
 
 
 def to_integer(variable: Any, value: Any) -> Any:
