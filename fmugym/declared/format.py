@@ -641,8 +641,7 @@ PLANT: Final = Table(
         ),
         "hold": Key(
             TIME,
-            "How long it holds. After that it is missing in the record, and the agent holds its "
-            "last action.",
+            "How long it holds for an agent, which holds its last action after that.",
             None,
             "a step",
         ),

@@ -65,8 +65,8 @@ class Feed:
 
     Attributes:
         values: The present values of the tags, in the task's units.
-        faults: What is wrong, by the names of tags whose last value holds or is missing.
-        missing: The names of those for which nothing holds any longer.
+        faults: What is wrong, by the names of tags whose last value goes on.
+        expired: The names of those whose last value has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.
     """
@@ -75,7 +75,7 @@ class Feed:
     wall: Callable[[], float]
     values: dict[str, tuple[float, ...]] = field(default_factory=dict)
     faults: dict[str, str] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
+    expired: tuple[str, ...] = ()
     time: float = 0.0
     jump: float = 0.0
     samples_outputs = True
@@ -130,7 +130,7 @@ class Feed:
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
-        if self.missing and not self._has_begun:
+        if self.expired and not self._has_begun:
             raise SimulationError(self._told())
         self._has_begun = True
 
@@ -176,7 +176,7 @@ class Feed:
         self._look(self._tick - self._plant.step, self._tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
-        self.missing += tuple(faults)
+        self.expired += tuple(faults)
 
     def _now(self) -> float:
         """The plant's time."""
@@ -187,7 +187,7 @@ class Feed:
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
-        self.faults, missing = {}, []
+        self.faults, expired = {}, []
         for name, held in self._held.items():
             readings = self._poller.between(name, begin, end)
             fresh = [one for one in readings if one.received > max(begin, held.received)]
@@ -200,8 +200,8 @@ class Feed:
                 why = self._poller.trouble(name) or "nothing was received"
                 self.faults[name] = f"{why} (for {age:.6g} s)" if held.numbers else why
             if age > self._plant.stale_after + self._plant.hold:
-                missing.append(name)
-        self.missing = tuple(missing)
+                expired.append(name)
+        self.expired = tuple(expired)
         self.values = {name: held.numbers for name, held in self._held.items()}
 
     def _sampled(self, name: str, readings: Sequence[Reading]) -> tuple[float, ...]:

@@ -102,8 +102,9 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     * ``"proposed"``: what the action would have written, by variable;
     * ``"predicted"``: what a copy of the FMU foretold a step ago, by variable;
-    * ``"missing"``: the variables that have no value any longer; the last ones go on;
-    * ``"fault"``: what is wrong, also while last values hold.
+    * ``"missing"``: the variables that have no good value; the last ones go on, and records leave
+      them out;
+    * ``"fault"``: what is wrong with these.
 
     An episode ends (``truncated``) if the plant's time jumps.
 
@@ -119,9 +120,9 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._copies, self.errors = copies, copies.errors
 
     @property
-    def is_missing(self) -> bool:
-        """Whether a value is missing, so that an agent holds its last action."""
-        return bool(self._feed.missing)
+    def is_holding(self) -> bool:
+        """Whether a value has been missing for so long that an agent holds its last action."""
+        return bool(self._feed.expired)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -154,7 +155,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
         info: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
-        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
+        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.faults)
         return info | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:
@@ -253,12 +254,12 @@ def _reading(
 
 
 def holding(policy: Policy, shadow: Shadow) -> Policy:
-    """Make a policy hold its last action while values are missing; it still sees all steps."""
+    """Make a policy hold its last action while the shadow does so; it still sees all steps."""
     last: list[Any] = []
 
     def act(observation: Any) -> Any:
         action = policy.act(observation)
-        if not (last and shadow.is_missing):
+        if not (last and shadow.is_holding):
             last[:] = [action]
         return last[0]
 

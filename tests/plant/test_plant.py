@@ -26,11 +26,13 @@ from fmugym.declared import Task
 from fmugym.declared.series import read_data
 from fmugym.episodes.simulation import action_of, policy_of, simulate
 from fmugym.errors import ConfigError, SimulationError
+from fmugym.fit import fit_logs
 from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
+from fmugym.tools.shadows import evaluate_log
 
 
 @pytest.fixture
@@ -153,36 +155,48 @@ class TestFaults:
                 observation, *_, info = env.step(policy(observation))
                 told.append((bool(info["missing"]), info.get("fault", "")))
             env.complete()
-        assert [missing for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
-        assert ["T, T_floor" in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
+        assert [missing for missing, _ in told] == [False] + [True] * 4 + [False] * 3
+        assert ["T, T_floor" in fault for _, fault in told] == [missing for missing, _ in told]
         assert re.search("connection|does not answer", told[4][1])
         series = env.series
-        assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+        assert np.isnan(series["T"]).tolist() == [False] * 2 + [True] * 4 + [False] * 3
         assert len(set(series["proposed.u"][4:7].tolist())) == 1
         assert series.faults.keys() == {2, 3, 4, 5}
         assert np.all(np.diff(series["time"]) == STEP)
         text = (tmp_path / "plant.csv").read_text(encoding="utf-8")
         assert len(text.splitlines()) == 10
 
-    def test_a_log_with_a_gap_is_two_episodes(self, clock, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("hold", [0, "1h"])
+    def test_what_held_is_a_gap_of_the_log(self, clock, tmp_path, monkeypatch, hold):
+        """An agent goes on with the last value; whoever reads the record finds nothing measured."""
         gone = []
         changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
-        task = house(stale_after="1min", hold=0)
+        task = house(stale_after="1min", hold=hold)
         with (
             Server(house(), "thermostat", clock=clock) as server,
             watched(clock, server.address, task) as shadow,
         ):
-            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            env, seen = RecordSeries(shadow, path=tmp_path / "plant.csv"), []
             env.reset(seed=0)
             for step in range(9):
                 gone[:] = [True] * (step in (4, 5))
-                env.step(np.float32([0.5]))
+                observation, *_, info = env.step(np.float32([0.5]))
+                seen.append((float(observation[0]), info["missing"], shadow.is_holding))
             env.complete()
+        assert [missing for _, missing, _ in seen] == [("T",) * (k in (4, 5)) for k in range(9)]
+        assert [held for *_, held in seen] == [k in (4, 5) and not hold for k in range(9)]
+        assert len({seen[k][0] for k in (3, 4, 5)}) == 1
         assert np.isnan(env.series["T"]).tolist() == [k in (5, 6) for k in range(10)]
         assert "holding 0 has no finite number" in env.series.faults[5]
         log = PlantLog.read(tmp_path / "plant.csv")
         found = play_log(log, lambda **more: fmugym.load(house(), physical=True, **more))
         assert [len(one) for one in found] == [4, 2]
+        scores = evaluate_log(house(), log, {}, lambda steps: None)
+        assert {tuple(one.steps) for one in scores} == {(4, 2)}
+        pytest.importorskip("scipy", reason="needs SciPy: the extra identification")
+        fit = fit_logs(lambda: fmugym.load(house(), physical=True), [log], {"UA": None}, wash_in=0)
+        lengths = [len(one.time) for one in fit.comparison.trajectories]
+        assert lengths == [5, 3]
 
     def test_a_server_that_is_started_anew(self, clock):
         with Server(house(), "thermostat", clock=clock) as first:

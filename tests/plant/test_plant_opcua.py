@@ -93,7 +93,7 @@ def test_a_server_that_goes_and_comes_back(server, clock):
     line.close()
     series = env.series
     assert not {2, 3, 4} - series.faults.keys()
-    assert np.isnan(series["T"][3:5]).all()
+    assert np.isnan(series["T"][2:6]).all()
     assert "fault" not in info
     assert not np.isnan(series["T"][-1])
     assert np.all(np.diff(series["time"]) == STEP)
@@ -111,11 +111,15 @@ def test_bad_quality(clock, monkeypatch):
         env.reset(seed=0)
         env.step(np.float32([0.5]))
         bad.append(True)
-        infos = [env.step(np.float32([0.5]))[-1] for _ in range(2)]
+        infos, holds = [], []
+        for _ in range(2):
+            infos.append(env.step(np.float32([0.5]))[-1])
+            holds.append(shadow.is_holding)
     assert "T: node ns=2;s=House.T: BadSensorFailure" in infos[0]["fault"]
     assert "T_floor" not in infos[0]["fault"]
-    assert [one["missing"] for one in infos] == [(), ("T",)]
-    assert np.isnan(env.series["T"]).tolist() == [False, False, False, True]
+    assert [one["missing"] for one in infos] == [("T",)] * 2
+    assert holds == [False, True]
+    assert np.isnan(env.series["T"]).tolist() == [False, False, True, True]
     assert not np.isnan(env.series["T_floor"]).any()
 
 
