@@ -46,11 +46,11 @@ class _Held:
 
     Attributes:
         numbers: The latest ones that were used.
-        received: When they were received.
+        asked: When they were asked for.
     """
 
     numbers: tuple[float, ...] = ()
-    received: float = -np.inf
+    asked: float = -np.inf
 
 
 @dataclass
@@ -60,7 +60,7 @@ class Feed:
     It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing.
 
     Args:
-        clock: The monotonic clock of ticks and of what is received.
+        clock: The monotonic clock of ticks and readings.
         wall: Gives the plant's time in seconds of the year, unless there is a tag for it.
 
     Attributes:
@@ -100,7 +100,7 @@ class Feed:
         self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
         self._live = live
         self._held = {name: _Held() for name in plant.tags}
-        self._tick, self._has_begun = 0.0, False
+        self._ahead, self._has_begun = 0.0, False
 
     # The backend.
 
@@ -125,8 +125,8 @@ class Feed:
             SimulationError: If there are none in time. Once there were some, it waits for ever.
         """
         self._wait_for_values()
-        now, step = self._now(), self._plant.step
-        self._tick = self.clock.time() + (-now % step)
+        self._ahead, step = self._seen_ahead(), self._plant.step
+        now = self.clock.time() + self._ahead
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
@@ -162,42 +162,43 @@ class Feed:
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""
-        self._tick += self._plant.step
         self.time += self._plant.step
         self._sleep()
-        apart = self._now() - (self.clock.time() - self._tick) - self.time
+        ahead = self._seen_ahead()
         tolerance = max(
             min(_LEAST_JUMP, self._plant.step), _LATE * getattr(self.clock, "speed", 1.0)
         )
-        self.jump = apart if abs(apart) > tolerance else 0.0
+        self.jump = ahead - self._ahead if abs(ahead - self._ahead) > tolerance else 0.0
+        self._ahead = min(self._ahead, ahead)  # an answer is late, and never early
 
     def _sleep(self) -> None:
-        self.clock.sleep(self._tick - self.clock.time())
-        self._look(self._tick - self._plant.step, self._tick)
+        tick = self.time - self._ahead
+        self.clock.sleep(tick - self.clock.time())
+        self._look(tick - self._plant.step, tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
         self.expired += tuple(faults)
 
-    def _now(self) -> float:
-        """The plant's time."""
+    def _seen_ahead(self) -> float:
+        """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
         held = self._held.get("clock")
         if held is None:
-            return self.wall()
-        return held.numbers[0] + self.clock.time() - held.received
+            return self.wall() - self.clock.time()
+        return held.numbers[0] - held.asked
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
         self.faults, expired = {}, []
         for name, held in self._held.items():
             readings = self._poller.between(name, begin, end)
-            fresh = [one for one in readings if one.received > max(begin, held.received)]
-            if fresh or (readings and not held.numbers):
-                fresh = fresh or readings
+            fresh = [one for one in readings if one.asked > max(begin, held.asked)]
+            fresh = fresh or [one for one in readings[-1:] if one.asked > held.asked]
+            if fresh:
                 held.numbers = self._sampled(name, fresh)
-                held.received = fresh[-1].received
-            age = end - held.received
+                held.asked = fresh[-1].asked
+            age = end - held.asked
             if age > self._plant.stale_after or not held.numbers:
-                why = self._poller.trouble(name) or "nothing was received"
+                why = self._poller.trouble(name) or "no answer has come in time"
                 self.faults[name] = f"{why} (for {age:.6g} s)" if held.numbers else why
             if age > self._plant.stale_after + self._plant.hold:
                 expired.append(name)

@@ -39,9 +39,9 @@ class Answer(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """A good answer, and when it was received on the monotonic clock."""
+    """A good answer, and when it was asked for on the monotonic clock: it is no older."""
 
-    received: float
+    asked: float
     numbers: tuple[float, ...]
 
 
@@ -71,7 +71,7 @@ class Poller:
 
     Args:
         client: The client.
-        clock: The monotonic clock by which values are received.
+        clock: The monotonic clock by which values are asked for.
         interval: Time from one question to the next, in s of the clock.
         timeout: How long an answer may take, in s of real time.
 
@@ -111,7 +111,7 @@ class Poller:
             begin = self._clock.time()
             async with asyncio.timeout(self._timeout):
                 answers = await self._client.read()
-            self._take(answers)
+            self._take(answers, begin)
             rest = begin + self._interval - self._clock.time()
             await asyncio.sleep(max(0.0, rest / self._speed))
 
@@ -119,26 +119,25 @@ class Poller:
         with self._lock:
             self._trouble = trouble
 
-    def _take(self, answers: dict[str, Answer]) -> None:
-        now = self._clock.time()
+    def _take(self, answers: dict[str, Answer], asked: float) -> None:
         with self._lock:
             self._trouble, self.has_answered = "", True
             self._faults = {name: one.fault for name, one in answers.items() if one.fault}
             for name, one in answers.items():
                 if not one.fault:
                     kept = self._readings.setdefault(name, deque(maxlen=_MOST))
-                    kept.append(Reading(now, one.numbers))
+                    kept.append(Reading(asked, one.numbers))
 
     def between(self, name: str, begin: float, end: float) -> list[Reading]:
-        """The readings of a tag after one time and until another, and the last one before.
+        """The readings of a tag, asked for between two times, and the last one before.
 
         Earlier ones are forgotten.
         """
         with self._lock:
             kept = self._readings.get(name, deque())
-            while len(kept) > 1 and kept[1].received <= begin:
+            while len(kept) > 1 and kept[1].asked <= begin:
                 kept.popleft()
-            return [one for one in kept if one.received <= end]
+            return [one for one in kept if one.asked <= end]
 
     def trouble(self, name: str) -> str:
         """What is wrong with a tag now; "" if nothing is."""

@@ -263,17 +263,43 @@ class TestFaults:
     def test_answers_that_are_two_seconds_late(self):
         """Values are older then, but ticks come in time."""
         clock = RealClock(300.0)
-        with Server(house(), "thermostat", clock=clock) as server:
-            line = Line(server.address)
+        task = house(poll="1min", stale_after="40min", timeout="5s")
+        with Server(house(), "thermostat", clock=clock) as server, Line(server.address) as line:
             line.delay = 2.0 / 3.0  # there are three questions
-            task = house(poll="1min", stale_after="20min", timeout="5s")
             with watched(clock, line.address, task) as env:
                 env.reset(seed=0)
                 begin = clock.time()
                 *_, info = env.step(np.float32([0.5]))
                 assert clock.time() - begin < 1.5 * STEP
                 assert "fault" not in info
-            line.close()
+
+    def test_a_late_answer_does_not_shift_the_record(self, monkeypatch):
+        """The time that an answer tells is late; quicker ones tell by how much."""
+        changed(monkeypatch, lambda values: {"T_mass": values["clock"]})
+        tags = tags_with(T_mass={"register": 300, "type": "float64", "unit": "K"})
+        given = {"agent": {"observations": ["T", "T_mass"]}, "tags": tags}
+        task, clock = house(poll="10s", stale_after="40min", **given), RealClock(600.0)
+        with Server(task, "thermostat", clock=clock) as server, Line(server.address) as line:
+            line.delay = 0.25  # of each question, so that answers are 450 s late and more
+            with watched(clock, line.address, task) as shadow:
+                env = RecordSeries(shadow)
+                env.reset(seed=0)
+                line.delay = 0.0
+                for _ in range(4):
+                    env.step(np.float32([0.5]))
+        off = env.series["T_mass"] - env.series["time"]
+        np.testing.assert_allclose(off[-2:], 0.0, atol=200.0)
+
+    def test_answers_that_are_too_late_leave_gaps(self):
+        task, clock = house(poll="10s", stale_after="1h"), RealClock(600.0)
+        with Server(task, "thermostat", clock=clock) as server, Line(server.address) as line:
+            with watched(clock, line.address, task) as shadow:
+                shadow.reset(seed=0)
+                line.delay = 1.5  # of each question, so that answers are an hour late
+                infos = [shadow.step(np.float32([0.5]))[-1] for _ in range(8)]
+        assert infos[0]["missing"] == ()
+        assert {"T", "T_floor"} <= {*infos[-1]["missing"]}
+        assert "no answer has come in time" in infos[-1]["fault"]
 
     def test_two_clients(self, server, clock):
         with (

@@ -87,7 +87,7 @@ class LockStep(ManualClock):
 
     def _have_read(self, before):
         """Whether each has asked the time for a whole round that has begun since then."""
-        return all(self.asked[t] >= n + 6 for t, n in before.items() if t.is_alive())
+        return all(self.asked[t] >= n + 4 for t, n in before.items() if t.is_alive())
 
 
 class Line:
@@ -144,6 +144,12 @@ class Line:
 
     def close(self):
         self.background.stop()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
 
 
 def functions_in(sent):
