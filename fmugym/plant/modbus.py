@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import struct
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError, host_and_port
@@ -15,16 +16,6 @@ from fmugym.plant.tags import Plant, Tag
 
 __all__ = ["ModbusClient", "serve_modbus"]
 
-_FORMATS: Final = {
-    "int16": "h",
-    "int32": "i",
-    "int64": "q",
-    "uint16": "H",
-    "uint32": "I",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
 
@@ -62,20 +53,26 @@ class _Place(NamedTuple):
         where = tag.address
         unit_id = plant["unit_id"] if where.get("unit_id") is None else where["unit_id"]
         one = cls(unit_id, where["kind"], where["register"], where["register"] + tag.count)
-        return one if one.is_bits else one._replace(end=one.begin + tag.count * _width(tag))
+        width = 1 if one.is_bits else _type(tag).value[1]
+        return one._replace(end=one.begin + tag.count * width)
 
 
-def _width(tag: Tag) -> int:
-    """How many registers a number takes."""
-    return struct.calcsize(f">{_FORMATS[tag.address['type']]}") // 2
+def _registers() -> Any:
+    """What makes numbers of registers, and registers of numbers."""
+    return imported("pymodbus.client.mixin", "plant").ModbusClientMixin
+
+
+def _type(tag: Tag) -> Any:
+    return _registers().DATATYPE[tag.address["type"].upper()]
 
 
 def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
     """The numbers in registers or bits; devices write NaN for what they do not know."""
-    numbers = [float(cell) for cell in cells]
+    found: Any = cells
     if not place.is_bits:
-        content = struct.pack(f">{len(cells)}H", *_ordered(tag, cells))
-        numbers = [*struct.unpack(f">{tag.count}{_FORMATS[tag.address['type']]}", content)]
+        order = tag.address["word_order"]
+        found = _registers().convert_from_registers(cells, _type(tag), order)
+    numbers = [float(number) for number in np.ravel(found)]
     if not all(map(math.isfinite, numbers)):
         return Answer((), f"{place.kind} {place.begin} has no finite number")
     return Answer(tuple(map(tag.conversion, numbers)))
@@ -86,25 +83,20 @@ def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
     numbers = [tag.conversion.inverse(value) for value in values]
     if place.is_bits:
         return [int(number > 0.5) for number in numbers]
-    form = _FORMATS[tag.address["type"]]
-    given = numbers if form in "fd" else [_saturated(number, form) for number in numbers]
-    content = struct.pack(f">{tag.count}{form}", *given)
-    return _ordered(tag, struct.unpack(f">{place.end - place.begin}H", content))
+    if "int" in tag.address["type"]:
+        numbers = [_saturated(number, tag.address["type"]) for number in numbers]
+    made: Sequence[int] = _registers().convert_to_registers(
+        numbers, _type(tag), tag.address["word_order"]
+    )
+    return made
 
 
-def _saturated(number: float, form: str) -> int:
+def _saturated(number: float, kind: str) -> int:
     """The nearest integer of a type, as converters give it; the lowest one for NaN."""
-    bits = 8 * struct.calcsize(f">{form}")
-    low = 0 if form.isupper() else -(2 ** (bits - 1))
-    return low if math.isnan(number) else min(max(round(number), low), low + 2**bits - 1)
-
-
-def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
-    """The words with the first one of each number first, or back."""
-    if tag.address["word_order"] == "big":
-        return words
-    width = _width(tag)
-    return [words[i - i % width + width - 1 - i % width] for i in range(len(words))]
+    limits = np.iinfo(kind)
+    if math.isnan(number):
+        return int(limits.min)
+    return min(max(round(number), int(limits.min)), int(limits.max))
 
 
 class ModbusClient:
