@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -13,9 +13,10 @@ import numpy as np
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.plant.live import Live
-from fmugym.plant.polling import Poller, Reading
+from fmugym.plant.polling import Poller
 from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Feed", "local_time", "told"]
 
@@ -38,19 +39,6 @@ def told(faults: Mapping[str, str]) -> str:
     for name, why in faults.items():
         names.setdefault(why, []).append(name)
     return "; ".join(f"{', '.join(own)}: {why}" for why, own in names.items())
-
-
-@dataclass
-class _Held:
-    """What is known of a tag.
-
-    Attributes:
-        numbers: The latest ones that were used.
-        asked: When they were asked for.
-    """
-
-    numbers: tuple[float, ...] = ()
-    asked: float = -np.inf
 
 
 @dataclass
@@ -99,7 +87,7 @@ class Feed:
         """
         self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
         self._live = live
-        self._held = {name: _Held() for name in plant.tags}
+        self._asked = dict.fromkeys(plant.tags, -np.inf)
         self._ahead, self._has_begun = 0.0, False
 
     # The backend.
@@ -138,7 +126,7 @@ class Feed:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
         poller = self._poller
         while True:
-            has_answered, is_refused = poller.has_answered, poller.is_refused
+            has_answered, is_refused = bool(poller.answers), poller.is_refused
             self._look(self.clock.time() - self._plant.step, self.clock.time())
             if not self.faults:
                 self._require_fit()
@@ -181,33 +169,31 @@ class Feed:
 
     def _seen_ahead(self) -> float:
         """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
-        held = self._held.get("clock")
-        if held is None:
+        if "clock" not in self._asked:
             return self.wall() - self.clock.time()
-        return held.numbers[0] - held.asked
+        return self.values["clock"][0] - self._asked["clock"]
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
         self.faults, expired = {}, []
-        for name, held in self._held.items():
-            readings = self._poller.between(name, begin, end)
-            fresh = [one for one in readings if one.asked > max(begin, held.asked)]
-            fresh = fresh or [one for one in readings[-1:] if one.asked > held.asked]
+        rounds = self._poller.take(end)
+        for name, asked in self._asked.items():
+            good = [one for one in rounds if not one.answers[name].fault]
+            fresh = [one for one in good if one.asked > begin] or good[-1:]
             if fresh:
-                held.numbers = self._sampled(name, fresh)
-                held.asked = fresh[-1].asked
-            age = end - held.asked
-            if age > self._plant.stale_after or not held.numbers:
+                numbers = np.array([one.answers[name].numbers for one in fresh])
+                self.values[name], asked = self._sampled(name, numbers), fresh[-1].asked
+                self._asked[name] = asked
+            age = end - asked
+            if age > self._plant.stale_after:
                 why = self._poller.trouble(name) or "no answer has come in time"
-                self.faults[name] = f"{why} (for {age:.6g} s)" if held.numbers else why
+                self.faults[name] = f"{why} (for {age:.6g} s)" if name in self.values else why
             if age > self._plant.stale_after + self._plant.hold:
                 expired.append(name)
         self.expired = tuple(expired)
-        self.values = {name: held.numbers for name, held in self._held.items()}
 
-    def _sampled(self, name: str, readings: Sequence[Reading]) -> tuple[float, ...]:
-        """What a step gives of its readings."""
-        numbers = np.array([one.numbers for one in readings])
+    def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
+        """What a step gives of its readings, a row for each."""
         how = self._samplings.get(name, "last")
         found = _SAMPLED[how](numbers)
         if how == "integral":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections import deque
 from typing import Final, NamedTuple, Protocol
 
@@ -12,10 +11,10 @@ from fmugym.plant.background import Background
 from fmugym.pool.backend.clocks import Clock
 from fmugym.signals import ordinary
 
-__all__ = ["Answer", "Client", "LostError", "Poller", "Reading", "RefusedError", "host_and_port"]
+__all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round", "host_and_port"]
 
-_MOST: Final = 100_000
-"""So many readings of a tag are kept until they are used."""
+_MOST: Final = 10_000
+"""So many rounds are kept until they are used."""
 
 
 class LostError(FMUGymError):
@@ -38,11 +37,11 @@ class Answer(NamedTuple):
     fault: str = ""
 
 
-class Reading(NamedTuple):
-    """A good answer, and when it was asked for on the monotonic clock: it is no older."""
+class Round(NamedTuple):
+    """The answers for all tags, and when they were asked for: they are no older."""
 
     asked: float
-    numbers: tuple[float, ...]
+    answers: dict[str, Answer]
 
 
 class Client(Protocol):
@@ -76,18 +75,17 @@ class Poller:
         timeout: How long an answer may take, in s of real time.
 
     Attributes:
-        has_answered: Whether there was an answer.
+        answers: The latest ones; none before the first.
         is_refused: Whether this client was refused when it last connected.
     """
 
     def __init__(self, client: Client, clock: Clock, interval: float, timeout: float) -> None:
         self._client, self._clock, self._timeout = client, clock, timeout
         self._interval, self._speed = interval, getattr(clock, "speed", 1.0)
-        self._lock = threading.Lock()
-        self._readings: dict[str, deque[Reading]] = {}
-        self._faults: dict[str, str] = {}
+        self._rounds: deque[Round] = deque(maxlen=_MOST)
         self._trouble = "it has not answered yet"
-        self.has_answered = self.is_refused = False
+        self.answers: dict[str, Answer] = {}
+        self.is_refused = False
         self._background = Background(self._poll, "plant")
 
     async def _poll(self) -> None:
@@ -95,10 +93,10 @@ class Poller:
             try:
                 await self._converse()
             except ordinary(TimeoutError):
-                self._note(f"it does not answer within {self._timeout:g} s")
+                self._trouble = f"it does not answer within {self._timeout:g} s"
             except ordinary(Exception) as error:  # whatever a library makes of a broken line
                 is_own = isinstance(error, LostError)
-                self._note(str(error) if is_own else f"{type(error).__name__}: {error}")
+                self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
                 self.is_refused = isinstance(error, RefusedError)
             finally:
                 await self._client.close()
@@ -110,39 +108,22 @@ class Poller:
         while True:
             begin = self._clock.time()
             async with asyncio.timeout(self._timeout):
-                answers = await self._client.read()
-            self._take(answers, begin)
+                self.answers = await self._client.read()
+            self._trouble = ""
+            self._rounds.append(Round(begin, self.answers))
             rest = begin + self._interval - self._clock.time()
             await asyncio.sleep(max(0.0, rest / self._speed))
 
-    def _note(self, trouble: str) -> None:
-        with self._lock:
-            self._trouble = trouble
-
-    def _take(self, answers: dict[str, Answer], asked: float) -> None:
-        with self._lock:
-            self._trouble, self.has_answered = "", True
-            self._faults = {name: one.fault for name, one in answers.items() if one.fault}
-            for name, one in answers.items():
-                if not one.fault:
-                    kept = self._readings.setdefault(name, deque(maxlen=_MOST))
-                    kept.append(Reading(asked, one.numbers))
-
-    def between(self, name: str, begin: float, end: float) -> list[Reading]:
-        """The readings of a tag, asked for between two times, and the last one before.
-
-        Earlier ones are forgotten.
-        """
-        with self._lock:
-            kept = self._readings.get(name, deque())
-            while len(kept) > 1 and kept[1].asked <= begin:
-                kept.popleft()
-            return [one for one in kept if one.asked <= end]
+    def take(self, end: float) -> list[Round]:
+        """Take the rounds until some time that nobody has taken."""
+        found = []
+        while self._rounds and self._rounds[0].asked <= end:
+            found.append(self._rounds.popleft())
+        return found
 
     def trouble(self, name: str) -> str:
         """What is wrong with a tag now; "" if nothing is."""
-        with self._lock:
-            return self._trouble or self._faults.get(name, "")
+        return self._trouble or (self.answers[name].fault if self.answers else "")
 
     def stop(self) -> None:
         """End the thread."""
