@@ -14,7 +14,6 @@ from plant_tools import (
     Line,
     changed,
     functions_in,
-    held_by,
     house,
     watched,
 )
@@ -143,8 +142,8 @@ class TestFaults:
         task = house(stale_after="5min", hold="20min", timeout="1s")
         with watched(clock, line.address, task) as shadow:
             env = RecordSeries(shadow, path=tmp_path / "plant.csv")
-            policy, told = held_by(shadow), []
-            observation, _ = env.reset(seed=0)
+            told = []
+            env.reset(seed=0)
             for step in range(8):
                 if step == 1:
                     clock.longest_wait = 0.1
@@ -152,7 +151,7 @@ class TestFaults:
                 if step == 5:
                     clock.longest_wait = 3.0
                     line.mend()
-                observation, *_, info = env.step(policy(observation))
+                *_, info = env.step(np.float32([0.1 + 0.1 * step]))
                 told.append((bool(info["missing"]), info.get("fault", "")))
             env.complete()
         assert [missing for missing, _ in told] == [False] + [True] * 4 + [False] * 3
@@ -180,11 +179,12 @@ class TestFaults:
             env.reset(seed=0)
             for step in range(9):
                 gone[:] = [True] * (step in (4, 5))
-                observation, *_, info = env.step(np.float32([0.5]))
-                seen.append((float(observation[0]), info["missing"], shadow.is_holding))
+                observation, *_, info = env.step(np.float32([0.1 * step]))
+                seen.append((float(observation[0]), info["missing"]))
             env.complete()
-        assert [missing for _, missing, _ in seen] == [("T",) * (k in (4, 5)) for k in range(9)]
-        assert [held for *_, held in seen] == [k in (4, 5) and not hold for k in range(9)]
+        assert [missing for _, missing in seen] == [("T",) * (k in (4, 5)) for k in range(9)]
+        acted = [4 if k in (5, 6) and hold == 0 else k for k in range(9)]
+        np.testing.assert_allclose(env.series["proposed.u"][1:], np.multiply(acted, 0.1), atol=1e-6)
         assert len({seen[k][0] for k in (3, 4, 5)}) == 1
         assert np.isnan(env.series["T"]).tolist() == [k in (5, 6) for k in range(10)]
         assert "holding 0 has no finite number" in env.series.faults[5]
@@ -292,11 +292,14 @@ class TestFaults:
 
     def test_answers_that_are_too_late_leave_gaps(self):
         task, clock = house(poll="10s", stale_after="1h"), RealClock(600.0)
-        with Server(task, "thermostat", clock=clock) as server, Line(server.address) as line:
-            with watched(clock, line.address, task) as shadow:
-                shadow.reset(seed=0)
-                line.delay = 1.5  # of each question, so that answers are an hour late
-                infos = [shadow.step(np.float32([0.5]))[-1] for _ in range(8)]
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            Line(server.address) as line,
+            watched(clock, line.address, task) as shadow,
+        ):
+            shadow.reset(seed=0)
+            line.delay = 1.5  # of each question, so that answers are an hour late
+            infos = [shadow.step(np.float32([0.5]))[-1] for _ in range(8)]
         assert infos[0]["missing"] == ()
         assert {"T", "T_floor"} <= {*infos[-1]["missing"]}
         assert "no answer has come in time" in infos[-1]["fault"]
