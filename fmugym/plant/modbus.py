@@ -5,16 +5,22 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
+from urllib.parse import urlsplit
 
 import numpy as np
 
+from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.plant.polling import Answer, LostError, host_and_port
+from fmugym.plant.polling import Answer, LostError
 from fmugym.plant.tags import Plant, Tag
 
 __all__ = ["ModbusClient", "serve_modbus"]
+
+_PORT: Final = 502
+"""That of Modbus TCP, where an address has none."""
 
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
@@ -72,10 +78,7 @@ def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
     if not place.is_bits:
         order = tag.address["word_order"]
         found = _registers().convert_from_registers(cells, _type(tag), order)
-    numbers = [float(number) for number in np.ravel(found)]
-    if not all(map(math.isfinite, numbers)):
-        return Answer((), f"{place.kind} {place.begin} has no finite number")
-    return Answer(tuple(map(tag.conversion, numbers)))
+    return Answer.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
 
 
 def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
@@ -99,31 +102,39 @@ def _saturated(number: float, kind: str) -> int:
     return min(max(round(number), int(limits.min)), int(limits.max))
 
 
+class _Placed(NamedTuple):
+    place: _Place
+    tag: Tag
+
+
+def _placed(plant: Plant) -> list[_Placed]:
+    """All tags, in the order of their places."""
+    found = [_Placed(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
+    return sorted(found, key=lambda one: one.place)
+
+
+def _neighbours(placed: Sequence[_Placed]) -> list[list[_Placed]]:
+    """The tags that are read at once, since they follow each other without a gap."""
+    found: list[list[_Placed]] = []
+    for one in placed:
+        last = found[-1][-1].place if found else None
+        if last is not None and (*last[:2], last.end) == one.place[:3]:
+            found[-1].append(one)
+        else:
+            found.append([one])
+    return found
+
+
 class ModbusClient:
     """Reads the tags of a plant; see ``polling.Client``."""
 
     def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
         self._errors = imported("pymodbus.exceptions", "plant")
-        self._host, self._port = host_and_port(plant.address, 502)
+        self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
-        self._places = {name: _Place.of(plant, tag) for name, tag in plant.tags.items()}
-        self._blocks = self._neighbours(plant)
+        self._blocks = _neighbours(_placed(plant))
         self._client: Any = None
-
-    def _neighbours(self, plant: Plant) -> list[list[Tag]]:
-        """The tags that are read at once, since they follow each other without a gap."""
-        found: list[list[Tag]] = []
-        for tag in sorted(plant.tags.values(), key=lambda tag: self._places[tag.name]):
-            place = self._places[tag.name]
-            if found:
-                first, last = (self._places[found[-1][i].name] for i in (0, -1))
-                is_next = (*last[:2], last.end) == place[:3]
-                if is_next and place.end - first.begin <= _MOST:
-                    found[-1].append(tag)
-                    continue
-            found.append([tag])
-        return found
 
     async def connect(self) -> None:
         """See ``polling.Client``."""
@@ -139,20 +150,19 @@ class ModbusClient:
             found |= await self._read(block)
         return found
 
-    async def _read(self, block: Sequence[Tag]) -> dict[str, Answer]:
-        first, last = (self._places[block[i].name] for i in (0, -1))
-        cells, fault = await self._ask(first._replace(end=last.end))
+    async def _read(self, block: Sequence[_Placed]) -> dict[str, Answer]:
+        begin, whole = block[0].place.begin, block[0].place._replace(end=block[-1].place.end)
+        cells, fault = await self._ask(whole)
         if not fault:
-            places = [(tag, self._places[tag.name]) for tag in block]
             return {
-                tag.name: _answer(tag, one, cells[one.begin - first.begin : one.end - first.begin])
-                for tag, one in places
+                tag.name: _answer(tag, place, cells[place.begin - begin : place.end - begin])
+                for place, tag in block
             }
         if len(block) == 1:
-            return {block[0].name: Answer((), fault)}
+            return {block[0].tag.name: Answer((), fault)}
         found: dict[str, Answer] = {}
-        for tag in block:  # one of them may be the reason
-            found |= await self._read([tag])
+        for one in block:  # one of them may be the reason
+            found |= await self._read([one])
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
@@ -187,6 +197,19 @@ class ModbusClient:
             self._client.close()
 
 
+def _host_and_port(address: str) -> tuple[str, int]:
+    """The two parts of an address.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    with suppress(ValueError):  # the port is no number
+        parts = urlsplit(f"//{address}")
+        if parts.hostname:
+            return parts.hostname, parts.port or _PORT
+    raise ConfigError(f"expected an address such as '10.0.0.5:{_PORT}', got {shown(address)}")
+
+
 async def serve_modbus(
     plant: Plant, port: int, values: Values, bound: Callable[[str], None]
 ) -> Callable[[], Awaitable[None]]:
@@ -202,12 +225,11 @@ async def serve_modbus(
         What ends it.
     """
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
-    found = [(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
-    placed = sorted(found, key=lambda one: one[0])
+    placed = _placed(plant)
     for (place, tag), (after, other) in pairwise(placed):
         if place[:2] == after[:2] and after.begin < place.end:
             raise other.entry.error(f"it shares {place.kind} {after.begin} with {tag.name!r}")
-    units = groupby(placed, key=lambda one: one[0].unit_id)
+    units = groupby(placed, key=lambda one: one.place.unit_id)
     devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
@@ -216,7 +238,7 @@ async def serve_modbus(
     return ended
 
 
-def _device(unit_id: int, placed: Sequence[tuple[_Place, Tag]], values: Values) -> Any:
+def _device(unit_id: int, placed: Sequence[_Placed], values: Values) -> Any:
     """A device whose registers are written anew before each reading."""
     simulator = imported("pymodbus.simulator", "plant")
     refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
@@ -245,7 +267,7 @@ def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) 
         registers[word] = registers[word] | mask if bit else registers[word] & ~mask
 
 
-def _area(simulator: Any, kind: str, placed: Sequence[tuple[_Place, Tag]]) -> Any:
+def _area(simulator: Any, kind: str, placed: Sequence[_Placed]) -> Any:
     """What the library needs to know of the registers of a kind, or of the bits."""
     own = [place for place, _ in placed if place.kind == kind] or [_Place(0, kind, 0, 1)]
     begin, end = min(one.begin for one in own), max(one.end for one in own)

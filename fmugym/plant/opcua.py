@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, nearest_name, shown
 from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
@@ -110,16 +109,14 @@ class OpcUaClient:
             return Answer((), f"node {node}: expected a number, got {shown(value)}")
         if len(numbers) != tag.count:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
-        if not all(map(math.isfinite, numbers)):
-            return Answer((), f"node {node} has no finite number")
-        return Answer(tuple(tag.conversion(float(one)) for one in numbers))
+        return Answer.of(tag, f"node {node}", numbers)
 
     async def _nearest(self, node: str) -> str:
         """The node that was probably meant, in words."""
         if self._known is None:
             self._known = [one async for one in self._browsed()]
-        near = get_close_matches(node, self._known, n=1)
-        return f"; did you mean {near[0]}?" if near else ""
+        near = nearest_name(node, self._known)
+        return f"; did you mean {near}?" if near else ""
 
     async def _browsed(self) -> AsyncIterator[str]:
         """The ids of the first nodes below the objects of the server, but not its own."""

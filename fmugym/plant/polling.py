@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Final, NamedTuple, Protocol
 
-from fmugym.errors import ConfigError, FMUGymError, shown
+from fmugym.errors import FMUGymError
 from fmugym.plant.background import Background
+from fmugym.plant.tags import Tag
 from fmugym.pool.backend.clocks import Clock
 from fmugym.signals import ordinary
 
-__all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round", "host_and_port"]
+__all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round"]
 
 _MOST: Final = 10_000
 """So many rounds are kept until they are used."""
@@ -35,6 +38,13 @@ class Answer(NamedTuple):
 
     numbers: tuple[float, ...]
     fault: str = ""
+
+    @classmethod
+    def of(cls, tag: Tag, where: str, numbers: Sequence[float]) -> Answer:
+        """The numbers of a plant in the unit of the task, if they are finite."""
+        if not all(map(math.isfinite, numbers)):
+            return cls((), f"{where} has no finite number")
+        return cls(tuple(tag.conversion(float(number)) for number in numbers))
 
 
 class Round(NamedTuple):
@@ -128,17 +138,3 @@ class Poller:
     def stop(self) -> None:
         """End the thread."""
         self._background.stop()
-
-
-def host_and_port(address: str, usual: int) -> tuple[str, int]:
-    """The two parts of an address.
-
-    Raises:
-        ConfigError: If it is none.
-    """
-    host, separator, port = address.rpartition(":")
-    if not separator:
-        return address, usual
-    if not host or not port.isdecimal():
-        raise ConfigError(f"expected an address such as '10.0.0.5:{usual}', got {shown(address)}")
-    return host, int(port)

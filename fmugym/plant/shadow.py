@@ -59,10 +59,17 @@ def _watched(task: Task, feed: Feed) -> Task:
         agent["forecast"] = [
             {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
         ]
-    if "history" in agent:
-        held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
-        document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**document, "agent": agent})
+
+
+def _with_past(task: Task) -> Task:
+    """The task with a warm-up that fills histories, if the agent sees some."""
+    agent = task.document.get("agent", {})
+    if "history" not in agent:
+        return task
+    held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+    warm_up = {"period": agent["history"]["length"], "controller": held}
+    return replace(task, document={**task.document, "warm_up": warm_up})
 
 
 def _listed(value: Any) -> list[Any]:
@@ -189,7 +196,7 @@ def connect(
     task, clock = Task.of(config), clock or RealClock()
     feed = Feed(clock, _wall(clock))
     watched = _watched(task, feed)
-    own = watched.physical() if check_flag("physical", physical) else watched
+    own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
         env = environment(own, backend=feed)
         stack.callback(env.close)
@@ -197,7 +204,7 @@ def connect(
         written = Written(env, feed, plant)
         read, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
-        model = _without_warm_up(watched).physical()
+        model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
             partial(environment, model), feed, plant, int(ahead / plant.step + 1e-9)
@@ -219,10 +226,6 @@ def _wall(clock: Clock) -> Callable[[], float]:
         return local_time
     start = local_time() - clock.time()
     return lambda: start + clock.time()
-
-
-def _without_warm_up(task: Task) -> Task:
-    return replace(task, document={k: v for k, v in task.document.items() if k != "warm_up"})
 
 
 def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:

@@ -339,6 +339,12 @@ def test_a_task_whose_tags_do_not_suffice(name):
         connect(house(tags=tags))
 
 
+@pytest.mark.parametrize("address", ["10.0.0.5:modbus", ":502", "10.0.0.5:70000"])
+def test_an_address_that_is_none(address):
+    with pytest.raises(ConfigError, match=r"such as '10.0.0.5:502', got '.*" + address):
+        connect(house(), address)
+
+
 class TestData:
     @pytest.fixture
     def prices(self, tmp_path):
