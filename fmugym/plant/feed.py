@@ -152,12 +152,13 @@ class Feed:
         """Wait for the next tick; what was read until then becomes present."""
         self.time += self._plant.step
         self._sleep()
-        ahead = self._seen_ahead()
+        off = self._seen_ahead() - self._ahead
         tolerance = max(
             min(_LEAST_JUMP, self._plant.step), _LATE * getattr(self.clock, "speed", 1.0)
         )
-        self.jump = ahead - self._ahead if abs(ahead - self._ahead) > tolerance else 0.0
-        self._ahead = min(self._ahead, ahead)  # an answer is late, and never early
+        self.jump = off if abs(off) > tolerance else 0.0
+        if not self.jump:
+            self._ahead += min(off, 0.0)  # an answer is late, and never early
 
     def _sleep(self) -> None:
         tick = self.time - self._ahead
