@@ -213,3 +213,42 @@ class TestCommand:
         assert main(["dataset", "test/old-v0", "--output", str(folder / "old")]) == 0
         assert "fmugym info minari:test/old-v0" in capsys.readouterr().err
         assert len(list((folder / "old").iterdir())) == 1
+
+
+def test_the_record_of_a_shadow(folder, monkeypatch, capsys):
+    """With a gap, on the plant's time, and with the data that the record has."""
+    pytest.importorskip("pymodbus", reason="needs pymodbus: the extra plant")
+    from plant_tools import LockStep, changed, house, nothing_left, watched
+
+    from fmugym.plant import Server
+
+    gone, clock = [], LockStep()
+    changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
+    data = {"T_out": {"register": 200}}
+    seen = {"observations": ["T", "T_floor", "T_out"]}
+    task = house(stale_after="1min", agent=seen, data=data)
+    task.write(folder / "house.toml")
+    with (
+        nothing_left(),
+        Server(task, "thermostat", clock=clock) as server,
+        watched(clock, server.address, task) as shadow,
+    ):
+        env = RecordSeries(shadow, path=folder / "shadow.csv")
+        env.reset(seed=0)
+        for step in range(9):
+            gone[:] = [True] * (step in (4, 5))
+            env.step(np.float32([0.5]))
+        env.complete()
+    command = ["simulate", str(folder / "house.toml"), "--output", "minari:test/shadow-v0"]
+    assert main([*command, "--log", str(folder / "shadow.csv")]) == 0, capsys.readouterr().err
+    assert "2 episodes, 6 steps" in capsys.readouterr().out
+    names = list(env.unwrapped.observation_names)
+    for begin, episode in zip((0, 7), minari.load_dataset("test/shadow-v0"), strict=True):
+        rows = range(begin, begin + len(episode) + 1)
+        expected = np.transpose([env.series[name][rows] for name in names])
+        np.testing.assert_allclose(episode.observations, expected, rtol=1e-5)
+        np.testing.assert_allclose(episode.rewards, env.series["reward"][rows[1:]], atol=1e-6)
+        np.testing.assert_allclose(episode.actions.ravel(), env.series["u"][rows[1:]], atol=1e-6)
+    assert [bool(one.truncated[-1]) for one in read_dataset("test/shadow-v0")] == [True, True]
+    assert main([*command, "--log", str(folder / "shadow.csv"), "--scenario", "frost"]) == 1
+    assert "shadow.csv' has its own periods" in capsys.readouterr().err

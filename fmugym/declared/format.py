@@ -635,14 +635,13 @@ PLANT: Final = Table(
         "poll": Key(POSITIVE_TIME, "Time from one reading to the next.", None, "a tenth of a step"),
         "stale_after": Key(
             POSITIVE_TIME,
-            "A good value that was received longer ago than this is stale: the last one holds.",
+            "A good value that was asked for longer ago than this is stale: the last one holds.",
             None,
             "three polls",
         ),
         "hold": Key(
             TIME,
-            "How long it holds. After that it is missing in the record, and the agent holds its "
-            "last action.",
+            "How long it holds for an agent, which holds its last action after that.",
             None,
             "a step",
         ),

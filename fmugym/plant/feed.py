@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -13,9 +13,10 @@ import numpy as np
 from fmugym.errors import ConfigError, SimulationError
 from fmugym.fmi.status import Status
 from fmugym.plant.live import Live
-from fmugym.plant.polling import Poller, Reading
+from fmugym.plant.polling import Poller
 from fmugym.plant.tags import Plant
 from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.base import FloatArray
 
 __all__ = ["Feed", "local_time", "told"]
 
@@ -41,32 +42,19 @@ def told(faults: Mapping[str, str]) -> str:
 
 
 @dataclass
-class _Held:
-    """What is known of a tag.
-
-    Attributes:
-        numbers: The latest ones that were used.
-        received: When they were received.
-    """
-
-    numbers: tuple[float, ...] = ()
-    received: float = -np.inf
-
-
-@dataclass
 class Feed:
     """The values of a plant at its ticks, which lie on multiples of the time step.
 
     It is a ``Backend``, whose ``reset`` sets nothing and whose ``step`` writes nothing.
 
     Args:
-        clock: The monotonic clock of ticks and of what is received.
+        clock: The monotonic clock of ticks and readings.
         wall: Gives the plant's time in seconds of the year, unless there is a tag for it.
 
     Attributes:
         values: The present values of the tags, in the task's units.
-        faults: What is wrong, by the names of tags whose last value holds or is missing.
-        missing: The names of those for which nothing holds any longer.
+        faults: What is wrong, by the names of tags whose last value goes on.
+        expired: The names of those whose last value has held for too long.
         time: The plant's time at the present tick.
         jump: By how much the plant's time has jumped, in seconds.
     """
@@ -75,7 +63,7 @@ class Feed:
     wall: Callable[[], float]
     values: dict[str, tuple[float, ...]] = field(default_factory=dict)
     faults: dict[str, str] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
+    expired: tuple[str, ...] = ()
     time: float = 0.0
     jump: float = 0.0
     samples_outputs = True
@@ -99,8 +87,8 @@ class Feed:
         """
         self._plant, self._poller, self._samplings, self._read = plant, poller, samplings, read
         self._live = live
-        self._held = {name: _Held() for name in plant.tags}
-        self._tick, self._has_begun = 0.0, False
+        self._asked = dict.fromkeys(plant.tags, -np.inf)
+        self._ahead, self._has_begun = 0.0, False
 
     # The backend.
 
@@ -125,12 +113,12 @@ class Feed:
             SimulationError: If there are none in time. Once there were some, it waits for ever.
         """
         self._wait_for_values()
-        now, step = self._now(), self._plant.step
-        self._tick = self.clock.time() + (-now % step)
+        self._ahead, step = self._seen_ahead(), self._plant.step
+        now = self.clock.time() + self._ahead
         self.time, self.jump = now + (-now % step), 0.0
         self._live.begin()
         self._sleep()
-        if self.missing and not self._has_begun:
+        if self.expired and not self._has_begun:
             raise SimulationError(self._told())
         self._has_begun = True
 
@@ -138,7 +126,7 @@ class Feed:
         deadline = time.monotonic() + 2.0 * self._plant["timeout"]
         poller = self._poller
         while True:
-            has_answered, is_refused = poller.has_answered, poller.is_refused
+            has_answered, is_refused = bool(poller.answers), poller.is_refused
             self._look(self.clock.time() - self._plant.step, self.clock.time())
             if not self.faults:
                 self._require_fit()
@@ -162,51 +150,51 @@ class Feed:
 
     def advance(self) -> None:
         """Wait for the next tick; what was read until then becomes present."""
-        self._tick += self._plant.step
         self.time += self._plant.step
         self._sleep()
-        apart = self._now() - (self.clock.time() - self._tick) - self.time
+        off = self._seen_ahead() - self._ahead
         tolerance = max(
             min(_LEAST_JUMP, self._plant.step), _LATE * getattr(self.clock, "speed", 1.0)
         )
-        self.jump = apart if abs(apart) > tolerance else 0.0
+        self.jump = off if abs(off) > tolerance else 0.0
+        if not self.jump:
+            self._ahead += min(off, 0.0)  # an answer is late, and never early
 
     def _sleep(self) -> None:
-        self.clock.sleep(self._tick - self.clock.time())
-        self._look(self._tick - self._plant.step, self._tick)
+        tick = self.time - self._ahead
+        self.clock.sleep(tick - self.clock.time())
+        self._look(tick - self._plant.step, tick)
         faults = self._live.refresh(self.time, self.values)
         self.faults |= faults
-        self.missing += tuple(faults)
+        self.expired += tuple(faults)
 
-    def _now(self) -> float:
-        """The plant's time."""
-        held = self._held.get("clock")
-        if held is None:
-            return self.wall()
-        return held.numbers[0] + self.clock.time() - held.received
+    def _seen_ahead(self) -> float:
+        """By how much the plant's time is ahead of the clock, by the latest answer, at the most."""
+        if "clock" not in self._asked:
+            return self.wall() - self.clock.time()
+        return self.values["clock"][0] - self._asked["clock"]
 
     def _look(self, begin: float, end: float) -> None:
         """Find out what holds at the end of a step."""
-        self.faults, missing = {}, []
-        for name, held in self._held.items():
-            readings = self._poller.between(name, begin, end)
-            fresh = [one for one in readings if one.received > max(begin, held.received)]
-            if fresh or (readings and not held.numbers):
-                fresh = fresh or readings
-                held.numbers = self._sampled(name, fresh)
-                held.received = fresh[-1].received
-            age = end - held.received
-            if age > self._plant.stale_after or not held.numbers:
-                why = self._poller.trouble(name) or "nothing was received"
-                self.faults[name] = f"{why} (for {age:.6g} s)" if held.numbers else why
+        self.faults, expired = {}, []
+        rounds = self._poller.take(end)
+        for name, asked in self._asked.items():
+            good = [one for one in rounds if not one.answers[name].fault]
+            fresh = [one for one in good if one.asked > begin] or good[-1:]
+            if fresh:
+                numbers = np.array([one.answers[name].numbers for one in fresh])
+                self.values[name], asked = self._sampled(name, numbers), fresh[-1].asked
+                self._asked[name] = asked
+            age = end - asked
+            if age > self._plant.stale_after:
+                why = self._poller.trouble(name) or "no answer has come in time"
+                self.faults[name] = f"{why} (for {age:.6g} s)" if name in self.values else why
             if age > self._plant.stale_after + self._plant.hold:
-                missing.append(name)
-        self.missing = tuple(missing)
-        self.values = {name: held.numbers for name, held in self._held.items()}
+                expired.append(name)
+        self.expired = tuple(expired)
 
-    def _sampled(self, name: str, readings: Sequence[Reading]) -> tuple[float, ...]:
-        """What a step gives of its readings."""
-        numbers = np.array([one.numbers for one in readings])
+    def _sampled(self, name: str, numbers: FloatArray) -> tuple[float, ...]:
+        """What a step gives of its readings, a row for each."""
         how = self._samplings.get(name, "last")
         found = _SAMPLED[how](numbers)
         if how == "integral":

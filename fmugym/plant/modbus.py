@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import logging
 import math
-import struct
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
+from urllib.parse import urlsplit
 
+import numpy as np
+
+from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
-from fmugym.plant.polling import Answer, LostError, host_and_port
+from fmugym.plant.polling import Answer, LostError
 from fmugym.plant.tags import Plant, Tag
 
 __all__ = ["ModbusClient", "serve_modbus"]
 
-_FORMATS: Final = {
-    "int16": "h",
-    "int32": "i",
-    "int64": "q",
-    "uint16": "H",
-    "uint32": "I",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
+_PORT: Final = 502
+"""That of Modbus TCP, where an address has none."""
+
 _MOST: Final = 120
 """So many registers are asked for at once; the standard allows 125."""
 
@@ -62,23 +59,26 @@ class _Place(NamedTuple):
         where = tag.address
         unit_id = plant["unit_id"] if where.get("unit_id") is None else where["unit_id"]
         one = cls(unit_id, where["kind"], where["register"], where["register"] + tag.count)
-        return one if one.is_bits else one._replace(end=one.begin + tag.count * _width(tag))
+        width = 1 if one.is_bits else _type(tag).value[1]
+        return one._replace(end=one.begin + tag.count * width)
 
 
-def _width(tag: Tag) -> int:
-    """How many registers a number takes."""
-    return struct.calcsize(f">{_FORMATS[tag.address['type']]}") // 2
+def _registers() -> Any:
+    """What makes numbers of registers, and registers of numbers."""
+    return imported("pymodbus.client.mixin", "plant").ModbusClientMixin
+
+
+def _type(tag: Tag) -> Any:
+    return _registers().DATATYPE[tag.address["type"].upper()]
 
 
 def _answer(tag: Tag, place: _Place, cells: Sequence[Any]) -> Answer:
     """The numbers in registers or bits; devices write NaN for what they do not know."""
-    numbers = [float(cell) for cell in cells]
+    found: Any = cells
     if not place.is_bits:
-        content = struct.pack(f">{len(cells)}H", *_ordered(tag, cells))
-        numbers = [*struct.unpack(f">{tag.count}{_FORMATS[tag.address['type']]}", content)]
-    if not all(map(math.isfinite, numbers)):
-        return Answer((), f"{place.kind} {place.begin} has no finite number")
-    return Answer(tuple(map(tag.conversion, numbers)))
+        order = tag.address["word_order"]
+        found = _registers().convert_from_registers(cells, _type(tag), order)
+    return Answer.of(tag, f"{place.kind} {place.begin}", [*np.ravel(found)])
 
 
 def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
@@ -86,25 +86,43 @@ def _cells(tag: Tag, place: _Place, values: Sequence[float]) -> Sequence[int]:
     numbers = [tag.conversion.inverse(value) for value in values]
     if place.is_bits:
         return [int(number > 0.5) for number in numbers]
-    form = _FORMATS[tag.address["type"]]
-    given = numbers if form in "fd" else [_saturated(number, form) for number in numbers]
-    content = struct.pack(f">{tag.count}{form}", *given)
-    return _ordered(tag, struct.unpack(f">{place.end - place.begin}H", content))
+    if "int" in tag.address["type"]:
+        numbers = [_saturated(number, tag.address["type"]) for number in numbers]
+    made: Sequence[int] = _registers().convert_to_registers(
+        numbers, _type(tag), tag.address["word_order"]
+    )
+    return made
 
 
-def _saturated(number: float, form: str) -> int:
+def _saturated(number: float, kind: str) -> int:
     """The nearest integer of a type, as converters give it; the lowest one for NaN."""
-    bits = 8 * struct.calcsize(f">{form}")
-    low = 0 if form.isupper() else -(2 ** (bits - 1))
-    return low if math.isnan(number) else min(max(round(number), low), low + 2**bits - 1)
+    limits = np.iinfo(kind)
+    if math.isnan(number):
+        return int(limits.min)
+    return min(max(round(number), int(limits.min)), int(limits.max))
 
 
-def _ordered(tag: Tag, words: Sequence[int]) -> Sequence[int]:
-    """The words with the first one of each number first, or back."""
-    if tag.address["word_order"] == "big":
-        return words
-    width = _width(tag)
-    return [words[i - i % width + width - 1 - i % width] for i in range(len(words))]
+class _Placed(NamedTuple):
+    place: _Place
+    tag: Tag
+
+
+def _placed(plant: Plant) -> list[_Placed]:
+    """All tags, in the order of their places."""
+    found = [_Placed(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
+    return sorted(found, key=lambda one: one.place)
+
+
+def _neighbours(placed: Sequence[_Placed]) -> list[list[_Placed]]:
+    """The tags that are read at once, since they follow each other without a gap."""
+    found: list[list[_Placed]] = []
+    for one in placed:
+        last = found[-1][-1].place if found else None
+        if last is not None and (*last[:2], last.end) == one.place[:3]:
+            found[-1].append(one)
+        else:
+            found.append([one])
+    return found
 
 
 class ModbusClient:
@@ -113,25 +131,10 @@ class ModbusClient:
     def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
         self._errors = imported("pymodbus.exceptions", "plant")
-        self._host, self._port = host_and_port(plant.address, 502)
+        self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
-        self._places = {name: _Place.of(plant, tag) for name, tag in plant.tags.items()}
-        self._blocks = self._neighbours(plant)
+        self._blocks = _neighbours(_placed(plant))
         self._client: Any = None
-
-    def _neighbours(self, plant: Plant) -> list[list[Tag]]:
-        """The tags that are read at once, since they follow each other without a gap."""
-        found: list[list[Tag]] = []
-        for tag in sorted(plant.tags.values(), key=lambda tag: self._places[tag.name]):
-            place = self._places[tag.name]
-            if found:
-                first, last = (self._places[found[-1][i].name] for i in (0, -1))
-                is_next = (*last[:2], last.end) == place[:3]
-                if is_next and place.end - first.begin <= _MOST:
-                    found[-1].append(tag)
-                    continue
-            found.append([tag])
-        return found
 
     async def connect(self) -> None:
         """See ``polling.Client``."""
@@ -147,20 +150,19 @@ class ModbusClient:
             found |= await self._read(block)
         return found
 
-    async def _read(self, block: Sequence[Tag]) -> dict[str, Answer]:
-        first, last = (self._places[block[i].name] for i in (0, -1))
-        cells, fault = await self._ask(first._replace(end=last.end))
+    async def _read(self, block: Sequence[_Placed]) -> dict[str, Answer]:
+        begin, whole = block[0].place.begin, block[0].place._replace(end=block[-1].place.end)
+        cells, fault = await self._ask(whole)
         if not fault:
-            places = [(tag, self._places[tag.name]) for tag in block]
             return {
-                tag.name: _answer(tag, one, cells[one.begin - first.begin : one.end - first.begin])
-                for tag, one in places
+                tag.name: _answer(tag, place, cells[place.begin - begin : place.end - begin])
+                for place, tag in block
             }
         if len(block) == 1:
-            return {block[0].name: Answer((), fault)}
+            return {block[0].tag.name: Answer((), fault)}
         found: dict[str, Answer] = {}
-        for tag in block:  # one of them may be the reason
-            found |= await self._read([tag])
+        for one in block:  # one of them may be the reason
+            found |= await self._read([one])
         return found
 
     async def _ask(self, place: _Place) -> tuple[Sequence[Any], str]:
@@ -195,6 +197,19 @@ class ModbusClient:
             self._client.close()
 
 
+def _host_and_port(address: str) -> tuple[str, int]:
+    """The two parts of an address.
+
+    Raises:
+        ConfigError: If it is none.
+    """
+    with suppress(ValueError):  # the port is no number
+        parts = urlsplit(f"//{address}")
+        if parts.hostname:
+            return parts.hostname, parts.port or _PORT
+    raise ConfigError(f"expected an address such as '10.0.0.5:{_PORT}', got {shown(address)}")
+
+
 async def serve_modbus(
     plant: Plant, port: int, values: Values, bound: Callable[[str], None]
 ) -> Callable[[], Awaitable[None]]:
@@ -210,12 +225,11 @@ async def serve_modbus(
         What ends it.
     """
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
-    found = [(_Place.of(plant, tag), tag) for tag in plant.tags.values()]
-    placed = sorted(found, key=lambda one: one[0])
+    placed = _placed(plant)
     for (place, tag), (after, other) in pairwise(placed):
         if place[:2] == after[:2] and after.begin < place.end:
             raise other.entry.error(f"it shares {place.kind} {after.begin} with {tag.name!r}")
-    units = groupby(placed, key=lambda one: one[0].unit_id)
+    units = groupby(placed, key=lambda one: one.place.unit_id)
     devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
@@ -224,7 +238,7 @@ async def serve_modbus(
     return ended
 
 
-def _device(unit_id: int, placed: Sequence[tuple[_Place, Tag]], values: Values) -> Any:
+def _device(unit_id: int, placed: Sequence[_Placed], values: Values) -> Any:
     """A device whose registers are written anew before each reading."""
     simulator = imported("pymodbus.simulator", "plant")
     refused = imported("pymodbus.constants", "plant").ExcCodes.ILLEGAL_FUNCTION
@@ -253,7 +267,7 @@ def _put(registers: list[int], start: int, place: _Place, cells: Sequence[int]) 
         registers[word] = registers[word] | mask if bit else registers[word] & ~mask
 
 
-def _area(simulator: Any, kind: str, placed: Sequence[tuple[_Place, Tag]]) -> Any:
+def _area(simulator: Any, kind: str, placed: Sequence[_Placed]) -> Any:
     """What the library needs to know of the registers of a kind, or of the bits."""
     own = [place for place, _ in placed if place.kind == kind] or [_Place(0, kind, 0, 1)]
     begin, end = min(one.begin for one in own), max(one.end for one in own)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError, shown
+from fmugym.errors import ConfigError, nearest_name, shown
 from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
@@ -66,7 +65,8 @@ class OpcUaClient:
 
     async def _secure(self, certificate: Path, key: Path) -> None:
         policies = imported("asyncua.crypto.security_policies", "plant")
-        self._client.application_uri = _uri_in(certificate) or self._client.application_uri
+        own = await _certificate_in(certificate)
+        self._client.application_uri = _uri_in(own) or self._client.application_uri
         pinned = self._plant.get("server_certificate")
         if pinned is not None:
             await self._require_pinned(Path(pinned))
@@ -80,7 +80,10 @@ class OpcUaClient:
     async def _require_pinned(self, path: Path) -> None:
         """Refuse a server with another certificate than the one in a file."""
         endpoints = await self._client.connect_and_get_server_endpoints()
-        if _der_of(path) not in [one.ServerCertificate for one in endpoints]:
+        pinned = imported("asyncua.crypto.uacrypto", "plant").der_from_x509(
+            await _certificate_in(path)
+        )
+        if pinned not in [one.ServerCertificate for one in endpoints]:
             raise RefusedError(f"its certificate is not that of {shown(str(path))}")
 
     async def read(self) -> dict[str, Answer]:
@@ -106,16 +109,14 @@ class OpcUaClient:
             return Answer((), f"node {node}: expected a number, got {shown(value)}")
         if len(numbers) != tag.count:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
-        if not all(map(math.isfinite, numbers)):
-            return Answer((), f"node {node} has no finite number")
-        return Answer(tuple(tag.conversion(float(one)) for one in numbers))
+        return Answer.of(tag, f"node {node}", numbers)
 
     async def _nearest(self, node: str) -> str:
         """The node that was probably meant, in words."""
         if self._known is None:
             self._known = [one async for one in self._browsed()]
-        near = get_close_matches(node, self._known, n=1)
-        return f"; did you mean {near[0]}?" if near else ""
+        near = nearest_name(node, self._known)
+        return f"; did you mean {near}?" if near else ""
 
     async def _browsed(self) -> AsyncIterator[str]:
         """The ids of the first nodes below the objects of the server, but not its own."""
@@ -160,25 +161,16 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
     return certificate, key
 
 
-def _certificate_in(path: Path) -> Any:
-    x509 = imported("cryptography.x509", "plant")
-    content = path.read_bytes()
-    load = x509.load_pem_x509_certificate if b"-----BEGIN" in content else None
-    return (load or x509.load_der_x509_certificate)(content)
+async def _certificate_in(path: Path) -> Any:
+    return await imported("asyncua.crypto.uacrypto", "plant").load_certificate(path)
 
 
-def _der_of(path: Path) -> bytes:
-    encoding = imported("cryptography.hazmat.primitives.serialization", "plant").Encoding.DER
-    found: bytes = _certificate_in(path).public_bytes(encoding)
-    return found
-
-
-def _uri_in(path: Path) -> str:
+def _uri_in(certificate: Any) -> str:
     """The application that a certificate is for."""
     x509 = imported("cryptography.x509", "plant")
     names = [
         one.value.get_values_for_type(x509.UniformResourceIdentifier)
-        for one in _certificate_in(path).extensions
+        for one in certificate.extensions
         if isinstance(one.value, x509.SubjectAlternativeName)
     ]
     return str(names[0][0]) if names and names[0] else ""
@@ -226,7 +218,7 @@ async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
         await server.load_private_key(str(key))
     await server.set_application_uri(uri)
     server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
-    known = None if trusted is None else _certificate_in(Path(trusted))
+    known = None if trusted is None else await _certificate_in(Path(trusted))
 
     async def validate(certificate: Any, description: Any) -> None:
         if known is not None and certificate != known:

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import threading
+import math
 from collections import deque
+from collections.abc import Sequence
 from typing import Final, NamedTuple, Protocol
 
-from fmugym.errors import ConfigError, FMUGymError, shown
+from fmugym.errors import FMUGymError
 from fmugym.plant.background import Background
+from fmugym.plant.tags import Tag
 from fmugym.pool.backend.clocks import Clock
 from fmugym.signals import ordinary
 
-__all__ = ["Answer", "Client", "LostError", "Poller", "Reading", "RefusedError", "host_and_port"]
+__all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round"]
 
-_MOST: Final = 100_000
-"""So many readings of a tag are kept until they are used."""
+_MOST: Final = 10_000
+"""So many rounds are kept until they are used."""
 
 
 class LostError(FMUGymError):
@@ -37,12 +39,19 @@ class Answer(NamedTuple):
     numbers: tuple[float, ...]
     fault: str = ""
 
+    @classmethod
+    def of(cls, tag: Tag, where: str, numbers: Sequence[float]) -> Answer:
+        """The numbers of a plant in the unit of the task, if they are finite."""
+        if not all(map(math.isfinite, numbers)):
+            return cls((), f"{where} has no finite number")
+        return cls(tuple(tag.conversion(float(number)) for number in numbers))
 
-class Reading(NamedTuple):
-    """A good answer, and when it was received on the monotonic clock."""
 
-    received: float
-    numbers: tuple[float, ...]
+class Round(NamedTuple):
+    """The answers for all tags, and when they were asked for: they are no older."""
+
+    asked: float
+    answers: dict[str, Answer]
 
 
 class Client(Protocol):
@@ -71,23 +80,22 @@ class Poller:
 
     Args:
         client: The client.
-        clock: The monotonic clock by which values are received.
+        clock: The monotonic clock by which values are asked for.
         interval: Time from one question to the next, in s of the clock.
         timeout: How long an answer may take, in s of real time.
 
     Attributes:
-        has_answered: Whether there was an answer.
+        answers: The latest ones; none before the first.
         is_refused: Whether this client was refused when it last connected.
     """
 
     def __init__(self, client: Client, clock: Clock, interval: float, timeout: float) -> None:
         self._client, self._clock, self._timeout = client, clock, timeout
         self._interval, self._speed = interval, getattr(clock, "speed", 1.0)
-        self._lock = threading.Lock()
-        self._readings: dict[str, deque[Reading]] = {}
-        self._faults: dict[str, str] = {}
+        self._rounds: deque[Round] = deque(maxlen=_MOST)
         self._trouble = "it has not answered yet"
-        self.has_answered = self.is_refused = False
+        self.answers: dict[str, Answer] = {}
+        self.is_refused = False
         self._background = Background(self._poll, "plant")
 
     async def _poll(self) -> None:
@@ -95,10 +103,10 @@ class Poller:
             try:
                 await self._converse()
             except ordinary(TimeoutError):
-                self._note(f"it does not answer within {self._timeout:g} s")
+                self._trouble = f"it does not answer within {self._timeout:g} s"
             except ordinary(Exception) as error:  # whatever a library makes of a broken line
                 is_own = isinstance(error, LostError)
-                self._note(str(error) if is_own else f"{type(error).__name__}: {error}")
+                self._trouble = str(error) if is_own else f"{type(error).__name__}: {error}"
                 self.is_refused = isinstance(error, RefusedError)
             finally:
                 await self._client.close()
@@ -110,55 +118,23 @@ class Poller:
         while True:
             begin = self._clock.time()
             async with asyncio.timeout(self._timeout):
-                answers = await self._client.read()
-            self._take(answers)
+                self.answers = await self._client.read()
+            self._trouble = ""
+            self._rounds.append(Round(begin, self.answers))
             rest = begin + self._interval - self._clock.time()
             await asyncio.sleep(max(0.0, rest / self._speed))
 
-    def _note(self, trouble: str) -> None:
-        with self._lock:
-            self._trouble = trouble
-
-    def _take(self, answers: dict[str, Answer]) -> None:
-        now = self._clock.time()
-        with self._lock:
-            self._trouble, self.has_answered = "", True
-            self._faults = {name: one.fault for name, one in answers.items() if one.fault}
-            for name, one in answers.items():
-                if not one.fault:
-                    kept = self._readings.setdefault(name, deque(maxlen=_MOST))
-                    kept.append(Reading(now, one.numbers))
-
-    def between(self, name: str, begin: float, end: float) -> list[Reading]:
-        """The readings of a tag after one time and until another, and the last one before.
-
-        Earlier ones are forgotten.
-        """
-        with self._lock:
-            kept = self._readings.get(name, deque())
-            while len(kept) > 1 and kept[1].received <= begin:
-                kept.popleft()
-            return [one for one in kept if one.received <= end]
+    def take(self, end: float) -> list[Round]:
+        """Take the rounds until some time that nobody has taken."""
+        found = []
+        while self._rounds and self._rounds[0].asked <= end:
+            found.append(self._rounds.popleft())
+        return found
 
     def trouble(self, name: str) -> str:
         """What is wrong with a tag now; "" if nothing is."""
-        with self._lock:
-            return self._trouble or self._faults.get(name, "")
+        return self._trouble or (self.answers[name].fault if self.answers else "")
 
     def stop(self) -> None:
         """End the thread."""
         self._background.stop()
-
-
-def host_and_port(address: str, usual: int) -> tuple[str, int]:
-    """The two parts of an address.
-
-    Raises:
-        ConfigError: If it is none.
-    """
-    host, separator, port = address.rpartition(":")
-    if not separator:
-        return address, usual
-    if not host or not port.isdecimal():
-        raise ConfigError(f"expected an address such as '10.0.0.5:{usual}', got {shown(address)}")
-    return host, int(port)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from fmugym.archive.units import Conversion
 from fmugym.baselines.observer import COPIES, Observer, spread
 from fmugym.declared import TaskEnv
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant, in_fmu
+from fmugym.plant.tags import Plant, tagged
 from fmugym.plant.written import Written
 from fmugym.pool.base import FloatArray
 
@@ -37,24 +37,6 @@ class Error(NamedTuple):
     number: int
 
 
-class _Copy:
-    """A copy of the FMU with the inputs of the plant, and some parameters."""
-
-    def __init__(
-        self, env: TaskEnv, feed: Feed, plant: Plant, parameters: Mapping[str, float]
-    ) -> None:
-        self.env, self._written = env, Written(env, feed, plant)
-        self._options = {"model_parameters": dict(parameters)}
-
-    def begin(self) -> None:
-        self.env.reset(seed=0, options=self._options)
-
-    def step(self) -> bool:
-        """Go on by a step; tells whether the FMU has failed."""
-        *_, terminated, truncated, _ = self.env.step(self._written.action())
-        return bool(terminated or truncated)
-
-
 class Predictions:
     """Copies of the FMU beside a plant, and the observer of MPC, which corrects them.
 
@@ -76,46 +58,47 @@ class Predictions:
     ) -> None:
         self._feed, self._plant, self._steps = feed, plant, steps
         self.envs: list[TaskEnv] = []
-        self._read: dict[str, tuple[str, Conversion]] = {}
+        self._written: list[Written] = []
+        self._spread: dict[str, FloatArray] = {}
+        self._tags: list[tuple[int, str, Conversion]] = []
         try:
-            self._copies = [*self._made(make_env)] if steps else []
+            if steps:
+                self._make(make_env)
         except BaseException:
             self.close()
             raise
-        self.names = list(self._read)
+        self.names = [alias for _, alias, _ in self._tags]
         shape = (steps, len(self.names))
         self._sums, self._squares = np.zeros(shape), np.zeros(shape)
         self._counts = np.zeros(shape, np.int64)
         self._told: deque[tuple[int, FloatArray]] = deque(maxlen=max(steps, 1))
 
-    def _made(self, make_env: Callable[[], TaskEnv]) -> Iterator[_Copy]:
+    def _make(self, make_env: Callable[[], TaskEnv]) -> None:
         self.envs.append(make_env())
-        values = spread(self.envs[0], 0)
-        for _ in range(COPIES - 1 if values else 0):
+        self._spread = spread(self.envs[0], 0)
+        for _ in range(COPIES - 1 if self._spread else 0):
             self.envs.append(make_env())
-        for place, env in enumerate(self.envs):
-            own = {name: float(each[place]) for name, each in values.items()}
-            yield _Copy(env, self._feed, self._plant, own)
-        self._read = {
-            alias: (variable.name, conversion)
-            for alias, (variable, conversion) in in_fmu(self.envs[0]).items()
-            if variable.name in self.envs[0].out and alias in self._plant.tags
-        }
+        self._written = [Written(env, self._feed, self._plant) for env in self.envs]
+        self._tags = tagged(self.envs[0], self._plant, self.envs[0].inside.spec.outputs)
 
     def _measured(self) -> FloatArray:
         return np.array([self._feed.values[name][0] for name in self.names])
 
     def _seen(self) -> FloatArray:
         """What the copies give, shape (n, k)."""
-        return np.array([[c(env.out[n]) for n, c in self._read.values()] for env in self.envs])
+        outputs = self.envs[0].inside.spec.outputs
+        return np.array(
+            [[c(env.out[outputs[k].name]) for k, _, c in self._tags] for env in self.envs]
+        )
 
     def begin(self) -> None:
         """Begin with the offsets that the plant has now."""
-        for copy in self._copies:
-            copy.begin()
-        self._observer = Observer(len(self._copies), len(self.names), len(self.names))
+        for place, env in enumerate(self.envs):
+            own = {name: float(values[place]) for name, values in self._spread.items()}
+            env.reset(seed=0, options={"model_parameters": own})
+        self._observer = Observer(len(self.envs), len(self.names), len(self.names))
         self._told.clear()
-        if self._copies:
+        if self.envs:
             self._observer.offsets = self._measured() - self._seen()
             self._tell()
 
@@ -130,11 +113,12 @@ class Predictions:
         Returns:
             What was foretold for this tick at the one before, by name.
         """
-        if any(copy.step() for copy in self._copies):
+        if not self.envs:
+            return {}
+        pairs = zip(self.envs, self._written, strict=True)
+        if any(self._has_failed(env, written) for env, written in pairs):
             self.begin()
             return dict.fromkeys(self.names, np.nan)
-        if not self._copies:
-            return {}
         is_new = np.array([name not in self._feed.faults for name in self.names])
         measured, seen = self._measured(), self._seen()
         found = [seen[best] + offsets for best, offsets in reversed(self._told)]
@@ -147,6 +131,12 @@ class Predictions:
         self._observer.correct(measured - seen, is_new)
         self._tell()
         return dict(zip(self.names, found[0].tolist(), strict=True))
+
+    @staticmethod
+    def _has_failed(env: TaskEnv, written: Written) -> bool:
+        """Let a copy go on by a step, and tell whether its FMU has failed."""
+        *_, terminated, truncated, _ = env.step(written.action())
+        return bool(terminated or truncated)
 
     def errors(self) -> list[Error]:
         """The errors until now, by variable and horizon."""

@@ -15,7 +15,6 @@ import numpy as np
 from fmugym.checks import check_flag
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
-from fmugym.episodes.simulation import Policy
 from fmugym.logs import on_time_of_year
 from fmugym.plant.feed import Feed, local_time, told
 from fmugym.plant.live import Live
@@ -24,12 +23,12 @@ from fmugym.plant.opcua import OpcUaClient
 from fmugym.plant.polling import Poller
 from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
-from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
+from fmugym.plant.tags import DATA, Plant, read_plant, tagged
 from fmugym.plant.written import Written, lacking_tag
 from fmugym.pool.backend.clocks import Clock, RealClock
 from fmugym.task.warm_up import WarmUp, WarmUps
 
-__all__ = ["Shadow", "connect", "holding"]
+__all__ = ["Shadow", "connect"]
 
 _CLIENTS: Final[Mapping[str, Any]] = {"modbus": ModbusClient, "opcua": OpcUaClient}
 
@@ -60,10 +59,17 @@ def _watched(task: Task, feed: Feed) -> Task:
         agent["forecast"] = [
             {k: v for k, v in one.items() if k != "error"} for one in _listed(given)
         ]
-    if "history" in agent:
-        held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
-        document["warm_up"] = {"period": agent["history"]["length"], "controller": held}
     return replace(task, document={**document, "agent": agent})
+
+
+def _with_past(task: Task) -> Task:
+    """The task with a warm-up that fills histories, if the agent sees some."""
+    agent = task.document.get("agent", {})
+    if "history" not in agent:
+        return task
+    held = dict.fromkeys(_listed(agent["actions"]), 0.0)  # what acts in the plant is known then
+    warm_up = {"period": agent["history"]["length"], "controller": held}
+    return replace(task, document={**task.document, "warm_up": warm_up})
 
 
 def _listed(value: Any) -> list[Any]:
@@ -100,10 +106,12 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
     goes on with what has acted in the plant. So rewards, histories and inputs are those of the
     plant. Infos have
 
-    * ``"proposed"``: what the action would have written, by variable;
+    * ``"proposed"``: what the action would have written, by variable; the last one holds while a
+      value has been missing for longer than the plant's ``hold``;
     * ``"predicted"``: what a copy of the FMU foretold a step ago, by variable;
-    * ``"missing"``: the variables that have no value any longer; the last ones go on;
-    * ``"fault"``: what is wrong, also while last values hold.
+    * ``"missing"``: the variables that have no good value; the last ones go on, and records leave
+      them out;
+    * ``"fault"``: what is wrong with these.
 
     An episode ends (``truncated``) if the plant's time jumps.
 
@@ -117,11 +125,7 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._feed, self._written, self._owned = feed, written, owned
         self._copies, self.errors = copies, copies.errors
-
-    @property
-    def is_missing(self) -> bool:
-        """Whether a value is missing, so that an agent holds its last action."""
-        return bool(self._feed.missing)
+        self._proposed: dict[str, float] = {}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -135,26 +139,27 @@ class Shadow(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._feed.begin()
         observation, info = self.env.reset(seed=seed, options=options)
         self._copies.begin()
-        unknown = dict.fromkeys(self._written.names, math.nan)
+        self._proposed = dict.fromkeys(self._written.names, math.nan)
         predicted = dict.fromkeys(self._copies.names, math.nan)
-        return observation, info | self._told(unknown, predicted)
+        return observation, info | self._told(predicted)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Wait for the next tick; see the class."""
-        proposed = self._written.proposed(action)
+        if not self._feed.expired:
+            self._proposed = self._written.proposed(action)
         self._feed.advance()
         observation, reward, terminated, truncated, info = self.env.step(self._written.action())
         truncated = truncated or self._feed.jump != 0.0
-        info |= self._told(proposed, self._copies.follow())
+        info |= self._told(self._copies.follow())
         return observation, reward, terminated, truncated, info
 
-    def _told(self, proposed: dict[str, float], predicted: dict[str, float]) -> dict[str, Any]:
+    def _told(self, predicted: dict[str, float]) -> dict[str, Any]:
         feed = self._feed
         faults = [told(feed.faults)] if feed.faults else []
         if feed.jump:
             faults.append(f"the plant's clock has jumped by {feed.jump:.6g} s")
-        info: dict[str, Any] = {"proposed": proposed, "predicted": predicted}
-        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.missing)
+        info: dict[str, Any] = {"proposed": self._proposed, "predicted": predicted}
+        info["missing"] = tuple(name.removeprefix(DATA) for name in feed.faults)
         return info | ({"fault": "; ".join(faults)} if faults else {})
 
     def close(self) -> None:
@@ -191,7 +196,7 @@ def connect(
     task, clock = Task.of(config), clock or RealClock()
     feed = Feed(clock, _wall(clock))
     watched = _watched(task, feed)
-    own = watched.physical() if check_flag("physical", physical) else watched
+    own = _with_past(watched.physical() if check_flag("physical", physical) else watched)
     with ExitStack() as stack:
         env = environment(own, backend=feed)
         stack.callback(env.close)
@@ -199,7 +204,7 @@ def connect(
         written = Written(env, feed, plant)
         read, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
-        model = _without_warm_up(watched).physical()
+        model = watched.physical()
         env.inside.model = partial(load, model)
         copies = Predictions(
             partial(environment, model), feed, plant, int(ahead / plant.step + 1e-9)
@@ -223,10 +228,6 @@ def _wall(clock: Clock) -> Callable[[], float]:
     return lambda: start + clock.time()
 
 
-def _without_warm_up(task: Task) -> Task:
-    return replace(task, document={k: v for k, v in task.document.items() if k != "warm_up"})
-
-
 def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
     if env.inside.warm_ups is not None:
         watching = _Watching(env.inside.warm_ups.warm_up, feed, written)
@@ -237,29 +238,14 @@ def _reading(
     env: TaskEnv, feed: Feed, plant: Plant
 ) -> tuple[Callable[[], Mapping[str, float]], dict[str, str]]:
     """What reads all that the task reads, in the FMU's units, and how tags are sampled."""
-    outputs = {one.name: one for one in env.inside.spec.outputs}
-    found = {
-        variable.name: (alias, conversion)
-        for alias, (variable, conversion) in in_fmu(env).items()
-        if variable.name in outputs and alias in plant.tags
-    }
-    for name in sorted(outputs - found.keys()):
-        raise lacking_tag(name)
+    outputs = env.inside.spec.outputs
+    found = tagged(env, plant, outputs)
+    known = {place for place, *_ in found}
+    for place, one in enumerate(outputs):
+        if place not in known:
+            raise lacking_tag(one.name)
 
     def read() -> dict[str, float]:
-        return {n: own.inverse(feed.values[alias][0]) for n, (alias, own) in found.items()}
+        return {outputs[k].name: own.inverse(feed.values[alias][0]) for k, alias, own in found}
 
-    return read, {alias: outputs[name].sampling for name, (alias, _) in found.items()}
-
-
-def holding(policy: Policy, shadow: Shadow) -> Policy:
-    """Make a policy hold its last action while values are missing; it still sees all steps."""
-    last: list[Any] = []
-
-    def act(observation: Any) -> Any:
-        action = policy.act(observation)
-        if not (last and shadow.is_missing):
-            last[:] = [action]
-        return last[0]
-
-    return Policy(act, policy.begin)
+    return read, {alias: outputs[k].sampling for k, alias, _ in found}

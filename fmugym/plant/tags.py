@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from fmugym.declared.entries import Entry
 from fmugym.errors import ConfigError, unknown_name
 from fmugym.logs import declared_as
 
-__all__ = ["DATA", "Plant", "Tag", "in_fmu", "read_plant"]
+__all__ = ["DATA", "Plant", "Tag", "in_fmu", "read_plant", "tagged"]
 
 DATA = "data."
 """What the names of tags of live data begin with."""
@@ -98,6 +98,18 @@ def in_fmu(env: TaskEnv) -> dict[str, tuple[Variable, Conversion]]:
         if variable is not None:
             found[alias] = variable, conversion_between(variable.unit, unit, units)
     return found
+
+
+def tagged(
+    env: TaskEnv, plant: Plant, variables: Sequence[Variable]
+) -> list[tuple[int, str, Conversion]]:
+    """Those of some variables that have a tag: place, name in the task, and conversion to it."""
+    places = {variable.name: place for place, variable in enumerate(variables)}
+    return [
+        (places[variable.name], alias, conversion)
+        for alias, (variable, conversion) in in_fmu(env).items()
+        if variable.name in places and alias in plant.tags
+    ]
 
 
 def read_plant(env: TaskEnv, address: str | None = None) -> Plant:

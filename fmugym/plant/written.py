@@ -12,7 +12,7 @@ from fmugym.declared import TaskEnv
 from fmugym.errors import ConfigError, shown
 from fmugym.logs import Actions
 from fmugym.plant.feed import Feed
-from fmugym.plant.tags import Plant, in_fmu
+from fmugym.plant.tags import Plant, in_fmu, tagged
 from fmugym.pool.base import FloatArray
 from fmugym.task.actions import flat_inputs
 
@@ -38,16 +38,11 @@ class Written:
 
     def __init__(self, env: TaskEnv, feed: Feed, plant: Plant) -> None:
         self._feed, self._inputs = feed, env.inside.spec.inputs
-        places = {variable.name: place for place, variable in enumerate(self._inputs)}
-        written = {
-            alias: (places[variable.name], alias, conversion)
-            for alias, (variable, conversion) in in_fmu(env).items()
-            if variable.name in places
-        }
+        known = in_fmu(env)
         for alias in env.task.root.child("agent").child("actions").value or ():
-            if alias in written and alias not in plant.tags:
+            if alias in known and alias not in plant.tags:
                 raise lacking_tag(alias)
-        self._tags = [one for alias, one in written.items() if alias in plant.tags]
+        self._tags = tagged(env, plant, self._inputs)
         self.actions = Actions(env, self, math.inf)
         self._own = env._get_inputs
         # the hook of this one environment, whatever its class

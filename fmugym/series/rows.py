@@ -192,7 +192,7 @@ class Rows:
         self._starts[begun] = self._episodes.evaluate(lambda env: (start_time_of(env),), begun)[0]
         self._sums[mask] = 0.0
         no = np.zeros(len(mask), np.bool_)
-        return self._block(mask, self._values(observations), (no, no), infos)
+        return self._block(mask, self._values(observations, infos), (no, no), infos)
 
     def add(self, outcome: Outcome, idle: MaskArray) -> Block:
         """Make the rows of a step.
@@ -205,8 +205,7 @@ class Rows:
         self._sums += np.where(idle, 0.0, np.array([outcome.rewards, *terms])).T
         self._steps += ~idle
         ended = (outcome.terminated | outcome.truncated) & ~idle
-        values = self._values(outcome.observations)
-        self._leave_out(values, outcome.infos)
+        values = self._values(outcome.observations, outcome.infos)
         if outcome.last is not None:
             begun = outcome.ended[self._indices]
             values[begun, : outcome.last.shape[1]] = outcome.last[begun]
@@ -216,18 +215,16 @@ class Rows:
         self._sums[due] = 0.0
         return block
 
-    def _leave_out(self, values: FloatArray, infos: Infos) -> None:
-        """Leave out what a plant has not told: the environment goes on with older values."""
+    def _values(self, observations: Any, infos: Infos) -> FloatArray:
+        """What they have, and what they observe; not what a plant has failed to tell."""
+        seen = self._choice.seen(flat(observations, self._episodes.count), self._indices)
+        now = present(self._episodes, self._choice, self._indices)
+        values = np.concatenate([now, seen], axis=1)
         for index, missing in infos.each("missing").items():
             for place, quantity in enumerate(self._choice.quantities):
                 if quantity.name in missing:
                     values[self._indices == index, place] = np.nan
-
-    def _values(self, observations: Any) -> FloatArray:
-        """What they have, and what they observe."""
-        seen = self._choice.seen(flat(observations, self._episodes.count), self._indices)
-        now = present(self._episodes, self._choice, self._indices)
-        return np.concatenate([now, seen], axis=1)
+        return values
 
     def _block(
         self,

@@ -70,7 +70,7 @@ def make_dataset(arguments: argparse.Namespace) -> None:
     name = dataset_of(arguments)
     make_env = maker_of(arguments.task, arguments.scenario, arguments.master)
     if arguments.log:
-        recordings = _logged(arguments, make_env)
+        recordings, make_env = _logged(arguments, make_env)
     else:
         player = only_player(arguments)
         make_env = partial(player.make_env, make_env)
@@ -93,20 +93,24 @@ def show_dataset(arguments: argparse.Namespace, name: str) -> None:
     _show(arguments, name, recordings, what)
 
 
-def _logged(arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]) -> list[Recording]:
+def _logged(
+    arguments: argparse.Namespace, make_env: Callable[..., FMUEnv]
+) -> tuple[list[Recording], Callable[..., FMUEnv]]:
+    """The episodes of logs, and what makes an environment of their time."""
     columns = dict(map(renaming, arguments.column or []))
     tolerance = 1e-3 if arguments.tolerance is None else arguments.tolerance
-    found: list[Recording] = []
+    found, make = list[Recording](), make_env
     for path in arguments.log:
         if path.endswith(".npz"):
             found.append(Recording.load(path))
             continue
-        log, seed = PlantLog.read(path), arguments.seed + len(found)
-        make: Callable[..., FMUEnv] = make_env
+        log, seed, make = PlantLog.read(path), arguments.seed + len(found), make_env
         if log.proposed is not None:  # of the shadow of a plant, so in seconds of the year
+            if arguments.scenario is not None:
+                raise ConfigError(f"{shown(path)} has its own periods: leave --scenario out")
             make = partial(load, as_logged(Task.read(arguments.task), log))
         found += play_log(log, make, columns=columns, tolerance=tolerance, seed=seed)
-    return found
+    return found, make
 
 
 def renaming(text: str) -> tuple[str, str]:

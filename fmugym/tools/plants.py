@@ -20,7 +20,6 @@ from fmugym.errors import ConfigError, plain, shown
 from fmugym.plant import Server, connect
 from fmugym.plant.predicting import Error
 from fmugym.plant.proposing import with_plant
-from fmugym.plant.shadow import holding
 from fmugym.pool.backend.clocks import RealClock
 from fmugym.tools.options import (
     Commands,
@@ -84,7 +83,7 @@ def follow_plant(arguments: argparse.Namespace) -> None:
         played = shadow
         if arguments.output:
             played = recording.begin("shadow", shadow, arguments.variables, arguments.every)
-        policy = holding(player.make_policy(shadow.unwrapped), shadow)
+        policy = player.make_policy(shadow.unwrapped)
         with (
             shown_in_any_case(lambda: _show(arguments, done, shadow.errors())),
             recording.finished(arguments.seed),

@@ -14,7 +14,6 @@ from plant_tools import (
     Line,
     changed,
     functions_in,
-    held_by,
     house,
     watched,
 )
@@ -26,11 +25,13 @@ from fmugym.declared import Task
 from fmugym.declared.series import read_data
 from fmugym.episodes.simulation import action_of, policy_of, simulate
 from fmugym.errors import ConfigError, SimulationError
+from fmugym.fit import fit_logs
 from fmugym.lab import RealClock
 from fmugym.logs import PlantLog, as_logged, play_log
 from fmugym.plant import Server, connect
 from fmugym.series import RecordSeries
 from fmugym.tools.cli import main
+from fmugym.tools.shadows import evaluate_log
 
 
 @pytest.fixture
@@ -141,8 +142,8 @@ class TestFaults:
         task = house(stale_after="5min", hold="20min", timeout="1s")
         with watched(clock, line.address, task) as shadow:
             env = RecordSeries(shadow, path=tmp_path / "plant.csv")
-            policy, told = held_by(shadow), []
-            observation, _ = env.reset(seed=0)
+            told = []
+            env.reset(seed=0)
             for step in range(8):
                 if step == 1:
                     clock.longest_wait = 0.1
@@ -150,39 +151,52 @@ class TestFaults:
                 if step == 5:
                     clock.longest_wait = 3.0
                     line.mend()
-                observation, *_, info = env.step(policy(observation))
+                *_, info = env.step(np.float32([0.1 + 0.1 * step]))
                 told.append((bool(info["missing"]), info.get("fault", "")))
             env.complete()
-        assert [missing for missing, _ in told] == [False] * 2 + [True] * 3 + [False] * 3
-        assert ["T, T_floor" in fault for _, fault in told] == [False] + [True] * 4 + [False] * 3
+        assert [missing for missing, _ in told] == [False] + [True] * 4 + [False] * 3
+        assert ["T, T_floor" in fault for _, fault in told] == [missing for missing, _ in told]
         assert re.search("connection|does not answer", told[4][1])
         series = env.series
-        assert np.isnan(series["T"]).tolist() == [False] * 3 + [True] * 3 + [False] * 3
+        assert np.isnan(series["T"]).tolist() == [False] * 2 + [True] * 4 + [False] * 3
         assert len(set(series["proposed.u"][4:7].tolist())) == 1
         assert series.faults.keys() == {2, 3, 4, 5}
         assert np.all(np.diff(series["time"]) == STEP)
         text = (tmp_path / "plant.csv").read_text(encoding="utf-8")
         assert len(text.splitlines()) == 10
 
-    def test_a_log_with_a_gap_is_two_episodes(self, clock, tmp_path, monkeypatch):
+    @pytest.mark.parametrize("hold", [0, "1h"])
+    def test_what_held_is_a_gap_of_the_log(self, clock, tmp_path, monkeypatch, hold):
+        """An agent goes on with the last value; whoever reads the record finds nothing measured."""
         gone = []
         changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
-        task = house(stale_after="1min", hold=0)
+        task = house(stale_after="1min", hold=hold)
         with (
             Server(house(), "thermostat", clock=clock) as server,
             watched(clock, server.address, task) as shadow,
         ):
-            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+            env, seen = RecordSeries(shadow, path=tmp_path / "plant.csv"), []
             env.reset(seed=0)
             for step in range(9):
                 gone[:] = [True] * (step in (4, 5))
-                env.step(np.float32([0.5]))
+                observation, *_, info = env.step(np.float32([0.1 * step]))
+                seen.append((float(observation[0]), info["missing"]))
             env.complete()
+        assert [missing for _, missing in seen] == [("T",) * (k in (4, 5)) for k in range(9)]
+        acted = [4 if k in (5, 6) and hold == 0 else k for k in range(9)]
+        np.testing.assert_allclose(env.series["proposed.u"][1:], np.multiply(acted, 0.1), atol=1e-6)
+        assert len({seen[k][0] for k in (3, 4, 5)}) == 1
         assert np.isnan(env.series["T"]).tolist() == [k in (5, 6) for k in range(10)]
         assert "holding 0 has no finite number" in env.series.faults[5]
         log = PlantLog.read(tmp_path / "plant.csv")
         found = play_log(log, lambda **more: fmugym.load(house(), physical=True, **more))
         assert [len(one) for one in found] == [4, 2]
+        scores = evaluate_log(house(), log, {}, lambda steps: None)
+        assert {tuple(one.steps) for one in scores} == {(4, 2)}
+        pytest.importorskip("scipy", reason="needs SciPy: the extra identification")
+        fit = fit_logs(lambda: fmugym.load(house(), physical=True), [log], {"UA": None}, wash_in=0)
+        lengths = [len(one.time) for one in fit.comparison.trajectories]
+        assert lengths == [5, 3]
 
     def test_a_server_that_is_started_anew(self, clock):
         with Server(house(), "thermostat", clock=clock) as first:
@@ -249,17 +263,46 @@ class TestFaults:
     def test_answers_that_are_two_seconds_late(self):
         """Values are older then, but ticks come in time."""
         clock = RealClock(300.0)
-        with Server(house(), "thermostat", clock=clock) as server:
-            line = Line(server.address)
+        task = house(poll="1min", stale_after="40min", timeout="5s")
+        with Server(house(), "thermostat", clock=clock) as server, Line(server.address) as line:
             line.delay = 2.0 / 3.0  # there are three questions
-            task = house(poll="1min", stale_after="20min", timeout="5s")
             with watched(clock, line.address, task) as env:
                 env.reset(seed=0)
                 begin = clock.time()
                 *_, info = env.step(np.float32([0.5]))
                 assert clock.time() - begin < 1.5 * STEP
                 assert "fault" not in info
-            line.close()
+
+    def test_a_late_answer_does_not_shift_the_record(self, monkeypatch):
+        """The time that an answer tells is late; quicker ones tell by how much."""
+        changed(monkeypatch, lambda values: {"T_mass": values["clock"]})
+        tags = tags_with(T_mass={"register": 300, "type": "float64", "unit": "K"})
+        given = {"agent": {"observations": ["T", "T_mass"]}, "tags": tags}
+        task, clock = house(poll="10s", stale_after="40min", **given), RealClock(600.0)
+        with Server(task, "thermostat", clock=clock) as server, Line(server.address) as line:
+            line.delay = 0.25  # of each question, so that answers are 450 s late and more
+            with watched(clock, line.address, task) as shadow:
+                env = RecordSeries(shadow)
+                env.reset(seed=0)
+                line.delay = 0.0
+                for _ in range(4):
+                    env.step(np.float32([0.5]))
+        off = env.series["T_mass"] - env.series["time"]
+        np.testing.assert_allclose(off[-2:], 0.0, atol=200.0)
+
+    def test_answers_that_are_too_late_leave_gaps(self):
+        task, clock = house(poll="10s", stale_after="1h"), RealClock(600.0)
+        with (
+            Server(task, "thermostat", clock=clock) as server,
+            Line(server.address) as line,
+            watched(clock, line.address, task) as shadow,
+        ):
+            shadow.reset(seed=0)
+            line.delay = 1.5  # of each question, so that answers are an hour late
+            infos = [shadow.step(np.float32([0.5]))[-1] for _ in range(8)]
+        assert infos[0]["missing"] == ()
+        assert {"T", "T_floor"} <= {*infos[-1]["missing"]}
+        assert "no answer has come in time" in infos[-1]["fault"]
 
     def test_two_clients(self, server, clock):
         with (
@@ -294,6 +337,12 @@ def test_a_task_whose_tags_do_not_suffice(name):
     del tags[name]
     with pytest.raises(ConfigError, match=r"\[plant\] has no tag for '(u|T_w)'"):
         connect(house(tags=tags))
+
+
+@pytest.mark.parametrize("address", ["10.0.0.5:modbus", ":502", "10.0.0.5:70000"])
+def test_an_address_that_is_none(address):
+    with pytest.raises(ConfigError, match=r"such as '10.0.0.5:502', got '.*" + address):
+        connect(house(), address)
 
 
 class TestData:

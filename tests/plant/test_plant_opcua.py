@@ -14,7 +14,6 @@ from plant_tools import (
     STEP,
     Line,
     changed,
-    held_by,
     house,
     watched,
 )
@@ -81,19 +80,18 @@ def test_a_server_that_goes_and_comes_back(server, clock):
     task = house("opcua", stale_after="5min", hold="10min", timeout="2s")
     with watched(clock, f"opc.tcp://{line.address}", task) as shadow:
         env = RecordSeries(shadow)
-        policy = held_by(shadow)
-        observation, _ = env.reset(seed=0)
+        env.reset(seed=0)
         for step in range(7):
             clock.longest_wait = 0.3 if step in (1, 2, 3) else 6.0
             if step == 1:
                 line.cut()
             if step == 4:
                 line.mend()
-            observation, *_, info = env.step(policy(observation))
+            *_, info = env.step(np.float32([0.3]))
     line.close()
     series = env.series
     assert not {2, 3, 4} - series.faults.keys()
-    assert np.isnan(series["T"][3:5]).all()
+    assert np.isnan(series["T"][2:5]).all()
     assert "fault" not in info
     assert not np.isnan(series["T"][-1])
     assert np.all(np.diff(series["time"]) == STEP)
@@ -111,11 +109,12 @@ def test_bad_quality(clock, monkeypatch):
         env.reset(seed=0)
         env.step(np.float32([0.5]))
         bad.append(True)
-        infos = [env.step(np.float32([0.5]))[-1] for _ in range(2)]
+        infos = [env.step(np.float32([u]))[-1] for u in (0.4, 0.3, 0.2)]
     assert "T: node ns=2;s=House.T: BadSensorFailure" in infos[0]["fault"]
     assert "T_floor" not in infos[0]["fault"]
-    assert [one["missing"] for one in infos] == [(), ("T",)]
-    assert np.isnan(env.series["T"]).tolist() == [False, False, False, True]
+    assert [one["missing"] for one in infos] == [("T",)] * 3
+    np.testing.assert_allclose(env.series["proposed.u"][1:], [0.5, 0.4, 0.3, 0.3], atol=1e-6)
+    assert np.isnan(env.series["T"]).tolist() == [False, False, True, True, True]
     assert not np.isnan(env.series["T_floor"]).any()
 
 

@@ -9,16 +9,12 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 import fmugym
 from fmugym.declared import Task
-from fmugym.episodes.simulation import Policy
 from fmugym.lab import ManualClock
 from fmugym.plant import connect
 from fmugym.plant.background import Background
 from fmugym.plant.serving import _Twin
-from fmugym.plant.shadow import holding
 
 HOUSE = Path(fmugym.__file__).parent / "envs" / "house.toml"
 STEP = 900.0
@@ -87,7 +83,7 @@ class LockStep(ManualClock):
 
     def _have_read(self, before):
         """Whether each has asked the time for a whole round that has begun since then."""
-        return all(self.asked[t] >= n + 6 for t, n in before.items() if t.is_alive())
+        return all(self.asked[t] >= n + 4 for t, n in before.items() if t.is_alive())
 
 
 class Line:
@@ -145,6 +141,12 @@ class Line:
     def close(self):
         self.background.stop()
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
 
 def functions_in(sent):
     """The function codes of Modbus in what a client has sent."""
@@ -170,13 +172,6 @@ def changed(monkeypatch, change):
     """Let servers tell other values: ``change`` takes those by the names of tags."""
     original = _Twin.values
     monkeypatch.setattr(_Twin, "values", lambda twin: original(twin) | change(original(twin)))
-
-
-def held_by(shadow):
-    """A policy that proposes something else each time, but holds while values are missing."""
-    numbers = iter(np.linspace(0.1, 0.9, 100))
-    policy = holding(Policy(lambda observation: np.float32([next(numbers)])), shadow)
-    return policy.act
 
 
 @contextmanager
