@@ -53,7 +53,7 @@ _STARTS: Final = 3
 when that was so in each of these starts."""
 
 _BEST_PART: Final = 4
-"""This part of the candidates tells what observations are like, if there is a controller."""
+"""This part of the candidates tells what observations are like."""
 
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
@@ -215,8 +215,8 @@ class Search:
     def _scale(self, arena: Arena, history: Agent, controller: str | None) -> FloatArray:
         """What observations are like while candidates add constants to what agents decide.
 
-        If there is a controller, only the best candidates count: policies that are worth something
-        see the like, while others may drive the process far away.
+        Only the best candidates count: policies that are worth something see the like, while others
+        may drive the process far away.
         """
         seen: list[tuple[Merit, Any]] = []
         for text in (controller, None):
@@ -225,8 +225,7 @@ class Search:
             outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
             seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)
             self.rounds += 1
-        part = 1 if controller is None else _BEST_PART
-        best = sorted(seen, key=lambda one: one[0])[-(len(seen) // part) :]
+        best = sorted(seen, key=lambda one: one[0])[-(len(seen) // _BEST_PART) :]
         return scale_of(sum(moments for _, moments in best))
 
     # Who wins.
