@@ -1,6 +1,7 @@
 """A single environment is for one thread at a time, and interrupts leave it whole."""
 
 import contextlib
+import gc
 import logging
 import signal
 import sys
@@ -222,7 +223,8 @@ def play_some(env):
 def interrupt(play, arguments):
     """Call ``play`` with each of the arguments, and interrupt each call by a signal.
 
-    Meanwhile no coverage is measured: an interrupt could leave the lock of the tracer taken.
+    Meanwhile no coverage is measured: an interrupt could leave the lock of the tracer taken. No
+    garbage is collected either: an interrupt of what others do then, such as Hypothesis, is lost.
     """
 
     def ring(*_):
@@ -231,6 +233,7 @@ def interrupt(play, arguments):
     before, trace = signal.signal(signal.SIGALRM, ring), sys.gettrace()
     rng, interrupted = np.random.default_rng(0), 0
     sys.settrace(None)
+    gc.disable()
     try:
         for argument in arguments:
             try:
@@ -241,6 +244,7 @@ def interrupt(play, arguments):
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
+        gc.enable()
         sys.settrace(trace)
     assert interrupted == len(arguments)
 
