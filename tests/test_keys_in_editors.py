@@ -6,11 +6,33 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from test_keys import WRONG
 
 pytestmark = pytest.mark.skipif(shutil.which("npm") is None, reason="needs npm")
 ROOT = Path(__file__).parent.parent
 TAPLO = "@taplo/cli@0.7.0"
+
+WRONG = """\
+fmu = { bundled = "Pendulum" }
+time_stepp = "20ms"
+reward = "-abs(q)"
+
+[variables]
+tau = { min = 0.01, max = -0.01, sample = "median" }
+
+[agent]
+actions = ["tau"]
+observations = ["q"]
+rescale = "yes"
+
+[setpoints]
+goal = { steps = { low = 0, high = 1 } }
+
+[config]
+on_fault = "rais"
+
+[foreign]
+probe_timeout = -1
+"""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +54,7 @@ def check(taplo, folder, *texts):
 
 
 def test_mistakes_are_marked(taplo, tmp_path):
-    code, said = check(taplo, tmp_path, WRONG.replace('"-abs(q"', '"-abs(q)"'))
+    code, said = check(taplo, tmp_path, WRONG)
     assert code != 0
     for fact in ("time_stepp", "median", '"mean"', '"yes"', "boolean", "rais", '"raise"'):
         assert fact in said

@@ -19,6 +19,7 @@ from fmugym.keys import table_of
 from fmugym.signals import ordinary
 from fmugym.systems import Component, FMUSystem
 from fmugym.systems.components import OpenComponent
+from fmugym.systems.connections import Connection
 from fmugym.task.starting import structural_values
 
 __all__ = ["described", "fmu_of"]
@@ -148,7 +149,10 @@ def _sound_part(section: Entry, options: dict[str, Any]) -> FMUSystem:
     hidden = section.mistakes.hidden
     hidden |= section.child("components").items().keys() - sound["components"].keys()
     for entry in section.child("connections").elements():
-        one, ends = entry.value, {entry.value.source, entry.value.target}
+        one = entry.value
+        if not isinstance(one, Connection):  # its mistake is noted
+            continue
+        ends = {one.source, one.target}
         with replace(entry, element=f"{one.source} -> {one.target}").noting():
             if hidden.isdisjoint(name.partition(".")[0] for name in ends):
                 FMUSystem(**{**sound, "connections": [*sound["connections"], one]})
