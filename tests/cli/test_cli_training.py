@@ -79,7 +79,7 @@ def trained(capsys, task, *arguments):
 
 
 @pytest.mark.parametrize(
-    ("function", "options"), [("train", ["--algorithm", "PPO"]), ("search", [])]
+    ("function", "options"), [("train", ["--algorithm", "PPO"]), ("Searching.run", [])]
 )
 def test_a_full_disk_is_told_with_the_folder(function, options, tmp_path, capsys, monkeypatch):
     def fill(*_, **__):
