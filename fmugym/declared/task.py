@@ -142,7 +142,7 @@ class Task:
         return cls(document, sources)
 
     def _checked(self) -> Task:
-        self.root  # noqa: B018  # which finds mistakes
+        self.begun().mistakes.require_none()
         return self
 
     @property

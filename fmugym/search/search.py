@@ -121,10 +121,7 @@ class Search:
 
     def others(self) -> list[Agent]:
         """The controllers that were declared, and have numbers now."""
-        return [
-            *self._fixed,
-            *(one.best for one in self._tuned if one.best),
-        ]
+        return [*self._fixed, *(one.best for one in self._tuned if one.best)]
 
     # Rounds.
 
