@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from functools import partial
-from math import isfinite
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,10 +17,10 @@ import numpy.typing as npt
 from fmugym.env import FMUEnv
 from fmugym.signals import ordinary
 from fmugym.task.inside import Inside
-from fmugym.task.judging import Result, after_step, info_of, judged
+from fmugym.task.judging import Result, after_step, judged
 from fmugym.task.native_draws import no_draws
 from fmugym.task.readings import READINGS, Readings, reading
-from fmugym.task.step import NUMBERS, ORDER, conclude_left
+from fmugym.task.step import ORDER
 from fmugym.vector.contents import borrowed, differs
 from fmugym.vector.engines.layout import Layout
 from fmugym.vector.engines.programs import attempt, compile_hooks
@@ -72,12 +71,11 @@ class Player:
 
     Attributes:
         readings: What hooks read from the pool's arrays.
-        left: The hooks that stay in Python, and why.
         step: Does a step by an action and the attributes of the environment; see
             ``_native.Pool.step_one``.
 
     Raises:
-        UntraceableError: If the hooks cannot be compiled.
+        UntraceableError: If one of the hooks cannot be compiled.
     """
 
     step: Callable[[Any, dict[str, Any]], Any]
@@ -99,7 +97,7 @@ class Player:
         self._memory = memory = Memory(env, self._rows, ended, self._numbers)
         memory.parameters = dict(zip(draws.parameter_names, self._starts, strict=True))
         memory.hold(task)
-        self._task, self.left = task, task.left
+        self._task = task
         reads = task.inputs.loads("parameter") or task.judgement.loads("parameter")
         self._parameters = frozenset(memory.parameters if reads else ())
         self.readings: Any = PoolReadings(env, self._own, self._rows, memory)
@@ -107,7 +105,8 @@ class Player:
 
     def _prepare(self, env: FMUEnv, task: TracedTask, memory: Memory) -> None:
         """Hand the programs and their arrays to the pool."""
-        draws, (shapes, form, self._divided) = env.inside.draws, Layout(task, env, 1).of_one()
+        draws, (shapes, form, divided) = env.inside.draws, Layout(task, env, 1).of_one()
+        self._complete = None if divided is None else partial(_complete, divided)
         real, flags = np.dtype(np.float64), ((1,), np.dtype(np.bool_))
         arrays = *shapes, ((1,), real), flags, flags, flags, ((0, 1), real)
         self._pool.prepare_play(
@@ -123,12 +122,10 @@ class Player:
 
     def _watch(self) -> None:
         """Let the pool compare the attributes before each step."""
-        whole = self._divided is None and not self.left
-        complete = None if whole else partial(_complete, self._env, self._divided)
         self._may_change = [one for one in self._watched if one.copy is not None]
         watched = tuple(part for one in self._watched for part in one[:2])
         judge = partial(_judge_again, self._env)
-        self.step = partial(self._pool.step_one, self._guard, judge, complete, watched)
+        self.step = partial(self._pool.step_one, self._guard, judge, self._complete, watched)
 
     def play(self, env: FMUEnv, action: Any) -> Result | None:
         """Let the pool do the whole step.
@@ -251,38 +248,10 @@ def _judge_again(ref: weakref.ref[FMUEnv]) -> Result:
     return after_step(env, judged, inside.pool.statuses.item(0))
 
 
-def _complete(ref: weakref.ref[FMUEnv], divided: Callable[[Any], Any] | None, result: Any) -> Any:
-    """Divide what the pool has filled, and call the hooks that are not compiled."""
-    env: Any = ref()
-    if divided is not None:
-        observation, info = divided(result[0])
-        result = observation, *result[1:4], info
-    if not env.inside.player.left:
-        return result
-    whole = after_step(env, _with_hooks_left, *result)
-    return _judge_again(ref) if whole is None else whole
-
-
-def _with_hooks_left(
-    env: FMUEnv,
-    observation: Any,
-    reward: Any,
-    terminated: bool,
-    truncated: bool,
-    info: dict[str, Any],
-) -> Result | None:
-    """The whole result; None if there are numbers that are not finite."""
-    left = env.inside.player.left
-    concluded = observation, reward, terminated, truncated
-    observation, reward, _, truncated = conclude_left(env, NUMBERS, left, concluded)
-    if not (isfinite(reward) and env.inside.is_finite(observation)):
-        return None
-    if "_get_info" in left:
-        info = info_of(env)
-    if truncated:
-        env.inside.keep()  # the pool does not know of it
-        env.inside.ended = True
-    return observation, reward, terminated, truncated, info
+def _complete(divided: Callable[[Any], Any], result: Result) -> Result:
+    """Divide what the pool has filled."""
+    observation, info = divided(result[0])
+    return observation, *result[1:4], info
 
 
 _KEPT: Final = ("values", *(name for name in READINGS if name not in {"out", "variables"}))
@@ -369,9 +338,9 @@ def _traced(env: FMUEnv, numbers: Mapping[str, npt.NDArray[Any]]) -> TracedTask:
         raise UntraceableError(f"it changes {changed} outside of self")
     with _repeated(env, numbers, len(near.step_count)):
         task = compile_hooks(env, [near, far], numbers)
-    if "_get_inputs" in task.left:  # it would have to read before the FMU steps
+    if task.left:
         raise UntraceableError("; ".join(task.left.values()))
-    difference = find_difference(env, near, task.left)
+    difference = find_difference(env, near)
     if difference is not None:
         raise UntraceableError(difference)
     return task

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from types import MappingProxyType
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy.typing as npt
 
@@ -16,7 +16,7 @@ from fmugym.signals import ordinary
 from fmugym.task.readings import Readings
 from fmugym.vector.hooks.check import sample_states
 from fmugym.vector.hooks.compare import require_same
-from fmugym.vector.hooks.program import DifferenceError
+from fmugym.vector.hooks.program import DifferenceError, UntraceableError
 from fmugym.vector.hooks.trace import TracedTask, trace_hooks
 
 __all__ = ["attempt", "compile_hooks", "find_programs"]
@@ -41,41 +41,44 @@ def find_programs(env: FMUEnv, required: bool) -> TracedTask:
     """
 
     def make() -> TracedTask:
-        return compile_hooks(env, [sample_states(env, s) for s in ((1.0,), _WILD_SCALES)])
+        batches = [sample_states(env, scales) for scales in ((1.0,), _WILD_SCALES)]
+        task = compile_hooks(env, batches)
+        if required and task.left:
+            raise UntraceableError("; ".join(task.left.values()))
+        return task
 
-    return attempt(env, make, required, "on arrays") or TracedTask.without_programs(env)
+    task = attempt(env, make, required, "on arrays")
+    if task is None:
+        return TracedTask.without_programs(env)
+    for why in task.left.values():
+        text = f"a hook of {type(env).__name__} cannot be compiled: {why}"
+        logger.info("%s. It runs on arrays, the others are compiled", text)
+    return task
 
 
 def attempt(env: FMUEnv, make: Callable[[], _Made], required: bool, where: str) -> _Made | None:
-    """Compile hooks; the log tells which ones cannot be compiled, and why.
+    """Compile hooks; if they cannot be compiled, the log tells why.
 
     Args:
         env: The environment.
-        make: Compiles its hooks; what it returns has in ``left`` those that cannot be compiled.
+        make: Compiles its hooks.
         required: Whether hooks that cannot be compiled are an error.
         where: How such hooks are called: ``"on arrays"``, for example.
 
     Returns:
-        None if none can be compiled.
+        None if they cannot be compiled.
 
     Raises:
-        ConfigError: If all are required, but one cannot be compiled.
+        ConfigError: If they cannot be compiled, but must.
     """
-    name = type(env).__name__
     try:
-        made: Any = make()
+        return make()
     except ordinary(Exception) as reason:  # hooks may raise anything
-        text = f"the hooks of {name} cannot be compiled: {reason}"
+        text = f"the hooks of {type(env).__name__} cannot be compiled: {reason}"
         if required:
             raise ConfigError(text) from None
         logger.info("%s. They run %s, which is slower", text, where)
         return None
-    for why in made.left.values():
-        text = f"a hook of {name} cannot be compiled: {why}"
-        if required:
-            raise ConfigError(text)
-        logger.info("%s. It runs %s, the others are compiled", text, where)
-    return cast(_Made, made)
 
 
 def compile_hooks(

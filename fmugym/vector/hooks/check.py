@@ -7,7 +7,7 @@ answer for all environments. So the check evaluates every hook on some distinct 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -62,16 +62,13 @@ _WILD_SCALES = (300.0, -1e5)
 """Hooks may fail at these. They reach limits that the FMU's own states are far from."""
 
 
-def find_difference(
-    env: FMUEnv, states: Readings | None = None, alone: Container[str] = ()
-) -> str | None:
+def find_difference(env: FMUEnv, states: Readings | None = None) -> str | None:
     """Look for a reason to call hooks one environment at a time.
 
     Args:
         env: A prototype.
         states: States in which hooks may fail; None for those that the FMU takes, if its pool has
             not been used yet, and others.
-        alone: Hooks that are called so in any case. They must change nothing.
 
     Returns:
         The hook and how it differs on arrays, or None if all hooks work on arrays.
@@ -90,7 +87,7 @@ def find_difference(
         kinds = [sample_states(env, some) for some in scales] if states is None else [states]
         for name in hooks:
             for index, batch in enumerate(kinds):
-                comparison = _Comparison(env, contents, batch, name, name in alone)
+                comparison = _Comparison(env, contents, batch, name)
                 may_fail = states is not None or index > 0
                 difference = comparison.run(is_natural=index == 0, may_fail=may_fail)
                 if difference is not None:
@@ -234,14 +231,12 @@ class _Comparison(NamedTuple):
         contents: What the prototype holds; each call is undone.
         batch: What hooks read.
         name: The hook.
-        alone: Whether only to look for what it changes.
     """
 
     env: FMUEnv
     contents: Contents
     batch: Readings
     name: str
-    alone: bool
 
     def run(self, is_natural: bool, may_fail: bool) -> str | None:
         """Say how the results differ, or None."""
@@ -255,7 +250,7 @@ class _Comparison(NamedTuple):
         if is_natural and changed is not None:
             return f"changes self.{changed}, which belongs in 'episode_variables'"
         failures = sum(type(result) is _Failure for result, _ in calls)
-        if self.alone or failures == count or (failures and may_fail):
+        if failures == count or (failures and may_fail):
             return None  # if it fails either way, the first step will tell
         together, changed = self._call(some(self.batch))
         if changed in {"state", "out"}:  # the same arrays
