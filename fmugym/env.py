@@ -149,6 +149,8 @@ class FMUEnv(Constructed):
         self.inside.way = check_option("way of calling hooks", hooks, _WAYS)
         self._construct(FMUEnv, fmu_path, config, log_level, render_mode)
         self._open(backend, isolation)
+        if hooks != "python":
+            import_module(_PLAYERS)  # so that the first reset does not wait for it
 
     # Gymnasium's interface.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from inspect import getattr_static
 from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, Final
 
@@ -237,7 +236,10 @@ def functions_of(env: Any) -> list[FunctionType]:
 
     Those of packages are left out.
     """
-    waiting = [getattr_static(env, name, None) for name in (*ORDER, "_goal_reward")]
+    attributes: dict[str, Any] = {}
+    for holder in (*reversed(type(env).__mro__), env):
+        attributes.update(vars(holder))
+    waiting = [attributes.get(name) for name in (*ORDER, "_goal_reward")]
     found: dict[int, FunctionType] = {}
     while waiting:
         function = unwrapped(waiting.pop())
@@ -247,7 +249,7 @@ def functions_of(env: Any) -> list[FunctionType]:
         found[id(function)] = function
         waiting += [place[name] for place, name in places_of(function)]
         names = [name for name in names_in(function.__code__) if not name.startswith("__")]
-        waiting += [getattr_static(env, name, None) for name in names]
+        waiting += map(attributes.get, names)
         if "super" in names:
             waiting += [vars(cls).get(name) for cls in type(env).__mro__ for name in names]
     return list(found.values())
