@@ -266,17 +266,17 @@ class FMUEnv(Constructed):
     def _step(self, action: Any) -> Result:
         """Let the pool do the whole step where it can, and note what a picture shows."""
         player = self.inside.player
-        if player is None:
+        result: Result | None = None if player is None else player.play(self, action)
+        if result is None:
             result = self._step_in_python(action)
-        else:
-            result = player.play(self, action) or self._step_in_python(action)
         if self.render_mode is not None:
             note_for_picture(self, result[1])
         return result
 
     def _step_in_python(self, action: Any) -> Result:
         inside = self.inside
-        inside.keep()
+        if inside.player is not None:
+            inside.keep()
         if inside.ended:
             self._check_before_step()
         inside.in_hooks = True
