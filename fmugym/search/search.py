@@ -40,12 +40,13 @@ _PART: Final = 5
 """The last validation has so many episodes for each agent, but in all no more than this part of the
 episodes of all rounds."""
 
+_TRIAL: Final = 10
 _TUNING: Final = 30
-"""Rounds for the numbers of each controller, and for a constant action."""
+"""Rounds for the numbers of each controller, and in all for those of the best one. A constant
+action is one, too."""
 
-_LEAST: Final = 10
 _SHARE: Final = 10
-"""A class of policies has at least so many rounds, and this part of all rounds."""
+"""A class of policies has at least this part of all rounds."""
 
 _ROUNDS_WITHOUT_GAIN: Final = 15
 _STARTS: Final = 3
@@ -107,12 +108,19 @@ class Search:
     @property
     def is_tuned(self) -> bool:
         """Whether the numbers of all controllers are found, so that policies come next."""
-        return all(one.rounds >= _TUNING for one in self._tuned)
+        return not self._tuning
 
     @property
     def is_over(self) -> bool:
         """Whether nothing more is gained."""
         return self.baseline is not None and not self._active
+
+    @property
+    def _tuning(self) -> list[Entrant]:
+        """The controllers whose numbers are sought now: at last those of the best one alone."""
+        new = [one for one in self._tuned if one.rounds < _TRIAL]
+        ranked = sorted(self._tuned, key=lambda one: one.merit)
+        return new or [one for one in ranked[-1:] if one.rounds < _TUNING]
 
     @property
     def _active(self) -> list[Entrant]:
@@ -128,7 +136,7 @@ class Search:
     def advance(self, arena: Arena) -> None:
         """Go on by one round, or by the two that tell what observations are like."""
         if not self.is_tuned:
-            self._play(min(self._tuned, key=lambda one: one.rounds), arena)
+            self._play(min(self._tuning, key=lambda one: one.rounds), arena)
         elif self.baseline is None:
             self.best, self.merit = _best_of(arena, self.others(), self._seeds(VALIDATION))
             self.baseline, self.merit_of_baseline = self.best, self.merit
@@ -142,13 +150,12 @@ class Search:
 
     def _leaders(self) -> list[Entrant]:
         """The best two; one that is not better than the baseline leads only if none is."""
-        ranked = sorted(self._active, key=lambda one: one.merit)
-        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[-2:]
+        ranked = sorted(self._active, key=lambda one: one.merit, reverse=True)
+        return ([one for one in ranked if one.merit > self.merit_of_baseline] or ranked)[:2]
 
     def _next(self, leaders: Sequence[Entrant]) -> Entrant:
         """Who plays: one that has had less than its share, or else the leaders by turns."""
-        share = max(_LEAST, self.rounds // _SHARE)
-        behind = [one for one in self._active if one.rounds < share]
+        behind = [one for one in self._active if one.rounds < self.rounds // _SHARE]
         return behind[0] if behind else min(leaders, key=lambda one: one.last_round)
 
     def _change(self, leader: Entrant) -> None:
@@ -238,7 +245,7 @@ class Search:
             agents, searches = list(self._fixed), self._tuned
         else:
             agents = [self.baseline]
-            searches = sorted(self._contenders, key=lambda one: one.merit)[-2:]
+            searches = sorted(self._contenders, key=lambda one: one.merit, reverse=True)[:2]
         for one in searches:
             if one.best:
                 agents.append(one.best)
