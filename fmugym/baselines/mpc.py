@@ -61,8 +61,8 @@ class MPC(Controller):
     the model. Copies read data as they were observed, and ahead as they were forecast last. Beyond
     a forecast, the value of a day before is repeated; data that are not observed have their mean in
     the training period. Differences between what is observed and what a copy gives, filtered,
-    become offsets of the outputs. The controller is told the episode variables, such as the clock,
-    but no noise.
+    become offsets of the outputs; those of a value that a plant fails to tell stay. The controller
+    is told the episode variables, such as the clock, but no noise.
 
     Args:
         horizon: How far plans go: seconds, or a text such as ``"24h"``.
@@ -151,7 +151,7 @@ class MPC(Controller):
         self._require_fit(future)
         self._foresight = _Foresight(self.names, future, self.time_step, steps)
         self._warm = self._bound_warm()
-        self._inverse: FloatArray | None = None
+        self._slopes: FloatArray | None = None
 
     def _sides(self) -> list[FloatArray]:
         """The lowest and the highest numbers of an action."""
@@ -230,7 +230,9 @@ class MPC(Controller):
             episode = self._episodes[index]
             if episode is None:
                 episode = self._episodes[index] = self._begun(env)
+                episode.is_measured = self._measured(env)
             else:
+                episode.is_measured = self._measured(env)
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
@@ -273,11 +275,16 @@ class MPC(Controller):
         episode.plan = np.full(self._plan_shape, 0.5)
         episode.rng = np.random.default_rng(self.seed)
         episode.warm = copy.deepcopy(self._warm)
-        if self._inverse is None:
-            self._inverse = self._find_inverse(episode.snapshot[0])
-        measured, outputs = episode.seen.shape[1], len(self._inverse)
-        episode.observer = Observer(self._many, measured, outputs, self.correction)
+        if self._slopes is None:
+            self._slopes = self._find_slopes(episode.snapshot[0])
+        episode.observer = Observer(self._many, *self._slopes.shape, self.correction)
         return episode
+
+    def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:
+        """Which elements of the observation were measured now, and do not hold or lie ahead."""
+        assert self._slopes is not None
+        is_held = np.isin([*self._prototype.out], [*env.inside.held()])
+        return self._foresight.is_present & ~self._slopes[:, is_held].any(axis=1)
 
     def _follow(self, episode: _Episode, action: Any, row: FloatArray, now: float) -> None:
         """Let the copies do the step that the environment has done, with what was observed."""
@@ -296,11 +303,11 @@ class MPC(Controller):
             sources = np.where(terminated | truncated, goes_on[0], np.arange(self._many))
             episode.snapshot = copied.save_state()[sources]
         episode.seen = np.asarray(observations, np.float64)[sources]
-        off = (row - episode.seen) * self._foresight.is_present
+        off = (row - episode.seen) * episode.is_measured
         episode.observer.follow(off, sources)
 
-    def _find_inverse(self, snapshot: Snapshot) -> FloatArray:
-        """How offsets of the outputs follow from differences of observations."""
+    def _find_slopes(self, snapshot: Snapshot) -> FloatArray:
+        """How present values of the observation follow the outputs, shape (k, o)."""
         copied = self._copied
         action = self._actions(np.full((1, *self._plan_shape), 0.5))
         seen = partial(copied.rollout, snapshot, action[:, :1])
@@ -310,7 +317,7 @@ class MPC(Controller):
             change = seen(offsets={name: 1.0}).observations[0, 0] - plain
             columns.append(np.where(self._foresight.is_present, change, 0.0))
         slopes = np.array(columns).T
-        return np.linalg.pinv(np.where(np.abs(slopes) < 1e-4, 0.0, slopes), rcond=1e-6)
+        return np.where(np.abs(slopes) < 1e-4, 0.0, slopes)
 
     def _start_of(
         self, index: int, episode: _Episode, row: FloatArray, now: float
@@ -320,8 +327,10 @@ class MPC(Controller):
             return self._env.save_state(*([[index]] if self._is_vector else [])), {}, {}
         if self.states:
             return self._moved(episode, row), {}, {"seed": self.seed}
-        assert self._inverse is not None
-        episode.observer.correct((row - episode.seen) @ self._inverse.T)
+        assert self._slopes is not None
+        slopes = self._slopes * episode.is_measured[:, np.newaxis]
+        wanted = (row - episode.seen) @ np.linalg.pinv(slopes, rcond=1e-6).T
+        episode.observer.correct(wanted, slopes.any(axis=0))
         best = episode.observer.best
         offsets = episode.observer.offsets[best].tolist()
         names = list(self._prototype.out)
@@ -332,7 +341,8 @@ class MPC(Controller):
     def _moved(self, episode: _Episode, row: FloatArray) -> Snapshot:
         """Let the copies go on in the state that was observed."""
         expected = episode.seen[:, self._places].mean(axis=0)  # their sensors are noisy, too
-        values = expected + self.correction * (row[self._places] - expected)
+        part = self.correction * episode.is_measured[self._places]
+        values = expected + part * (row[self._places] - expected)
         values = row[self._places] if not episode.steps else values
         starts = dict(zip(self.states.values(), values.tolist(), strict=True))
         nominal = {n: float(v[0]) for n, v in spread(self._prototype, self.seed).items()}
@@ -451,6 +461,7 @@ class _Episode:
         have_ended: Whether their episodes have ended; the last snapshot stays.
         plan: The latest plan, from 0 to 1, shape (steps, m).
         row: The latest observation.
+        is_measured: Which elements of it were measured then, shape (k,).
         steps: How many there were before.
         told: The latest forecast of data for each step, by name.
         rng: Draws candidates.
@@ -463,6 +474,7 @@ class _Episode:
     observer: Observer
     plan: FloatArray
     row: FloatArray
+    is_measured: npt.NDArray[np.bool_]
     warm: list[Controller]
     rng: np.random.Generator
 

@@ -202,7 +202,7 @@ def connect(
         stack.callback(env.close)
         plant = read_plant(env, address)
         written = Written(env, feed, plant)
-        read, samplings = _reading(env, feed, plant)
+        read, env.inside.held, samplings = _reading(env, feed, plant)
         _watch_warm_up(env, feed, written)
         model = watched.physical()
         env.inside.model = partial(load, model)
@@ -236,8 +236,8 @@ def _watch_warm_up(env: TaskEnv, feed: Feed, written: Written) -> None:
 
 def _reading(
     env: TaskEnv, feed: Feed, plant: Plant
-) -> tuple[Callable[[], Mapping[str, float]], dict[str, str]]:
-    """What reads all that the task reads, in the FMU's units, and how tags are sampled."""
+) -> tuple[Callable[[], Mapping[str, float]], Callable[[], list[str]], dict[str, str]]:
+    """What reads all that the task reads, in the FMU's units; what of it holds; its samplings."""
     outputs = env.inside.spec.outputs
     found = tagged(env, plant, outputs)
     known = {place for place, *_ in found}
@@ -248,4 +248,7 @@ def _reading(
     def read() -> dict[str, float]:
         return {outputs[k].name: own.inverse(feed.values[alias][0]) for k, alias, own in found}
 
-    return read, {alias: outputs[k].sampling for k, alias, _ in found}
+    def held() -> list[str]:
+        return [outputs[k].name for k, alias, _ in found if alias in feed.faults]
+
+    return read, held, {alias: outputs[k].sampling for k, alias, _ in found}

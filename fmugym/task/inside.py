@@ -86,6 +86,7 @@ class Inside:
         future: What a declared task reads of the future; None for other tasks.
         controllers: Makes the simple controllers of a declared task; None for other tasks.
         model: Makes an environment to plan with, where a plant stands in for the FMU; or None.
+        held: Returns the outputs that a plant has not told now, whose last values go on.
         own: The hooks that the class has itself.
         readings: What hooks read now.
         in_hooks: Whether hooks are being called, which must not draw random numbers.
@@ -117,6 +118,7 @@ class Inside:
     future: Future | None
     controllers: Callable[[], list[Any]] | None
     model: Callable[[], Any] | None
+    held: Callable[[], Sequence[str]]
     guard: Guard
     halt: Callable[[], None]
     has_chosen: bool
@@ -163,6 +165,7 @@ class Inside:
         self.ended = True
         self.warm_ups = self.player = self.quantities = self.renderer = self.scope = None
         self.future = self.controllers = self.model = None
+        self.held = lambda: ()
         self.pictured = None, 0.0
         self.readings = NoReadings()  # type: ignore[assignment]  # until there are any
 

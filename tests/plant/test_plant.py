@@ -494,6 +494,35 @@ class TestMPC:
             found, expected = ([one[name] for one in rows] for rows in (copied, acted))
             np.testing.assert_allclose(found, expected, atol=off, rtol=0)
 
+    def test_corrects_nothing_by_a_value_that_holds(self, clock, monkeypatch):
+        """A sensor fails: its last value is no reason to believe that the room stands still."""
+        gone = []
+        changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
+        task = house(agent={"observations": ["T", "T_floor", "gap"]}, stale_after="1min", hold="1d")
+        task.document["expressions"]["gap"] = {"expr": "T_floor - T"}
+        leaky = house(parameters={"T_start": 20.0, "H_ve": 400.0})
+        offsets, errors = [], []
+        with (
+            Server(leaky, "thermostat", clock=clock) as server,
+            watched(clock, server.address, task) as env,
+        ):
+            controller = MPC("1h", candidates=36).bind(env.unwrapped)
+            controller.reset()
+            observation, _ = env.reset(seed=0)
+            for step in range(9):
+                gone[:] = [True] * (3 <= step < 7)
+                action = controller.act(observation)
+                (episode,) = controller._episodes
+                offsets.append(episode.observer.offsets[episode.observer.best])
+                errors.append(episode.observer.errors[0])
+                observation, *_ = env.step(action)
+            controller.close()
+        moved = np.diff(offsets, axis=0)[:, :2] != 0.0
+        assert moved[:, 0].tolist() == [not 3 <= step < 7 for step in range(8)]
+        assert moved[:, 1].all()
+        grown = np.diff(errors, axis=0)[3:7]
+        assert np.all(grown[:, [0, 2]] <= 0.0)
+
 
 class TestServer:
     def test_tells_what_sensors_show(self, clock):
