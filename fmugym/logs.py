@@ -11,7 +11,6 @@ actions that write the logged inputs.
 
 from __future__ import annotations
 
-import csv
 import itertools
 import math
 import os
@@ -31,15 +30,14 @@ from fmugym.archive.variable import Variable
 from fmugym.checks import check_number, require_regular
 from fmugym.declared import Task
 from fmugym.declared.entries import Entry
-from fmugym.declared.series import read_data
+from fmugym.declared.series import is_number, read_csv, read_data
 from fmugym.distributions import Uniform
 from fmugym.env import FMUEnv
-from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.errors import ConfigError, reading, shown, unknown_name
 from fmugym.fmi.status import Status
 from fmugym.pool.base import FloatArray
 from fmugym.recording import Recorder, Recording
 from fmugym.series.store import TEXT
-from fmugym.signals import ordinary
 from fmugym.task.actions import flat_inputs
 
 __all__ = [
@@ -105,24 +103,27 @@ class PlantLog:
             ConfigError: If the file cannot be read, a cell that is needed is no number, or times do
                 not rise.
         """
-        names, rows = _cells(Path(path))
-        found = [_heading(name) for name in names]
-        values = {
-            name: np.array([_number(path, row, place) for row in rows])
-            for place, (name, _) in enumerate(found)
-            if name and _is_numeric(rows, place) and found[place][1] != TEXT
-        }
-        texts = {
-            name: np.array([row[place] for row in rows], object)
-            for place, (name, _) in enumerate(found)
-            if name and name not in values
-        }
+        with reading(f"{shown(str(path))} cannot be read"):
+            require_regular(Path(path))
+            columns = read_csv(Path(path), Path(path).read_bytes())
+        units: dict[str, str] = {}
+        values: dict[str, FloatArray] = {}
+        texts: dict[str, npt.NDArray[np.object_]] = {}
+        for heading, cells in columns.items():
+            name, unit = _heading(heading)
+            if not name:
+                continue
+            if unit == TEXT or not is_number(next(filter(None, cells), "")):
+                texts[name] = np.array(cells, object)
+                continue
+            values[name] = np.array([_number(path, heading, cell) for cell in cells])
+            if unit:
+                units[name] = unit
         if "time" not in values:
             raise ConfigError(f"{shown(str(path))} has no column 'time' of numbers")
         times = values.pop("time")
         numbers = values.pop("episode", np.cumsum(np.diff(times, prepend=times[:1]) < 0.0))
         _require_rising(path, times, numbers)
-        units = {name: unit for name, unit in found if unit and unit != TEXT}
         before = "step" in values if inputs_before is None else inputs_before
         return cls(times, values, units, numbers.astype(np.float64), before, texts)
 
@@ -160,25 +161,6 @@ class PlantLog:
             )
 
 
-def _cells(path: Path) -> tuple[list[str], list[list[str]]]:
-    try:
-        require_regular(path)
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            names, *rows = [row for row in csv.reader(file) if row]
-    except ordinary(OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{shown(str(path))} cannot be read: {reason(error)}") from None
-    except ValueError:
-        raise ConfigError(f"{shown(str(path))} is empty") from None
-    if not rows:
-        raise ConfigError(f"{shown(str(path))} has no rows, only a heading")
-    for number, row in enumerate(rows, 2):
-        if len(row) != len(names):
-            raise ConfigError(
-                f"{shown(str(path))}, row {number}: expected {len(names)} cells, got {len(row)}"
-            )
-    return names, rows
-
-
 def _heading(text: str) -> tuple[str, str | None]:
     """A column's name and its unit; ``v[2]`` is a name."""
     match = _HEADING.match(text)
@@ -188,22 +170,12 @@ def _heading(text: str) -> tuple[str, str | None]:
     return match["name"], unit
 
 
-def _is_numeric(rows: Sequence[Sequence[str]], place: int) -> bool:
-    """Whether the first cell of a column that is not empty is a number; others are remarks."""
-    first = next((row[place] for row in rows if row[place]), "")
-    try:
-        float(first)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(path: Any, row: Sequence[str], place: int) -> float:
+def _number(path: Any, heading: str, cell: str) -> float:
     """The number in a cell; NaN for what was not measured."""
     try:
-        return float(row[place] or "nan")
+        return float(cell or "nan")
     except ValueError:
-        text = f"{shown(str(path))}: expected a number in column {place + 1}, got {row[place]!r}"
+        text = f"{shown(str(path))}: expected a number in column {shown(heading)}, got {cell!r}"
         raise ConfigError(text) from None
 
 

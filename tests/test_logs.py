@@ -137,12 +137,12 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("text", "facts"),
         [
-            ("", ["empty"]),
+            ("", ["no rows"]),
             ("time,x", ["no rows"]),
             ("x,f\n1,2", ["'time'"]),
             ("time,x\n0,1,2", ["row 2", "2", "3"]),
             ("time,x\n0,1\n0,2", ["row 3", "rise"]),
-            ("time,x\n0,1\n1,much", ["column 2", "'much'"]),
+            ("time,x\n0,1\n1,much", ["column 'x'", "'much'"]),
         ],
     )
     def test_files(self, tmp_path, text, facts):

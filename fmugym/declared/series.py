@@ -5,9 +5,10 @@ from __future__ import annotations
 import codecs
 import csv
 import datetime
+import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from fmugym.errors import ConfigError, reason, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.signals import ordinary
 
-__all__ = ["Series", "read_data", "read_rows", "read_schedule"]
+__all__ = ["Series", "is_number", "read_csv", "read_data", "read_rows", "read_schedule"]
 
 _DAY: Final = 86400.0
 _CLOCK: Final = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}))?")
@@ -259,16 +260,28 @@ def _read_text(path: Path, changed: int, size: int) -> Mapping[str, Table]:
         if content.startswith(b"#1"):
             return read_modelica(path.name, lines)
         return {path.stem: read_weather(path.name, lines)}
+    return {path.stem: Table(read_csv(path, content))}
+
+
+def read_csv(path: Path, content: bytes) -> dict[str, tuple[str, ...]]:
+    """Read the columns of a CSV file by their names.
+
+    A semicolon separates cells where the first line has one.
+
+    Args:
+        path: The file, for errors.
+        content: What it has.
+
+    Raises:
+        ConfigError: If it has no rows, or they are not of one length, or it is no text in UTF-8.
+    """
     try:
-        return {path.stem: _read_csv(path, content.decode("utf-8").splitlines())}
+        file = io.StringIO(content.decode("utf-8-sig"), newline="")
     except UnicodeDecodeError:
         raise ConfigError(f"{shown(str(path))} is not encoded in UTF-8") from None
-
-
-def _read_csv(path: Path, lines: Sequence[str]) -> Table:
-    """Read rows of cells. A semicolon separates them where the first line has one."""
-    delimiter = ";" if lines and ";" in lines[0] else ","
-    header, *rows = [row for row in csv.reader(lines, delimiter=delimiter) if row] or [[]]
+    delimiter = ";" if ";" in file.readline() else ","
+    file.seek(0)
+    header, *rows = [row for row in csv.reader(file, delimiter=delimiter) if row] or [[]]
     for number_of_row, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise ConfigError(
@@ -277,7 +290,7 @@ def _read_csv(path: Path, lines: Sequence[str]) -> Table:
     if not rows:
         raise ConfigError(f"{path.name} has no rows below its header")
     names = [name.strip() for name in header]
-    return Table(dict(zip(names, zip(*rows, strict=True), strict=True)))
+    return dict(zip(names, zip(*rows, strict=True), strict=True))
 
 
 def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
@@ -295,7 +308,7 @@ def _times(entry: Entry, rows: Mapping[str, Cells]) -> FloatArray:
 
 
 def _seconds(entry: Entry, cells: Cells) -> FloatArray:
-    if _is_number(cells[0]):
+    if is_number(cells[0]):
         return _numbers(entry, cells)
     dates = [_date(entry, i, cell) for i, cell in enumerate(cells)]
     start = dates[0].replace(month=1, day=1, hour=0, minute=0, second=0, microsecond=0)
@@ -317,7 +330,8 @@ def _date(entry: Entry, index: int, cell: Any) -> datetime.datetime:
         ) from None
 
 
-def _is_number(cell: Any) -> bool:
+def is_number(cell: Any) -> bool:
+    """Whether a cell is a number, or its text."""
     try:
         float(cell)
     except (TypeError, ValueError):
@@ -326,7 +340,7 @@ def _is_number(cell: Any) -> bool:
 
 
 def _cell(entry: Entry, index: int, cell: Any) -> float:
-    value = float(cell) if _is_number(cell) else math.nan
+    value = float(cell) if is_number(cell) else math.nan
     if not math.isfinite(value):
         raise entry.error(f"row {index + 2} of the column is {shown(cell)}, expected a number")
     return value
