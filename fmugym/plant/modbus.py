@@ -28,15 +28,6 @@ _MOST: Final = 120
 _CODES: Final = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 """The functions that read, by what they read."""
 
-_SAID: Final = {
-    1: "it does not know this function",
-    2: "there is no such register",
-    3: "it refuses the number of registers",
-    4: "the device has failed",
-    10: "there is no way to this device",
-    11: "the device does not answer",
-}
-
 Values = Callable[[], Mapping[str, Sequence[float]]]
 
 logging.getLogger("pymodbus.logging").addHandler(logging.NullHandler())
@@ -131,6 +122,7 @@ class ModbusClient:
     def __init__(self, plant: Plant) -> None:
         self._client_of = imported("pymodbus.client", "plant").AsyncModbusTcpClient
         self._errors = imported("pymodbus.exceptions", "plant")
+        self._codes = imported("pymodbus.constants", "plant").ExcCodes
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
         self._blocks = _neighbours(_placed(plant))
@@ -186,8 +178,9 @@ class ModbusClient:
             except self._errors.ModbusException:
                 raise LostError("it does not answer, or not by Modbus") from None
             if told.isError():
-                code, where = told.exception_code, f"{place.kind} {begin} of unit {place.unit_id}"
-                return (), f"{where}: {_SAID.get(code, 'refused')} (exception {code})"
+                known, code = {one.value: one.name for one in self._codes}, told.exception_code
+                where = f"{place.kind} {begin} of unit {place.unit_id}"
+                return (), f"{where}: exception {code}, {known.get(code, 'unknown')}"
             cells += told.bits[:count] if place.is_bits else told.registers
         return cells, ""
 

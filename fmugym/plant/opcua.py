@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from fmugym.checks import check_path
-from fmugym.errors import ConfigError, nearest_name, shown
+from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
@@ -18,9 +18,6 @@ from fmugym.plant.tags import Plant, Tag
 from fmugym.signals import Ignoring
 
 __all__ = ["OpcUaClient", "serve_opcua"]
-
-_MOST_NODES: Final = 2000
-"""So many nodes are looked at for the nearest name."""
 
 _REFUSALS: Final = ("Certificate", "Security", "Identity", "UserAccess")
 """Words in the names of status codes of a server that refuses a client."""
@@ -42,7 +39,6 @@ class OpcUaClient:
                 raise ConfigError("without encryption, everybody on the line reads the password")
         self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
         self._client: Any = None
-        self._known: list[str] | None = None
 
     async def connect(self) -> None:
         """See ``polling.Client``."""
@@ -69,22 +65,10 @@ class OpcUaClient:
         self._client.application_uri = _uri_in(own) or self._client.application_uri
         pinned = self._plant.get("server_certificate")
         if pinned is not None:
-            await self._require_pinned(Path(pinned))
-        await self._client.set_security(
-            policies.SecurityPolicyBasic256Sha256,
-            str(certificate),
-            str(key),
-            server_certificate=None if pinned is None else str(pinned),
-        )
-
-    async def _require_pinned(self, path: Path) -> None:
-        """Refuse a server with another certificate than the one in a file."""
-        endpoints = await self._client.connect_and_get_server_endpoints()
-        pinned = imported("asyncua.crypto.uacrypto", "plant").der_from_x509(
-            await _certificate_in(path)
-        )
-        if pinned not in [one.ServerCertificate for one in endpoints]:
-            raise RefusedError(f"its certificate is not that of {shown(str(path))}")
+            other = RefusedError(f"its certificate is not that of {shown(pinned)}")
+            self._client.certificate_validator = await _only(pinned, other)
+        policy = policies.SecurityPolicyBasic256Sha256
+        await self._client.set_security(policy, str(certificate), str(key))
 
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
@@ -93,16 +77,14 @@ class OpcUaClient:
             told = await self._client.uaclient.read_attributes(self._nodes, attribute)
         except self._ua.UaError as error:
             raise self._lost(error) from None
-        found = {}
-        for tag, one in zip(self._tags, told, strict=True):
-            found[tag.name] = await self._answer(tag, one)
-        return found
+        pairs = zip(self._tags, told, strict=True)
+        return {tag.name: self._answer(tag, one) for tag, one in pairs}
 
-    async def _answer(self, tag: Tag, told: Any) -> Answer:
+    @staticmethod
+    def _answer(tag: Tag, told: Any) -> Answer:
         node, status = tag.address["node"], told.StatusCode
         if status is not None and not status.is_good():
-            near = await self._nearest(node) if status.name == "BadNodeIdUnknown" else ""
-            return Answer((), f"node {node}: {status.name}{near}")
+            return Answer((), f"node {node}: {status.name}")
         value = None if told.Value is None else told.Value.Value
         numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value]
         if not all(isinstance(one, bool | int | float) for one in numbers):
@@ -110,23 +92,6 @@ class OpcUaClient:
         if len(numbers) != tag.count:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
         return Answer.of(tag, f"node {node}", numbers)
-
-    async def _nearest(self, node: str) -> str:
-        """The node that was probably meant, in words."""
-        if self._known is None:
-            self._known = [one async for one in self._browsed()]
-        near = nearest_name(node, self._known)
-        return f"; did you mean {near}?" if near else ""
-
-    async def _browsed(self) -> AsyncIterator[str]:
-        """The ids of the first nodes below the objects of the server, but not its own."""
-        left, count = [self._client.nodes.objects], 0
-        while left and count < _MOST_NODES:
-            for child in await left.pop(0).get_children():
-                if child.nodeid.NamespaceIndex != 0:
-                    count += 1
-                    left.append(child)
-                    yield child.nodeid.to_string()
 
     async def close(self) -> None:
         """See ``polling.Client``."""
@@ -159,6 +124,17 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
     certificate, key = (check_path("a certificate", path) for path in paths)
     require_secret(key)
     return certificate, key
+
+
+async def _only(path: str, other: Exception) -> Callable[[Any, Any], Awaitable[None]]:
+    """What takes the certificate in a file, and raises an error at all others."""
+    known = await _certificate_in(Path(path))
+
+    async def validate(certificate: Any, description: Any) -> None:
+        if certificate != known:
+            raise other
+
+    return validate
 
 
 async def _certificate_in(path: Path) -> Any:
@@ -218,13 +194,9 @@ async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
         await server.load_private_key(str(key))
     await server.set_application_uri(uri)
     server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
-    known = None if trusted is None else await _certificate_in(Path(trusted))
-
-    async def validate(certificate: Any, description: Any) -> None:
-        if known is not None and certificate != known:
-            raise refused(ua.StatusCodes.BadCertificateUntrusted)
-
-    server.set_certificate_validator(validate)
+    if trusted is not None:
+        untrusted = refused(ua.StatusCodes.BadCertificateUntrusted)
+        server.set_certificate_validator(await _only(trusted, untrusted))
 
 
 async def _add(

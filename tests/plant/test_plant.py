@@ -228,7 +228,9 @@ class TestFaults:
         task = house(tags=tags_with(T_floor={"register": 900, "type": "int16"}))
         with (
             watched(clock, server.address, task) as env,
-            pytest.raises(ConfigError, match=r"T_floor: holding 900 of unit 1.*no such") as told,
+            pytest.raises(
+                ConfigError, match=r"T_floor: holding 900 of unit 1: .*ILLEGAL_ADDRESS"
+            ) as told,
         ):
             env.reset()
         assert "power: " not in str(told.value)

@@ -121,7 +121,7 @@ def test_bad_quality(clock, monkeypatch):
 @pytest.mark.parametrize(
     ("node", "message"),
     [
-        ("ns=2;s=House.T_flor", r"T_flor: BadNodeIdUnknown.*mean ns=2;s=House.T_floor\?"),
+        ("ns=2;s=House.T_flor", r"T_floor: node ns=2;s=House.T_flor: BadNodeIdUnknown"),
         ("i=2255", r"T_floor: node i=2255: expected a number, got"),
     ],
     ids=["a tag that does not exist", "a wrong type"],
