@@ -277,7 +277,8 @@ class MPC(Controller):
         episode.warm = copy.deepcopy(self._warm)
         if self._slopes is None:
             self._slopes = self._find_slopes(episode.snapshot[0])
-        episode.observer = Observer(self._many, *self._slopes.shape, self.correction)
+        measured, outputs = self._slopes.shape
+        episode.observer = Observer(self._many, measured, outputs, self.correction)
         return episode
 
     def _measured(self, env: FMUEnv) -> npt.NDArray[np.bool_]:

@@ -14,7 +14,6 @@ import numpy as np
 
 from fmugym.declared import Task, TaskEnv, load
 from fmugym.declared.format import DEVICE
-from fmugym.declared.naming import CLOCK
 from fmugym.declared.series import Series, read_data
 from fmugym.episodes.simulation import Player, Policy, Summary, action_of, policy_of
 from fmugym.errors import ConfigError, FMUGymError, SimulationError
@@ -65,7 +64,8 @@ class _Twin:
         self._env, self._plant, self._policy, self._clock = env, plant, policy, clock
         self._seed, self._most = seed, most
         assert env.inside.quantities is not None
-        self._quantities = env.inside.quantities()
+        assert env.inside.future is not None
+        self._quantities, self._future = env.inside.quantities(), env.inside.future
         self._is_late, self._is_straight = self._shapes()
         self._sensors = self._places_of_sensors()
         self._data = {name: read_data(e) for name, e in env.task.root.child("data").items().items()}
@@ -143,17 +143,9 @@ class _Twin:
         now = np.where(self._is_straight, moved, self._before)
         now = np.where(self._is_late, self._after, now)
         found = dict(zip([one.name for one in self._quantities.all], now.tolist(), strict=True))
-        time = self._time() + (part - 1.0) * self._plant.step
+        time = float(self._future.clock(self._env)) + (part - 1.0) * self._plant.step
         found["clock"] = time
         return {name: self._of_tag(name, found, time) for name in self._plant.tags}
-
-    def _time(self) -> float:
-        """The time of data after the latest step."""
-        env = self._env
-        if CLOCK in env.variables:
-            now: float = env.variables[CLOCK] + env.step_count * self._plant.step
-            return now
-        return float(env.time)
 
     def _of_tag(self, name: str, found: Mapping[str, float], time: float) -> tuple[float, ...]:
         if not name.startswith(DATA):
