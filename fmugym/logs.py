@@ -18,7 +18,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import gymnasium
 import numpy as np
@@ -274,7 +274,7 @@ class _Player:
         self._columns = Columns(inner, log, columns)
         for variable in inner.inside.spec.outputs:
             self._columns.require(variable)
-        self._actions = Actions(inner, self._columns, tolerance)
+        self._actions = Actions(inner, self._columns.range_of, tolerance)
         self._has_drawn_start = inner.config.draws_start_time
 
     def play(self, seed: int) -> list[Recording]:
@@ -383,6 +383,14 @@ class Columns:
         if not self.has(variable):
             raise unknown_name("column of the log", variable.name, self._columns)
 
+    def range_of(self, variable: Variable) -> float:
+        """How far apart the values of a variable are; 1 if they are all the same."""
+        self.require(variable)
+        column, factor, _ = self._from[variable.name]
+        values = self._columns[column]
+        known = values[~np.isnan(values)]
+        return float(np.ptp(known) * abs(factor) if known.size else 0.0) or 1.0
+
     def values(self, variable: Variable, part: PlantLog) -> FloatArray:
         """The values of a variable in the rows of an episode, which must be finite."""
         column, factor, offset = self._from[variable.name]
@@ -394,13 +402,6 @@ class Columns:
                 f"got {part.columns[column][wrong][0]}; leave such rows out"
             )
         return values
-
-    def range_of(self, variable: Variable) -> float:
-        """How far apart the values of a variable are; 1 if they are all the same."""
-        column, factor, _ = self._from[variable.name]
-        values = self._columns[column]
-        known = values[~np.isnan(values)]
-        return float(np.ptp(known) * abs(factor) if known.size else 0.0) or 1.0
 
     def held(self, variable: Variable, part: PlantLog) -> FloatArray:
         """The values of an input that hold from each row on, as ``values``.
@@ -440,30 +441,23 @@ class Columns:
         return values[after - 1]
 
 
-class Inputs(Protocol):
-    """Inputs that were written."""
-
-    def require(self, variable: Variable) -> None:
-        """Refuse an input of which nothing is known."""
-
-    def range_of(self, variable: Variable) -> float:
-        """How far apart its values are."""
-
-
 class Actions:
     """Finds the action that makes an environment write given inputs.
 
     Args:
         env: The environment. Its hook ``_get_inputs`` is called as it is now.
-        columns: The inputs.
+        range_of: Returns how far apart the values of an input are, or refuses one of which nothing
+            is known.
         tolerance: How far an input may be from the given one, as a part of its range.
     """
 
-    def __init__(self, env: FMUEnv, columns: Inputs, tolerance: float) -> None:
+    def __init__(
+        self, env: FMUEnv, range_of: Callable[[Variable], float], tolerance: float
+    ) -> None:
         self._env, self._tolerance, self._get_inputs = env, tolerance, env._get_inputs
         self._space: Any = env.action_space
         self._candidates = _candidates(self._space)
-        self._columns = columns
+        self._range_of = range_of
         self._written: list[int] = []
         self._scales = np.empty(0)
 
@@ -493,14 +487,11 @@ class Actions:
 
     def _find_written(self, tried: FloatArray) -> None:
         """Note which inputs actions change; data and schedules write the others."""
-        changes = np.flatnonzero(np.ptp(tried, axis=0) > 0.0).tolist()
-        new = [place for place in changes if place not in self._written]
-        for place in new:
-            self._columns.require(self._env.inside.spec.inputs[place])
-        if new:
-            self._written = sorted(self._written + new)
+        changes = set(np.flatnonzero(np.ptp(tried, axis=0) > 0.0).tolist())
+        if changes - set(self._written):
+            self._written = sorted(changes.union(self._written))
             inputs = self._env.inside.spec.inputs
-            self._scales = np.array([self._columns.range_of(inputs[i]) for i in self._written])
+            self._scales = np.array([self._range_of(inputs[i]) for i in self._written])
 
     def _nearest(self, tried: FloatArray, wanted: FloatArray) -> Any:
         if not isinstance(self._space, spaces.Box):

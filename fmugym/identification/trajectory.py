@@ -14,7 +14,7 @@ from fmugym.errors import ConfigError, shown
 from fmugym.pool.base import FloatArray, MaskArray
 from fmugym.signals import ordinary
 
-__all__ = ["Trajectory", "common_names", "float_array", "is_repeat"]
+__all__ = ["Trajectory", "common_names", "is_repeat"]
 
 LONGEST_REPEAT = 5
 """Longer runs of equal samples are a plant at rest, not stale samples."""
@@ -130,28 +130,6 @@ def is_repeat(signals: FloatArray) -> MaskArray:
     return found
 
 
-def float_array(what: str, values: npt.ArrayLike) -> FloatArray:
-    """Return a copy of finite real numbers as an array.
-
-    Args:
-        what: What the numbers are, for the error.
-        values: Numbers of any shape.
-
-    Raises:
-        ConfigError: If there is something other than a finite real number.
-    """
-    try:
-        raw = np.asarray(values)
-        if raw.dtype.kind not in "biufO":  # numpy would convert texts and complex numbers
-            raise TypeError
-        array = np.array(raw, np.float64)
-    except ordinary(Exception):  # objects may do anything when numpy looks at them
-        raise ConfigError(f"{what} must be numbers, not {shown(values)}") from None
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{what} must be finite")
-    return array
-
-
 def common_names(trajectories: Sequence[Trajectory]) -> tuple[list[str], list[str]]:
     """Return the names of the outputs and inputs, which all trajectories must share.
 
@@ -182,12 +160,19 @@ def _signals(what: str, signals: Any, count: int) -> dict[str, FloatArray]:
 
 def _samples(name: str, values: npt.ArrayLike, count: int | None) -> FloatArray:
     """Check and copy one signal; a number is a constant signal."""
-    array = float_array(f"{shown(name)} of a trajectory", values)
+    what = f"{shown(name)} of a trajectory"
+    try:
+        raw = np.asarray(values)
+        if raw.dtype.kind not in "biufO":  # numpy would convert texts and complex numbers
+            raise TypeError
+        array = np.array(raw, np.float64)
+    except ordinary(Exception):  # objects may do anything when numpy looks at them
+        raise ConfigError(f"{what} must be numbers, not {shown(values)}") from None
+    if not np.isfinite(array).all():
+        raise ConfigError(f"{what} must be finite")
     if array.ndim == 0 and count is not None:
         array = np.full(count, array)
     if array.ndim != 1 or count not in (None, len(array)):
         wanted = "(n,)" if count is None else f"({count},)"
-        raise ConfigError(
-            f"{shown(name)} of a trajectory must have the shape {wanted}, not {array.shape}"
-        )
+        raise ConfigError(f"{what} must have the shape {wanted}, not {array.shape}")
     return array

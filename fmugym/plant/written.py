@@ -43,7 +43,7 @@ class Written:
             if alias in known and alias not in plant.tags:
                 raise lacking_tag(alias)
         self._tags = tagged(env, plant, self._inputs)
-        self.actions = Actions(env, self, math.inf)
+        self.actions = Actions(env, self._range_of, math.inf)
         self._own = env._get_inputs
         # the hook of this one environment, whatever its class
         env._get_inputs = self._get_inputs  # type: ignore[method-assign]
@@ -69,14 +69,9 @@ class Written:
         values = self.actions.inputs(action)
         return {alias: float(conversion(values[place])) for place, alias, conversion in self._tags}
 
-    # For ``Actions``.
-
-    def require(self, variable: Variable) -> None:
-        """Refuse an input that no tag tells: what acts would be unknown."""
+    def _range_of(self, variable: Variable) -> float:
+        """How far apart the values of an input are; refuses one that no tag tells."""
         if variable.name not in {self._inputs[place].name for place, *_ in self._tags}:
             raise lacking_tag(variable.name)
-
-    def range_of(self, variable: Variable) -> float:
-        """How far apart its values are, if that is known."""
         width = variable.maximum - variable.minimum
         return width if math.isfinite(width) and width > 0 else 1.0
