@@ -511,8 +511,8 @@ class TestMPC:
             controller = MPC("1h", candidates=36).bind(env.unwrapped)
             controller.reset()
             observation, _ = env.reset(seed=0)
-            for step in range(9):
-                gone[:] = [True] * (3 <= step < 7)
+            for step in range(7):
+                gone[:] = [True] * (2 <= step < 5)
                 action = controller.act(observation)
                 (episode,) = controller._episodes
                 offsets.append(episode.observer.offsets[episode.observer.best])
@@ -520,9 +520,9 @@ class TestMPC:
                 observation, *_ = env.step(action)
             controller.close()
         moved = np.diff(offsets, axis=0)[:, :2] != 0.0
-        assert moved[:, 0].tolist() == [not 3 <= step < 7 for step in range(8)]
+        assert moved[:, 0].tolist() == [not 2 <= step < 5 for step in range(6)]
         assert moved[:, 1].all()
-        grown = np.diff(errors, axis=0)[3:7]
+        grown = np.diff(errors, axis=0)[2:5]
         assert np.all(grown[:, [0, 2]] <= 0.0)
 
 
