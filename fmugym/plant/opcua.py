@@ -68,7 +68,7 @@ class OpcUaClient:
             other = RefusedError(f"its certificate is not that of {shown(pinned)}")
             self._client.certificate_validator = await _only(pinned, other)
         policy = policies.SecurityPolicyBasic256Sha256
-        await self._client.set_security(policy, str(certificate), str(key))
+        await self._client.set_security(policy, _content(certificate), _content(key))
 
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
@@ -137,8 +137,15 @@ async def _only(path: str, other: Exception) -> Callable[[Any, Any], Awaitable[N
     return validate
 
 
+def _content(path: Path) -> Any:
+    """What a file has, read at once: the library leaves files open when a poller is stopped."""
+    crypto = imported("asyncua.crypto.uacrypto", "plant")
+    return crypto.CertProperties(path.read_bytes(), path.suffix.removeprefix("."))
+
+
 async def _certificate_in(path: Path) -> Any:
-    return await imported("asyncua.crypto.uacrypto", "plant").load_certificate(path)
+    load, found = imported("asyncua.crypto.uacrypto", "plant").load_certificate, _content(path)
+    return await load(found.path_or_content, found.extension)
 
 
 def _uri_in(certificate: Any) -> str:
