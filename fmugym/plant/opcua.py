@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -65,8 +66,8 @@ class OpcUaClient:
         self._client.application_uri = _uri_in(own) or self._client.application_uri
         pinned = self._plant.get("server_certificate")
         if pinned is not None:
-            other = RefusedError(f"its certificate is not that of {shown(pinned)}")
-            self._client.certificate_validator = await _only(pinned, other)
+            text = f"its certificate is not that of {shown(pinned)}"
+            self._client.certificate_validator = await _only(pinned, partial(RefusedError, text))
         policy = policies.SecurityPolicyBasic256Sha256
         await self._client.set_security(policy, _content(certificate), _content(key))
 
@@ -126,13 +127,15 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
     return certificate, key
 
 
-async def _only(path: str, other: Exception) -> Callable[[Any, Any], Awaitable[None]]:
+async def _only(
+    path: str, refusal: Callable[[], Exception]
+) -> Callable[[Any, Any], Awaitable[None]]:
     """What takes the certificate in a file, and raises an error at all others."""
     known = await _certificate_in(Path(path))
 
     async def validate(certificate: Any, description: Any) -> None:
         if certificate != known:
-            raise other
+            raise refusal()
 
     return validate
 
@@ -202,7 +205,7 @@ async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
     await server.set_application_uri(uri)
     server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
     if trusted is not None:
-        untrusted = refused(ua.StatusCodes.BadCertificateUntrusted)
+        untrusted = partial(refused, ua.StatusCodes.BadCertificateUntrusted)
         server.set_certificate_validator(await _only(trusted, untrusted))
 
 
