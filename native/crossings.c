@@ -4,7 +4,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "solver.h"
+#include "equations.h"
 
 enum { MOST_GUESSES = 200 }; /* of the time of one event */
 
@@ -44,12 +44,11 @@ static double next_guess(const Solver *me, const Bracket *b, int guesses, double
 /* Goes to a fraction of the step, and reads the indicators there. */
 static Status go_to(Solver *me, double end, double fraction) {
     const double time = me->memory.time;
-    Status status = me->solving->method->between(me, end, fraction, me->found);
+    const Status status = me->solving->method->between(me, end, fraction, me->found);
 
-    if (good(status)) {
-        status = solver_place(me, time + fraction * (end - time), me->found);
-    }
-    return good(status) ? solver_indicators(me, me->found_z) : status;
+    return good(status)
+               ? solver_indicators(me, time + fraction * (end - time), me->found, me->found_z)
+               : status;
 }
 
 static void narrow(Solver *me, Bracket *b, double guess) {

@@ -4,7 +4,7 @@
 #include <math.h>
 #include <string.h>
 
-#include "solver.h"
+#include "equations.h"
 
 static const double ROOT = 0x1p-26; /* of the resolution of doubles; for differences */
 

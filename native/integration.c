@@ -1,11 +1,9 @@
-#include "solver.h"
-
 #include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "log.h"
+#include "equations.h"
 
 enum {
     MOST_UPDATES = 1000,  /* of the discrete states in one event */
@@ -105,7 +103,7 @@ static Status know(Solver *me) {
         status = solver_rates(me, me->memory.time, me->x, me->rates);
     }
     if (good(status) && !me->knows_indicators) {
-        status = solver_indicators(me, me->z);
+        status = solver_indicators_here(me, me->z);
     }
     me->knows_rates = me->knows_indicators = good(status);
     return status;
@@ -305,10 +303,7 @@ static Status leave_zero(Solver *me, double until, double *end, bool *event) {
     for (size_t i = 0; i < me->n; i++) {
         me->next[i] = me->x[i] + (*end - me->memory.time) * me->rates[i];
     }
-    Status status = solver_place(me, *end, me->next);
-    if (good(status)) {
-        status = solver_indicators(me, me->next_z);
-    }
+    const Status status = solver_indicators(me, *end, me->next, me->next_z);
     *event = good(status) && solver_crosses(me, me->z, me->next_z);
     return status;
 }
@@ -318,10 +313,9 @@ static Status take_whole_step(Solver *me, double until, double *end, bool *event
     Status status = take_step(me, until, end);
 
     if (good(status) && me->solving->method->last == 0) {
-        status = solver_place(me, *end, me->next); /* the last stage of the others was there */
-    }
-    if (good(status)) {
-        status = solver_indicators(me, me->next_z);
+        status = solver_indicators(me, *end, me->next, me->next_z);
+    } else if (good(status)) { /* the last stage was there */
+        status = solver_indicators_here(me, me->next_z);
     }
     *event = good(status) && solver_crosses(me, me->z, me->next_z);
     return *event ? solver_locate(me, end) : status;
@@ -386,8 +380,6 @@ Status solver_advance(Solver *me, double until) {
     Memory *memory = &me->memory;
     Status status = STATUS_OK;
 
-    Status (*step)(Solver *, double) = me->model->step != NULL ? step_by_fmu : step_to;
-
     me->events = 0;
     if (memory->mode == IN_EVENTS && !memory->terminated) {
         status = solver_settle(me);
@@ -398,7 +390,8 @@ Status solver_advance(Solver *me, double until) {
         if (is_due(me, until)) {
             status = handle_time_event(me);
         } else if (memory->time < until - resolution(me, until)) {
-            status = step(me, smaller(until, memory->next_event));
+            const double end = smaller(until, memory->next_event);
+            status = me->model->step != NULL ? step_by_fmu(me, end) : step_to(me, end);
         } else {
             memory->time = larger(memory->time, until);
             break;

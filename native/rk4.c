@@ -1,6 +1,6 @@
 /* The classical Runge-Kutta method of order 4. */
 
-#include "solver.h"
+#include "equations.h"
 
 /* Its arrays do not overlap, as those of the next function. That helps the compiler. */
 static void move(size_t n, const double *restrict x, double step, const double *restrict rates,

@@ -106,9 +106,6 @@ Status solver_enter_events(Solver *me);
 /* Integrates to this time, and handles all events until then and at it. */
 Status solver_advance(Solver *me, double until);
 
-/* In equations.c: moves the FMU to a time and state, and reads the event indicators there. */
-Status solver_place(Solver *me, double time, const double *x);
-Status solver_indicators(Solver *me, double *z);
 /* In crossings.c: finds the first crossing in the step that ends at *end. Moves the end and next to just after
  * it. */
 Status solver_locate(Solver *me, double *end);
@@ -122,9 +119,12 @@ static inline bool solver_crosses(const Solver *me, const double *before, const 
     return any;
 }
 
-/* In equations.c. The first logs a message like one of the FMU, and returns an Error. */
+/* In solver.c. Logs a message like one of the FMU, and returns an Error. */
 Status solver_fail(const Solver *me, const char *format, ...);
-void solver_restore_floats(const Solver *me);
+
+static inline void solver_restore_floats(const Solver *me) {
+    floats_restore_if_seen(me->floats);
+}
 
 /* Whether the work goes on. */
 static inline bool good(Status status) {
@@ -139,9 +139,6 @@ static inline double smaller(double a, double b) {
     return b < a ? b : a;
 }
 
-/* The rates at a time and state, and where the FMU is. In equations.c. */
-Status solver_rates(Solver *me, double time, const double *x, double *rates);
-Status solver_rates_here(Solver *me, double *rates);
 /* Fills jacobian, row by row, and slope: the derivatives of the rates by state and time. In
  * differentials.c. */
 Status solver_differentiate(Solver *me, double step);

@@ -3,8 +3,8 @@
 #ifndef FMUGYM_STAGES_H
 #define FMUGYM_STAGES_H
 
+#include "equations.h"
 #include "platform.h"
-#include "solver.h"
 
 /* The sum of the first stages of one state, added in their order. Faster where the compiler knows
  * how many they are. */
