@@ -87,19 +87,10 @@ static size_t work_with_memory(Task *task, size_t begin, size_t end) {
     return troubled;
 }
 
-static size_t work_inside(Task *task, size_t begin, size_t end) {
-    begin_inside(task->pool);
-    const size_t troubled = work_with_memory(task, begin, end);
-    floats_restore(&task->pool->floats);
-    end_inside();
-    return troubled;
-}
-
-/* Works on a chunk, on any thread. */
-static void work(void *context, size_t begin, size_t end) {
-    Task *task = context;
+/* Works on a chunk, on a thread that is inside the pool. */
+static void work(Task *task, size_t begin, size_t end) {
     const uint64_t began = task->measured ? clock_now() : 0;
-    const size_t troubled = work_inside(task, begin, end);
+    const size_t troubled = work_with_memory(task, begin, end);
 
     if (troubled > 0) {
         atomic_add(&task->troubled, troubled);
@@ -151,9 +142,15 @@ typedef struct {
     size_t first;
 } Rest;
 
+/* Any thread may do this. Only the caller's is inside the pool already. */
 static void work_on_rest(void *context, size_t begin, size_t end) {
     const Rest *rest = context;
+    const Pool *pool = rest->task->pool;
+
+    begin_inside(pool);
     work(rest->task, rest->first + begin, rest->first + end);
+    floats_restore(&pool->floats);
+    end_inside();
 }
 
 /* The number of threads worth waking in addition to the caller's. */
