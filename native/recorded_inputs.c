@@ -126,7 +126,7 @@ static double *row_of(Records *r, size_t row) {
     for (; row >= end; block++) {
         end *= 2;
     }
-    if (end * (r->width + 1) > RECORDS_LIMIT / sizeof(double) / r->count) {
+    if (end * (r->width + 1) * r->count > RECORDS_LIMIT / sizeof(double)) {
         return NULL;
     }
     const size_t first = block == 0 ? 0 : end / 2;

@@ -346,12 +346,9 @@ static size_t step_together(Task *task, size_t begin, LineUp *line, Scratch scra
     if (!pool->settings.fmi->exchange(pool->instances[begin].library, &e)) {
         return conclude_steps(task, begin, line, scratch);
     }
-    if (line->others == 0) {
-        memset(pool->settings.status + begin, STATUS_OK, line->count);
-        return 0;
-    }
-    for (size_t i = 0; i < line->count; i++) {
-        pool->settings.status[begin + line->places[i]] = STATUS_OK;
+    int8_t *status = pool->settings.status + begin;
+    for (size_t i = 0; i < e.count; i++) {
+        status[e.places[i]] = STATUS_OK;
     }
     return 0;
 }
@@ -390,22 +387,6 @@ static size_t take_not_small(Task *task, size_t begin, size_t count, double *out
     return troubled;
 }
 
-/* Checks the outputs in the scratch memory, and hands them to whoever wants a copy. */
-static size_t hand_out(Task *task, size_t begin, size_t count, Scratch scratch,
-                       bool *fits_floats) {
-    size_t troubled = 0;
-
-    *fits_floats =
-        all_within(scratch.outputs, count * task->pool->settings.outputs->count, FLOAT32_LIMIT);
-    if (!*fits_floats) {
-        troubled = take_not_small(task, begin, count, scratch.outputs);
-    }
-    if (task->call->observations != NULL) {
-        write_observations(task, begin, count, scratch.outputs);
-    }
-    return troubled;
-}
-
 static void add_offsets(const Turn *turn, size_t width, size_t count, double *outputs) {
     for (size_t j = 0; turn != NULL && turn->offsets != NULL && j < count; j++) {
         for (size_t i = 0; i < width; i++) {
@@ -418,12 +399,21 @@ static void add_offsets(const Turn *turn, size_t width, size_t count, double *ou
  * with so many arguments is a part of its step. */
 static ALWAYS_INLINE size_t advance(Task *task, size_t begin, size_t count, Scratch scratch,
                                     bool *fits_floats) {
+    const size_t width = task->pool->settings.outputs->count;
+
     gather_inputs(task, begin, count, scratch.inputs);
     records_add(task->pool, begin, count, task->call->mask, scratch.inputs);
     scratch.sound = are_finite(scratch.inputs, count * task->pool->settings.inputs->count);
-    const size_t troubled = do_each(task, begin, count, scratch);
-    add_offsets(task->call->turn, task->pool->settings.outputs->count, count, scratch.outputs);
-    return troubled + hand_out(task, begin, count, scratch, fits_floats);
+    size_t troubled = do_each(task, begin, count, scratch);
+    add_offsets(task->call->turn, width, count, scratch.outputs);
+    *fits_floats = all_within(scratch.outputs, count * width, FLOAT32_LIMIT);
+    if (!*fits_floats) {
+        troubled += take_not_small(task, begin, count, scratch.outputs);
+    }
+    if (task->call->observations != NULL) {
+        write_observations(task, begin, count, scratch.outputs);
+    }
+    return troubled;
 }
 
 /* Takes over what other processes have left, as advance leaves it. Their outputs are finite. */
