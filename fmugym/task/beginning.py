@@ -74,17 +74,16 @@ class Beginning(ABC):
     def forget(self) -> None:
         """Let hooks read nothing of earlier episodes, but for the outputs."""
         inside, given = self.env.inside, self.parameters.get
-        none = inside.no_action
-        self.show(step_count=0, action=none, previous_action=none, done=False, after_end=False)
-        self.show_inputs([given(name, start) for name, start in inside.start_inputs])
+        self.clear([given(name, start) for name, start in inside.start_inputs], inside.no_action)
 
     @abstractmethod
-    def show(self, **values: Any) -> None:
-        """Let hooks read values by name, the same in all these environments."""
+    def clear(self, inputs: list[Any], action: Any) -> None:
+        """Let hooks read what there is before the first step.
 
-    @abstractmethod
-    def show_inputs(self, values: list[Any]) -> None:
-        """Let hooks read the inputs: for each a number, or a row of shape (N,)."""
+        Args:
+            inputs: For each a number, or a row of shape (N,).
+            action: Stands for that of a step, the same in all these environments.
+        """
 
     @abstractmethod
     def look(self) -> None:
@@ -129,14 +128,12 @@ class BeginningOfOne(Beginning):
         inside.pictured = None, 0.0
         super().forget()
 
-    def show(self, **values: Any) -> None:
-        """See ``Beginning.show``."""
-        for name, value in values.items():
-            setattr(self._read, name, value)
-
-    def show_inputs(self, values: list[Any]) -> None:
-        """See ``Beginning.show_inputs``."""
-        self._read.inputs = tuple(values)
+    def clear(self, inputs: list[Any], action: Any) -> None:
+        """See ``Beginning.clear``."""
+        read = self._read
+        read.inputs, read.step_count = tuple(inputs), 0
+        read.action = read.previous_action = action
+        read.done = read.after_end = False
 
     def look(self) -> None:
         """See ``Beginning.look``."""

@@ -832,16 +832,14 @@ class _Beginning(Beginning):
         super().__init__(engine.env, draws, indices, values, parameters)
         self._engine = engine
 
-    def show(self, **values: Any) -> None:
-        """See ``Beginning.show``."""
-        for name, value in values.items():
-            rows = getattr(self.env.inside.readings, name)
-            rows[..., self.indices] = np.asarray(value)[..., np.newaxis]
-
-    def show_inputs(self, values: list[Any]) -> None:
-        """See ``Beginning.show_inputs``."""
-        for row, value in zip(self.env.inside.readings.inputs, values, strict=True):
-            row[self.indices] = value[self.indices] if isinstance(value, np.ndarray) else value
+    def clear(self, inputs: list[Any], action: Any) -> None:
+        """See ``Beginning.clear``."""
+        read, own = self.env.inside.readings, self.indices
+        for row, value in zip(read.inputs, inputs, strict=True):
+            row[own] = value[own] if isinstance(value, np.ndarray) else value
+        for row in (read.action, read.previous_action):
+            row[..., own] = np.asarray(action)[..., np.newaxis]
+        read.step_count[own], read.done[own], read.after_end[own] = 0, False, False
 
     def look(self) -> None:
         """See ``Beginning.look``."""
