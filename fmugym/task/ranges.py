@@ -40,7 +40,7 @@ def within(variable: Variable, value: Any) -> Any:
         return value
     low, high = variable.bounds or _range_of_fmu(variable)
     ends = support_of(value) if is_distribution(value) else (value, value)
-    if all(_lies_in(low, end, high) for end in ends):
+    if _lies_in(low, ends[0], high) and _lies_in(low, ends[1], high):
         return value
     unit = "" if variable.unit in (None, "", "1") else f" {variable.unit}"
     text = f"{low} and {high}{unit}, {_GIVEN if variable.bounds else _OF_FMU}"
