@@ -99,6 +99,12 @@ def load(opened):
 
 
 @pytest.fixture
+def make_envs(opened):
+    """Make vector environments that are closed after the test."""
+    return lambda *arguments, **options: opened(fmugym.FMUVectorEnv(*arguments, **options))
+
+
+@pytest.fixture
 def make_env(probe, opened):
     """Make environments over the probe that are closed after the test."""
 

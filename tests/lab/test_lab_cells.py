@@ -4,11 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from lab_tools import (
-    experiment,
-    fixture_lab,  # noqa: F401  # the fixture "lab"
-    track,
-)
+from lab_tools import experiment, track
 from scipy.integrate import solve_ivp
 
 from fmugym import ConfigError
@@ -257,11 +253,6 @@ class TestNetwork:
         both = np.array(times["get"] + times["set"])
         assert np.mean(both > 10.0) == pytest.approx(0.002, abs=0.0015)
         assert both.max() < 55.0
-
-    def test_ideal_calls_take_no_time(self, lab):
-        client, token = experiment(lab)
-        client.get_position(token)
-        assert lab.clock.time() == 0.0
 
 
 class TestSeeds:

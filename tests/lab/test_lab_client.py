@@ -7,13 +7,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from lab_tools import (
-    TOKEN,
-    experiment,
-    fixture_double,  # noqa: F401  # the fixture "double"
-    fixture_lab,  # noqa: F401  # the fixture "lab"
-    fixture_single,  # noqa: F401  # the fixture "single"
-)
+from lab_tools import TOKEN, experiment
 
 import fmugym
 from fmugym import ConfigError, FMUGymError

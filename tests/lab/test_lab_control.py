@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 from combinations import in_turn
-from lab_tools import (
-    experiment,
-    fixture_double,  # noqa: F401  # the fixture "double"
-    fixture_lab,  # noqa: F401  # the fixture "lab"
-    fixture_single,  # noqa: F401  # the fixture "single"
-    track,
-)
+from lab_tools import experiment, track
 
 from fmugym import ConfigError
 from fmugym.lab import Lab, LabError, ManualClock

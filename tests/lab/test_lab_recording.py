@@ -10,12 +10,7 @@ from urllib.request import url2pathname
 import building
 import numpy as np
 import pytest
-from lab_tools import (
-    TOKEN,
-    experiment,
-    fixture_lab,  # noqa: F401  # the fixture "lab"
-    track,
-)
+from lab_tools import TOKEN, experiment, track
 
 from fmugym import ConfigError
 from fmugym.lab import CellType, Client, Lab, LabError, ManualClock, videos
@@ -83,10 +78,6 @@ class TestVideo:
         lab.clock.advance(1.5)
         _, frames = frames_of(path_of(client.stop_episode(token)))
         assert len(frames) == 25
-
-    def test_none_without_record(self, lab):
-        client, token = experiment(lab)
-        assert client.stop_experiment(token) == ""
 
     def test_goes_with_the_lab(self, lab, temp_root):
         path = swing(lab, 0.1)

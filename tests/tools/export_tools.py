@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
 
 import gymnasium
@@ -16,7 +16,7 @@ from fmpy import extract, read_model_description
 from fmpy.fmi2 import FMU2Slave
 from gymnasium import spaces
 
-from fmugym.export import Activation, Layer, Network, Scaling, write_c, write_onnx
+from fmugym.export import Activation, Layer, Network, Scaling, agent_of, write_c, write_onnx
 
 FLAGS = ("-Wall", "-Wextra", "-Wpedantic", "-Werror", "-O2", "-ffp-contract=off")
 COMPILERS = {"C99": ["cc", "-std=c99"], "C++": ["c++", "-std=c++11", "-x", "c++"]}
@@ -73,6 +73,12 @@ TIMES = {
 def made(env_id):
     """A registered environment without wrappers."""
     return gymnasium.make(f"fmugym/{env_id}-v0").unwrapped
+
+
+def agent_named(name="agent", seed=0):
+    """An agent of a cart-pole with random weights."""
+    with closing(made("CartPole")) as env:
+        return agent_of(env, network_for(env, seed=seed), name=name)
 
 
 def differences(env, act, logic, step, steps, plant=None):

@@ -1,10 +1,8 @@
-"""What the tests of the lab share."""
+"""What the tests of the lab do again and again."""
 
 import math
 
-import pytest
-
-from fmugym.lab import Client, Lab, ManualClock
+from fmugym.lab import Client
 
 TOKEN = "a user's token"
 
@@ -22,19 +20,3 @@ def track(lab, client, token, duration, period=0.02, getter="get_position"):
         lab.clock.sleep(begin + tick * period - lab.clock.time())
         readings.append(getattr(client, getter)(token))
     return readings
-
-
-@pytest.fixture(name="lab")
-def fixture_lab():
-    with Lab("ideal", clock=ManualClock(), seed=0) as lab:
-        yield lab
-
-
-@pytest.fixture(name="single")
-def fixture_single(lab):
-    return experiment(lab)
-
-
-@pytest.fixture(name="double")
-def fixture_double(lab):
-    return experiment(lab, "DoublePendulum")

@@ -2,6 +2,7 @@
 
 import datetime
 import decimal
+import enum
 import fractions
 import itertools
 import sys
@@ -64,17 +65,30 @@ class OddText(str):
         raise ZeroDivisionError("this text has no equal")
 
 
+class Whole(int):
+    """An integer of a class of the caller's."""
+
+
+class Colour(enum.Enum):
+    """A choice of the caller's."""
+
+    RED = 1
+
+
 NUMBERS = (
     *(None, True, 0, 0.0, -0.0, -1, 1, 7, -1e-300, 1e-320, 1e308, -1e308, 10**400, -(10**400)),
     *(2**31, 2**63, 2**64, float("nan"), float("inf"), -float("inf"), 1j, Slippery(2.0)),
     *(Slippery("nan"), decimal.Decimal("1.5"), decimal.Decimal("sNaN"), fractions.Fraction(1, 3)),
     *(np.float32(0.1), np.float64("nan"), np.int8(-3), np.uint64(2**64 - 1), np.bool_(True)),
     *(np.datetime64("2020-01-01"), np.timedelta64(1, "s"), datetime.timedelta(seconds=1)),
+    *(2, 3, 2**53 + 1, 10**5000, 0.1, 0.5, 1.5, 1e-9, np.float16(1), np.complex64(1), Whole(2)),
+    *(np.longdouble("1e4000"), decimal.Decimal("1e9999"), fractions.Fraction(10**400)),
 )
 TEXTS = (
     *("", " ", "5", "5 s", "nan", "SimplePendulum", "DoublePendulum", "simplependulum", "None"),
     *("\0", "\ud800", "%s%n{0}", "x" * 5000, "\u200b", "1" * 19, b"5", bytearray(b"5")),
     *(OddText("5"), OddText("SimplePendulum"), "ideal", "hardware", "rgb_array", "../x"),
+    *("tau", "q_0", "q", "rk4", "process", "human", "\u00e4\u4e2d", memoryview(b"1"), Colour.RED),
 )
 GROUPS = (
     *((), [], {}, set(), frozenset([1]), [1], [1.0, 2.0], (None,), [None, None], [[1]], [[]]),
@@ -90,6 +104,30 @@ OTHERS = (
 MAKERS = (
     *(circular, lambda: iter([1.0]), lambda: itertools.repeat(1.0), lambda: [circular()]),
     *(lambda: (1 / 0 for _ in range(2)), lambda: [Unspeakable()], lambda: {"a": Unspeakable()}),
+    lambda: hostile("__repr__"),
+    lambda: hostile("__repr__", "__str__"),
+    lambda: hostile(),
+    lambda: hostile("__float__"),
+    lambda: hostile("__index__"),
+    lambda: hostile("__int__"),
+    lambda: hostile("__array__"),
+    lambda: hostile("__eq__"),
+    lambda: hostile("__bool__"),
+    lambda: hostile("__hash__"),
+    lambda: hostile("__len__"),
+    lambda: hostile("__iter__"),
+    lambda: hostile("__getattr__"),
+    lambda: hostile("__getitem__", "__len__"),
+    lambda: hostile("__fspath__"),
+    lambda: hostile("__deepcopy__"),
+    lambda: hostile("__eq__", "__bool__", "__repr__", "__array__", "__float__", "__len__"),
+    lambda: hostile("__repr__", base=float),
+    lambda: hostile("__float__", base=float),
+    lambda: hostile("__repr__", "__eq__", "__index__", "__float__", base=int),
+    lambda: hostile("__iter__", "__len__", base=list),
+    lambda: hostile("keys", base=dict),
+    lambda: hostile("__iter__", "items", base=dict),
+    lambda: hostile("__hash__", base=str),
 )
 
 

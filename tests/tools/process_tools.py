@@ -165,13 +165,6 @@ def fixture_faulty(tmp_path_factory):
     return faulty_fmu(tmp_path_factory.mktemp("faulty"))
 
 
-@pytest.fixture(name="opened")
-def fixture_opened():
-    """Closes what is entered into it."""
-    with contextlib.ExitStack() as stack:
-        yield lambda closable: stack.enter_context(contextlib.closing(closable))
-
-
 def is_alive(pid):
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

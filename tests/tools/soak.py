@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import gymnasium
 import numpy as np
-from zoo_tools import ZooEnv, parameters, zoo_fmu
+from zoo_tools import ZooEnv, parameters, resident_bytes, zoo_fmu
 
 import fmugym
 from fmugym.archive.bundled import FMI_VERSIONS
@@ -69,11 +69,6 @@ def parent_of_each():
     """The parents of all processes."""
     stats = {int(pid): read(f"/proc/{pid}/stat") for pid in os.listdir("/proc") if pid.isdigit()}
     return {pid: int(text.rpartition(")")[2].split()[1]) for pid, text in stats.items() if text}
-
-
-def resident_bytes(pid):
-    pages = read(f"/proc/{pid}/statm").split()
-    return int(pages[1]) * os.sysconf("SC_PAGE_SIZE") if pages else 0
 
 
 def read(path):

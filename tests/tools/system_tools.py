@@ -102,11 +102,6 @@ def _pendulum(damping):
     return Component("pendulum", bundled_fmu("Pendulum"), starts=starts)
 
 
-def whole_pendulum():
-    """The pendulum with friction, in one part."""
-    return system([_pendulum(FRICTION)], ())
-
-
 def parted_pendulum(linear_path):
     """The same in two parts."""
     damper = linear("damper", linear_path, d=[[-FRICTION, 0], [0, 0]])

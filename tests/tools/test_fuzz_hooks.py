@@ -22,5 +22,5 @@ def test_a_failure_is_reported(monkeypatch):
     assert any("ZeroDivisionError: division by zero" in failure for failure in failures)
     monkeypatch.undo()
     monkeypatch.setattr(BatchEngine, "_handle_faults", lambda *given: None)
-    failures = fuzz_driver.run(fuzz_hooks.program, 200, seed="tests").failures
+    failures = fuzz_driver.run(fuzz_hooks.program, 60, seed="tests", first=400).failures
     assert any(": rewards" in failure for failure in failures)

@@ -253,7 +253,9 @@ def _is_open(descriptor):
     return True
 
 
-def resident_bytes():
-    """The memory of this process."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+def resident_bytes(pid="self"):
+    """The memory of a process; 0 where none is told."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
