@@ -4,9 +4,7 @@ import copy
 import os
 import pickle
 import re
-import resource
 import signal
-from pathlib import Path
 
 import fmu_tools
 import numpy as np
@@ -16,6 +14,7 @@ from hypothesis import settings
 from hypothesis.stateful import run_state_machine_as_test
 from test_snapshot_machine import Machine
 from test_snapshots import ACTIONS, POOLS, Track, play, play_vector, vector_of
+from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import SimulationError
@@ -192,13 +191,8 @@ def test_no_growth_over_many_snapshots(copying):
         kept = [env.save_state() for _ in range(10)]
         for round_ in range(21):
             if round_ == 1:
-                before = resident()
+                before = resident_bytes()
             for _ in range(1000):
                 kept[round_ % 10] = env.save_state()
                 env.restore_state(kept[0])
-        assert resident() - before < 2e6
-
-
-def resident():
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize()
+        assert resident_bytes() - before < 2e6

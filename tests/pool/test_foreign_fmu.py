@@ -95,25 +95,9 @@ def test_what_is_invalid_in_it_does_not_stop(env):
     assert any("variability" in finding for finding in env.fmu.description.findings)
 
 
-def test_spaces(env):
-    assert env.action_space.low.tolist() == [0.0, 0.0, 0.0]
-    assert env.action_space.high.tolist() == [0.5, 1.0, 3.0]
-    assert env.observation_space.shape == (3,)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_contract_of_the_package(env, seed):
     check_fmu_env(env, seed=seed, num_steps=60)
-
-
-def test_an_integer_action_alone(tank_fmu):
-    env = TankEnv(tank_fmu, model_input_names="pump_stage", bounds={"pump_stage": (1, 3)})
-    assert env.action_space.n == 3
-    env.reset(seed=0)
-    env.step(2)
-    assert env.inputs == (3.0,)
-    assert env.out["level"] > 1.0
-    env.close()
 
 
 def test_many_instances_and_lives(tank_fmu):

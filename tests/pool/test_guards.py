@@ -1,7 +1,6 @@
 """Guards in the process, in all pools: finite values, retries, health, leaks."""
 
 import ctypes
-import itertools
 import logging
 import sys
 
@@ -166,20 +165,6 @@ class TestRetries:
         with pytest.raises(ConfigError, match="fault_retries must be an integer from 0 to 10, got"):
             LawfulEnv(lawful[2], fault_retries=count)
 
-    def test_not_of_what_is_real(self, lawful):
-        class Rig:
-            def reset(self, start_values):
-                return {"y": 0.0}
-
-            def step(self, inputs):
-                return {"y": 0.0}, Status.OK
-
-            def stop(self):
-                pass
-
-        with pytest.raises(ConfigError, match="a backend's steps cannot be repeated"):
-            LawfulEnv(lawful[2], fault_retries=1, backend=Rig())
-
 
 class TestHealth:
     @every_version
@@ -287,21 +272,6 @@ class TestLeaks:
         growth = self.play(pool, 16_000, read, leak=3600)
         assert growth > 20 * MB
         assert pool.health()["memory_growth"][0] == pytest.approx(growth, rel=0.1)
-
-    @pytest.mark.parametrize("keeps", [False, True])
-    def test_the_caller_may_take_memory(self, make, caplog, keeps):
-        """Much for a while, or more and more."""
-        pool = make(2, 1, leak_limit=self.LIMIT)
-        kept, counter = [], itertools.count()
-
-        def allocate():
-            if keeps:
-                kept.append(np.ones(self.LEAK // 8))
-            else:
-                kept[:] = [np.ones(2 * MB)] if next(counter) % 100 < 50 else []
-
-        self.play(pool, between=allocate)
-        assert caplog.text == ""
 
     @pytest.mark.parametrize("leak", [{"leak": -LEAK}, {"step_leak": -LEAK / 4, "steps": 4}])
     def test_a_worker_that_leaks_is_replaced(self, make, leak):

@@ -226,10 +226,12 @@ class TestWaiting:
         assert 0.8 <= time.monotonic() - start < 30.0
 
     @pytest.mark.parametrize("options", [{}, {"isolation": "process"}])
-    def test_in_a_reset_of_some_environments(self, folder, licences, other_program, options):
+    def test_in_a_reset_of_some_environments(
+        self, folder, licences, other_program, options, make_envs
+    ):
         licences.limit(2)
         path = make_fmu(folder, "licensed at initialization")
-        envs = fmugym.FMUVectorEnv(
+        envs = make_envs(
             lambda: DemandingEnv(path, reset_method="instance", licence_wait=20), 2, **options
         )
         other_program()
@@ -237,7 +239,6 @@ class TestWaiting:
         for _ in range(3):
             envs.step(np.full((2, 1), 0.5, np.float32))
         assert [state[0] for state in envs.get_attr("state")] == [EXPECTED] * 2
-        envs.close()
 
 
 @pytest.mark.parametrize(

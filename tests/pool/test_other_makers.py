@@ -1,4 +1,7 @@
-"""FMUs that programs of other makers build: every episode equals that of a fresh FMPy instance."""
+"""Every episode equals that of a fresh FMPy instance, wherever and in whatever company FMUs run.
+
+The FMUs are those that programs of other makers build, and a bundled one of each version of FMI.
+"""
 
 import functools
 
@@ -9,19 +12,33 @@ import pytest
 from combinations import in_turn
 
 import fmugym
+from fmugym.archive.bundled import FMI_VERSIONS, bundled_fmu
 
+MADE = makers.MADE | {
+    f"bundled {version}": makers.Made(
+        lambda folder, version=version: bundled_fmu("Pendulum", version),
+        {"tau": 0.1},
+        ("q", "q_dot"),
+        0.02,
+        {"q_0": (0.5, 1.0)},
+    )
+    for version in FMI_VERSIONS
+}
 LENGTHS = (3, 12, 12, 5)
 NUM_ENVS = 3
-WAYS = {"default": {}, "one": {"threads": 1}, "two": {"threads": 2}}
-WAYS["process"] = {"isolation": "process"}
-made = pytest.mark.parametrize("name", makers.MADE)
+WAYS = {
+    **{f"{threads} threads": {"threads": threads} for threads in (1, 2, 3)},
+    "per env": {"hooks": "per_env"},
+    **{f"{n} workers": {"isolation": "process", "workers": n} for n in (1, 2)},
+    "default": {},
+}
 
 
 class MadeEnv(fmugym.FMUEnv):
     """Draws all parameters."""
 
     def __init__(self, path, name, **options):
-        one = makers.MADE[name]
+        one = MADE[name]
         config = {
             "model_input_names": list(one.inputs),
             "model_output_names": one.outputs,
@@ -37,7 +54,7 @@ class MadeEnv(fmugym.FMUEnv):
 
 @pytest.fixture(scope="module")
 def make_fmu(tmp_path_factory):
-    return functools.cache(lambda name: makers.MADE[name].build(tmp_path_factory.mktemp("made")))
+    return functools.cache(lambda name: MADE[name].build(tmp_path_factory.mktemp("made")))
 
 
 @pytest.fixture(autouse=True)
@@ -51,17 +68,17 @@ def actions_of(name, length, index=0):
     """Moving inputs of one environment, shape (steps, inputs)."""
     swing = np.sin(0.9 * np.arange(length) + index)
     columns = [np.rint(abs(swing) * reach) if isinstance(reach, int) else abs(swing) * reach
-               for reach in makers.MADE[name].inputs.values()]  # fmt: skip
+               for reach in MADE[name].inputs.values()]  # fmt: skip
     return np.stack(columns, axis=1).astype(np.float32)
 
 
 def expected(path, name, drawn, length, index=0):
-    one = makers.MADE[name]
+    one = MADE[name]
     rows = [dict(zip(one.inputs, row, strict=True)) for row in actions_of(name, length, index)]
     return fresh.play(path, one.outputs, rows, one.step, drawn)
 
 
-@in_turn({"name": list(makers.MADE), "isolation": ["none", "process"]})
+@in_turn({"name": list(MADE), "isolation": ["none", "process"]})
 def test_single(make_fmu, name, isolation):
     path = make_fmu(name)
     env = MadeEnv(path, name, isolation=isolation)
@@ -76,12 +93,10 @@ def test_single(make_fmu, name, isolation):
     env.close()
 
 
-@in_turn({"name": list(makers.MADE), "way": list(WAYS)})
-def test_vector(make_fmu, name, way):
+@in_turn({"name": list(MADE), "way": list(WAYS)})
+def test_vector(make_fmu, name, way, make_envs):
     path = make_fmu(name)
-    envs = fmugym.FMUVectorEnv(
-        lambda: MadeEnv(path, name), NUM_ENVS, autoreset_mode="Disabled", **WAYS[way]
-    )
+    envs = make_envs(lambda: MadeEnv(path, name), NUM_ENVS, autoreset_mode="Disabled", **WAYS[way])
     envs.reset(seed=7)
     for length in LENGTHS:
         _, infos = envs.reset()
@@ -94,4 +109,3 @@ def test_vector(make_fmu, name, way):
             told = infos.get("drawn", {}).items()
             drawn = {n: values[index] for n, values in told if not n.startswith("_")}
             assert states == expected(path, name, drawn, length, index)
-    envs.close()

@@ -611,13 +611,6 @@ class TestStartValues:
             for text in ("here", "there"):
                 assert caplog.text.count(f"step 1 of {text} is 100%") == 1
 
-    @with_state
-    def test_saved_states_do_not_pile_up(self, make_pool, probe, version):
-        pool = make_pool(probe(version), ["a"], ["live"])
-        for index in range(20):
-            set_up(pool, gain=index // 4)
-        assert step(pool)[0][0, 0] <= 1
-
     @each_pool
     def test_only_the_columns_in_the_mask_are_used(self, make_pool, probe, version):
         pool = make_pool(probe(version), ["a"], ["sum"], 2)

@@ -114,18 +114,3 @@ def test_single(make_env, model, version, interface, isolation):
                 assert not terminated
                 assert not truncated
                 np.testing.assert_allclose(row, exact[index], atol=tolerance(model, interface))
-
-
-@in_turn({"model,version,interface": CASES, "isolation": ["process", "none"]})
-def test_vector(make_env, model, version, interface, isolation):
-    exact = EXACT[model](TIMES)
-    count = 8 if model == "stair" else STEPS  # before it ends
-    envs = fmugym.FMUVectorEnv(lambda: make_env(model, version, interface, isolation), 3)
-    with closing(envs):
-        envs.reset(seed=1)
-        for index in range(count):
-            rows, _, terminated, truncated, _ = envs.step(np.zeros(3, int))
-            assert not terminated.any()
-            assert not truncated.any()
-            expected = np.tile(exact[index], (3, 1))
-            np.testing.assert_allclose(rows, expected, atol=tolerance(model, interface))

@@ -5,7 +5,7 @@ import pytest
 from pool_tools import KINDS, open_pool, start, step
 
 import fmugym
-from fmugym import FMU, ConfigError, FMUVectorEnv, bundled_fmu
+from fmugym import FMU, ConfigError, bundled_fmu
 from fmugym.pool.spec import SAMPLINGS
 
 SUBSTEPS, STEP = 5, 0.1
@@ -79,8 +79,8 @@ class Cart(fmugym.FMUEnv):
         return -abs(self.out["x_dot"])
 
 
-def test_one_environment_equals_those_of_a_vector():
-    env, envs = Cart(), FMUVectorEnv(Cart, 2, hooks="compiled")
+def test_one_environment_equals_those_of_a_vector(make_envs):
+    env, envs = Cart(), make_envs(Cart, 2, hooks="compiled")
     np.testing.assert_array_equal(env.reset(seed=1)[0], envs.reset(seed=1)[0][0])
     for action in np.linspace(-1, 1, 6, dtype=np.float32):
         single = env.step([action])
@@ -88,7 +88,6 @@ def test_one_environment_equals_those_of_a_vector():
         for one, many in zip(single[:4], results[:4], strict=True):
             np.testing.assert_array_equal(one, many[0])
     env.close()
-    envs.close()
 
 
 @pytest.mark.parametrize(
@@ -97,19 +96,3 @@ def test_one_environment_equals_those_of_a_vector():
 def test_mistakes_are_named(samplings, fact):
     with pytest.raises(ConfigError, match=fact):
         Cart(samplings=samplings)
-
-
-class Rig:
-    def reset(self, values):
-        return dict.fromkeys(OUTPUTS, 0.0)
-
-    def step(self, inputs):
-        return dict.fromkeys(OUTPUTS, 0.0)
-
-    def stop(self):
-        """Nothing moves."""
-
-
-def test_a_rig_has_no_substeps():
-    with pytest.raises(ConfigError, match="samplings"):
-        Cart(backend=Rig())

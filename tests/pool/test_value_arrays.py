@@ -1,6 +1,5 @@
 """Arrays in all pools: against closed forms and FMPy."""
 
-import fmpy
 import makers
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from values_tools import (
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv, Uniform
+from fmugym import Choice, ConfigError, Uniform
 from fmugym.series import RecordSeries
 from fmugym.testing import check_fmu_env
 from fmugym.tools import cli
@@ -73,26 +72,6 @@ def test_arrays_follow_the_closed_form(state_space, options):
             assert env.out["der(x)"] == pytest.approx(A @ x + B @ [0.5], abs=1e-7)
             assert observation == pytest.approx(np.append(C @ x + D @ [0.5], x), rel=1e-6)
     env.close()
-
-
-def test_arrays_agree_with_fmpy(state_space):
-    matrix = [[-0.5, 2.0], [-2.0, -0.5]]
-    env = state_space_env(state_space, model_parameters={"A": matrix, "x_0": 1.0})
-    env.reset()
-    rows = [env.out["y"]]
-    for _ in range(5):
-        env.step(np.zeros(1, np.float32))
-        rows.append(env.out["y"])
-    env.close()
-    result = fmpy.simulate_fmu(
-        str(state_space),
-        stop_time=0.5,
-        output_interval=STEP,
-        fmi_type="CoSimulation",
-        start_values={"A": np.ravel(matrix), "x_0": [1, 1]},
-        output=["y"],
-    )
-    assert np.array(rows) == pytest.approx(result["y"], abs=1e-12)
 
 
 @pools
@@ -160,8 +139,8 @@ def test_vector_environments_do_as_single_ones(state_space, options):
     require_same_alone(lambda: state_space_env(state_space, model_parameters=drawn, **options), 3)
 
 
-def test_each_environment_has_its_own_array(state_space):
-    envs = FMUVectorEnv(lambda: state_space_env(state_space, model_parameters={"x_0": 0.0}), 2)
+def test_each_environment_has_its_own_array(state_space, make_envs):
+    envs = make_envs(lambda: state_space_env(state_space, model_parameters={"x_0": 0.0}), 2)
     envs.set_attr("x_0", [[1, 2], [3, 4]])
     envs.set_attr("A[1,2]", [0.5, 0.0])
     assert envs.reset()[0][:, 3:].tolist() == [[1, 2], [3, 4]]
@@ -170,7 +149,6 @@ def test_each_environment_has_its_own_array(state_space):
     assert rows[1, 3] == pytest.approx(3 * np.exp(-STEP), rel=1e-6)
     with pytest.raises(ConfigError, match=r"'x_0'.*\(2,\)"):
         envs.set_attr("x_0", [[1, 2], [3]])
-    envs.close()
 
 
 def test_hooks_on_arrays_of_environments(state_space):
@@ -213,11 +191,11 @@ def test_snapshots(state_space, options):
     env.close()
 
 
-def test_rollouts(state_space):
+def test_rollouts(state_space, make_envs):
     def make():
         return state_space_env(state_space, model_parameters={"A": [[-1, 0.5], [0, -2]]})
 
-    envs, env = FMUVectorEnv(make, 2), make()
+    envs, env = make_envs(make, 2), make()
     env.reset(seed=0)
     start = env.save_state()
     actions = np.random.default_rng(0).uniform(-1, 1, (4, 3, 1)).astype(np.float32)
@@ -229,7 +207,6 @@ def test_rollouts(state_space):
         assert rollout.observations[index].tolist() == rows
     with pytest.raises(ConfigError, match=r"A\[1,1\].*all elements"):
         envs.rollout(start, actions, parameters={"A[1,2]": 0.5})
-    envs.close()
     env.close()
 
 

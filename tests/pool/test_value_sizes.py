@@ -14,7 +14,7 @@ from values_tools import (
 )
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv
+from fmugym import Choice, ConfigError
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +31,9 @@ def larger(steps, u):
 
 
 @in_turn({"options": WAYS, "probe": [None, 60.0]})
-def test_structural_parameters_give_arrays_their_sizes(sized, options, probe):
+def test_structural_parameters_give_arrays_their_sizes(sized, options, probe, make_envs):
     config = {"model_parameters": LARGER, "probe_timeout": probe} | options
-    envs = FMUVectorEnv(lambda: state_space_env(sized, **config), 2)
+    envs = make_envs(lambda: state_space_env(sized, **config), 2)
     env = state_space_env(sized, **config)
     assert env.action_space.shape == (2,)
     assert env.observation_names == ("y[1]", "x[1]", "x[2]", "x[3]")
@@ -47,7 +47,6 @@ def test_structural_parameters_give_arrays_their_sizes(sized, options, probe):
             assert env.state == pytest.approx(larger(steps, u), abs=1e-7)
             assert rows.tolist() == [np.float32(env.state).tolist()] * 2
     env.close()
-    envs.close()
 
 
 def test_a_task_file_gives_sizes(sized, tmp_path):

@@ -15,7 +15,7 @@ from values_tools import (
     versions,
 )
 
-from fmugym import ConfigError, FMUVectorEnv
+from fmugym import ConfigError
 
 LIMITS = {
     "Integer": (-(2**31), 2**31 - 1),
@@ -97,7 +97,7 @@ def test_enumerations_are_discrete(feedthrough, version, options):
 
 
 @in_turn({"version": VERSIONS, "options": POOLS})
-def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options):
+def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options, make_envs):
     path = model_tools.model_fmu(
         tmp_path / "Resource.fmu",
         "resource",
@@ -110,11 +110,10 @@ def test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, options):
     def make():
         return Writing(path, [], model_input_names=[], model_output_names="y", **options)
 
-    envs, env = FMUVectorEnv(make, 2), make()
+    envs, env = make_envs(make, 2), make()
     assert env.reset()[0].tolist() == [42.5]
     assert envs.reset()[0].tolist() == [[42.5]] * 2
     env.close()
-    envs.close()
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from fmugym.fmi import Status
 from fmugym.pool import BackendPool, Paced, PoolSpec
 from fmugym.pool.backend import backend_pool as backend_module
 from fmugym.pool.backend.clocks import ManualClock
-from fmugym.pool.bundle import Bundle
 
 PENDULUM = fmugym.bundled_fmu("Pendulum")
 OMEGA = 3.0  # rad/s
@@ -389,6 +388,18 @@ def test_a_rig_is_recorded(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        ({"fault_retries": 1}, "a backend's steps cannot be repeated"),
+        ({"substeps": 5, "samplings": {"q": "mean"}}, "samplings"),
+    ],
+)
+def test_what_no_rig_can_do(config, text):
+    with pytest.raises(ConfigError, match=text):
+        RigEnv(Oscillator(), **config)
+
+
+@pytest.mark.parametrize(
     ("backend", "text"),
     [
         (object(), "a backend needs the methods reset, step and stop"),
@@ -412,7 +423,7 @@ def test_a_name_chooses_how_the_fmu_is_stepped():
 
 
 class TestVector:
-    def test_rigs_step_at_the_same_time(self):
+    def test_rigs_step_at_the_same_time(self, make_envs):
         """Each step waits for all the others: one after another they would never get past."""
         gate = threading.Barrier(3, timeout=10)
 
@@ -422,12 +433,11 @@ class TestVector:
                 return super().step(inputs)
 
         rigs = [Waiting() for _ in range(3)]
-        env = FMUVectorEnv(lambda: RigEnv(rigs), 3)
+        env = make_envs(lambda: RigEnv(rigs), 3)
         env.reset()
         *_, infos = env.step(np.zeros((3, 1), np.float32))
         assert "fault" not in infos
         assert len(set.union(*(rig.threads for rig in rigs))) == 3
-        env.close()
 
     def test_no_rig_moves_before_the_first_reset(self):
         rigs = [Oscillator(), Oscillator()]
@@ -436,9 +446,9 @@ class TestVector:
         env.close()
         assert [rig.calls for rig in rigs] == [[], []]
 
-    def test_a_fault_of_one_is_no_affair_of_the_others(self):
+    def test_a_fault_of_one_is_no_affair_of_the_others(self, make_envs):
         rigs = [Oscillator(), Failing(OSError("cable out")), Oscillator()]
-        env = FMUVectorEnv(lambda: RigEnv(rigs), 3)
+        env = make_envs(lambda: RigEnv(rigs), 3)
         env.reset()
         for _ in range(3):
             *_, truncated, infos = env.step(np.zeros((3, 1), np.float32))
@@ -448,7 +458,6 @@ class TestVector:
         *_, truncated, infos = env.step(np.zeros((3, 1), np.float32))
         assert not truncated.any()
         assert [rig.calls.count("reset") for rig in rigs] == [1, 2, 1]
-        env.close()
 
     def test_an_interrupt_stops_all(self):
         rigs = [Oscillator(), Failing(KeyboardInterrupt()), Oscillator()]
@@ -498,14 +507,12 @@ def test_hooks_of_several_real_plants(hooks, mode):
 
 class TestPool:
     @pytest.fixture
-    def pool(self):
+    def pool(self, opened):
         fmu = FMU(PENDULUM)
         spec = PoolSpec(
             (fmu.variable("tau"),), tuple(map(fmu.variable, ("q", "q_dot"))), 0.05, num_observed=2
         )
-        pool = BackendPool(fmu, spec, 3, [Oscillator() for _ in range(3)])
-        yield pool
-        pool.close()
+        return opened(BackendPool(fmu, spec, 3, [Oscillator() for _ in range(3)]))
 
     def test_its_own_arrays(self, pool):
         pool.reset((FMU(PENDULUM).variable("q_0"),), np.zeros((1, 3)))
@@ -513,12 +520,6 @@ class TestPool:
         assert pool.step_own() == 0
         np.testing.assert_array_equal(pool.observations, pool.outputs.T.astype(np.float32))
         assert len(set(pool.outputs[1])) == 3
-
-    def test_there_are_no_states(self, pool):
-        with pytest.raises(SimulationError, match="no states that could be saved"):
-            pool.save_instances(np.arange(1))
-        with pytest.raises(SimulationError, match="no states that could be restored"):
-            pool.restore_instances(Bundle(()), np.arange(0), np.arange(0))
 
     def test_closed(self, pool):
         pool.close()
@@ -592,17 +593,16 @@ class TestPacing:
         stamped.close()
 
     @pytest.mark.parametrize("hooks", ["array", "per_env"])
-    def test_info_of_several(self, hooks):
+    def test_info_of_several(self, hooks, make_envs):
         clock = ManualClock()
         rigs = Paced([Oscillator(), Oscillator()], clock)
-        env = FMUVectorEnv(lambda: RigEnv(rigs), 2, hooks=hooks)
+        env = make_envs(lambda: RigEnv(rigs), 2, hooks=hooks)
         env.reset()
         clock.advance(0.5)
         *_, infos = env.step(np.zeros((2, 1), np.float32))
         assert infos["deadline_misses"].tolist() == [1, 1]
         assert infos["worst_lateness"] == pytest.approx([0.4, 0.4])
         assert infos["_sample_age"].all()
-        env.close()
 
     def test_while_nobody_steps_a_rig_holds(self):
         """The thread looks at the clock, which only the test moves."""

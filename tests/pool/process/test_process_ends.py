@@ -14,7 +14,6 @@ from process_tools import (
     INTERRUPTIBLE,
     FaultyEnv,
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
-    fixture_opened,  # noqa: F401  # the fixture "opened"
     is_alive,
     linux_only,
     posix_only,

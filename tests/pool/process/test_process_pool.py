@@ -19,7 +19,6 @@ from process_tools import (
     FaultyEnv,
     faulty_fmu,
     fixture_faulty,  # noqa: F401  # the fixture "faulty"
-    fixture_opened,  # noqa: F401  # the fixture "opened"
     is_alive,
     linux_only,
     no_descriptors_left,
@@ -31,7 +30,7 @@ from process_tools import (
 )
 
 import fmugym
-from fmugym import FMU, ConfigError, FMULoadError, SimulationError, _native, bundled_fmu
+from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.process import guard, launcher
@@ -141,25 +140,6 @@ class TestSingle:
             assert "in a step" in info["fault"] or "for a step" in info["fault"]
             assert cause in info["fault"]
 
-    def test_policies_are_those_of_other_faults(self, make_env):
-        env = make_env("crash", on_fault="terminate", fault_reward=-7)
-        env.reset()
-        env.step([1.0])
-        assert env.step([1.0])[1:4] == (-7.0, True, False)
-        env = make_env("crash", on_fault="raise")
-        env.reset()
-        env.step([1.0])
-        with pytest.raises(SimulationError, match="SIGSEGV"):
-            env.step([1.0])
-
-    def test_a_worker_that_is_killed_between_two_calls(self, make_env):
-        env = make_env()
-        env.reset()
-        os.kill(env.inside.pool.processes()[0], signal.SIGKILL)
-        assert "SIGKILL" in env.step([1.0])[4]["fault"]
-        env.reset()
-        assert not env.step([1.0])[3]
-
     def test_last_words_are_told(self, make_pool, faulty):
         pool = make_pool()
         set_up(pool, faulty, ["crash"], at=1)
@@ -254,13 +234,6 @@ class TestVector:
         assert observations.ravel().tolist() == [0.5, 0.5, 2.0, 2.0]
         assert not truncated.any()
 
-    def test_training_goes_on(self, make_vector_env):
-        env = make_vector_env(3, workers=3)
-        env.set_attr("fault", [start_values(fault)["fault"] for fault in ("crash", "exit", "none")])
-        env.reset()
-        ends = [env.step(np.ones((3, 1)))[3].tolist() for _ in range(9)]
-        assert ends == [[False] * 3, [True, True, False], [False] * 3] * 3
-
     @linux_only
     def test_from_make_vec(self, opened, temp_root):
         options = {"isolation": "process", "workers": 3}
@@ -333,17 +306,6 @@ class TestShortages:
 
 
 class TestOptions:
-    @pytest.mark.parametrize("value", [0, 0.0, -1, np.nan, np.inf, "5", [1.0], 10**400, 1j])
-    def test_call_timeouts_that_are_none(self, make_pool, value):
-        with pytest.raises(ConfigError, match="call_timeout must be"):
-            make_pool(call_timeout=value)
-
-    @pytest.mark.parametrize("name", ["workers", "threads"])
-    @pytest.mark.parametrize("value", [0, -1, 1.5, "2", True])
-    def test_numbers_of_workers_and_threads_that_are_none(self, make_pool, name, value):
-        with pytest.raises(ConfigError, match=f"{name} must be a positive integer, got"):
-            make_pool(**{name: value})
-
     @pytest.mark.parametrize("value", [1e9, 1e308, 10**12, np.float32(50.0), None])
     def test_long_call_timeouts(self, make_pool, faulty, value):
         """They wait that long: the slow answer comes after the first look."""
@@ -395,31 +357,11 @@ class TestPool:
         set_up(pool, faulty, ["none"] * 4)
         assert step(pool)[1].tolist() == [0] * 4
 
-    def test_the_outputs_stay_those_before_the_death(self, make_pool, faulty):
-        pool = make_pool(2)
-        set_up(pool, faulty, ["none", "abort"], at=2)
-        observations = np.full((2, 1), np.nan, np.float32)
-        step(pool)
-        outputs, _ = step(pool, observations=observations)
-        assert outputs[0].tolist() == [1.0, 0.5]
-        assert observations.ravel().tolist() == [1.0, 0.5]
-
     def test_a_skipped_instance_cannot_die(self, make_pool, faulty):
         pool = make_pool(2)
         set_up(pool, faulty, ["crash", "none"], at=1)
         assert step(pool, skip=np.array([True, False]))[1].tolist() == [0, 0]
         assert step(pool)[1].tolist() == [4, 0]
-
-    def test_a_new_process_does_as_the_former_one(self, make_pool, faulty):
-        def rollout(pool):
-            set_up(pool, faulty, ["none"] * 3)
-            return [step(pool, 0.1 * index)[0].tobytes() for index in range(5)]
-
-        pool = make_pool(3)
-        before = rollout(pool)
-        set_up(pool, faulty, ["crash", "none", "abort"], at=1)
-        assert step(pool)[1].any()
-        assert rollout(pool) == before
 
     def test_snapshots_go_with_their_process(self, make_pool, faulty):
         pool = make_pool(2)
@@ -470,14 +412,6 @@ class TestPool:
         set_up(pool, faulty, ["none"])
         assert step(pool)[0][0].tolist() == [0.5]
 
-    def test_after_close(self, make_pool):
-        pool = make_pool()
-        pids = pool.processes()
-        pool.close()
-        assert not any(map(is_alive, pids))
-        with pytest.raises(SimulationError, match="the pool is closed"):
-            pool.step_own()
-
     def test_several_at_once(self, make_pool, faulty):
         first, second = make_pool(2), make_pool(3)
         set_up(first, faulty, ["none"] * 2)
@@ -511,30 +445,6 @@ class TestPool:
         assert [die() for _ in range(10)] == [first] * 10
 
 
-@posix_only
-def test_a_worker_does_as_a_pool_in_this_process(make_pool, faulty):
-    here = make_pool(3, isolation="none")
-    pool = make_pool(3)
-    with pytest.raises(SimulationError):
-        pool.save()  # before the first reset
-    for one in (here, pool):
-        set_up(one, faulty, ["none"] * 3)
-        step(one, 1.0)
-        snapshot = one.save()
-        step(one, 2.0, skip=np.array([False, True, False]))
-        one.restore(snapshot, np.array([False, False, True]))
-        one.inputs[:] = 4.0
-        assert one.step_own() == 0
-        del snapshot
-        step(one, np.inf)
-    np.testing.assert_array_equal(pool.outputs, here.outputs)
-    np.testing.assert_array_equal(pool.statuses, here.statuses)
-    np.testing.assert_array_equal(pool.observations, here.observations)
-    assert all(pool.failure(index).endswith("u = inf") for index in range(3))
-    variables = (FMU(faulty).variable("u"), FMU(faulty).variable("y"))
-    np.testing.assert_array_equal(pool.read(variables), here.read(variables))
-
-
 class TestChoice:
     """An FMU whose second instance fails, though it has a copy of the library."""
 
@@ -565,25 +475,3 @@ class TestChoice:
     def test_with_isolation_asked_for(self, make_pool, tmp_path):
         path = faulty_fmu(tmp_path, "{lonely}")
         assert len(make_pool(2, path, workers=None).processes()) == 2
-
-
-def test_the_bundled_fmus_run_in_processes(opened):
-    """With what a user passes to a single environment of a class of his own."""
-
-    class Pole(fmugym.FMI2CSEnv):
-        def __init__(self):
-            config = {
-                "model_input_names": "f",
-                "model_output_names": ["x", "theta"],
-                "time_step": 0.02,
-                "isolation": "process",
-            }
-            super().__init__(bundled_fmu("CartPole"), config)
-
-        def _is_done(self):
-            return abs(self.state[1]) > 1.0
-
-    env = opened(Pole())
-    env.reset()
-    assert env.step([1.0])[0].shape == (2,)
-    assert env.read_variables("x").keys() == {"x"}
