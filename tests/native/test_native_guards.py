@@ -14,7 +14,6 @@ from process_tools import run_python
 from program_tools import DISCRETE, code, uniform_draws
 from test_native_pool import LOG, make, on_linux
 
-import fmugym
 from fmugym import FMU, SimulationError, _native, bundled_fmu
 from fmugym.envs import CartPoleEnv
 from fmugym.fmi import Status
@@ -77,18 +76,14 @@ class TestArrays:
         ):
             counting_in(counts)
 
-    def test_actions_that_are_not_aligned(self):
-        with_these, with_others = (
-            fmugym.FMUVectorEnv(CartPoleEnv, 6, hooks="compiled") for _ in range(2)
-        )
+    def test_actions_that_are_not_aligned(self, make_envs):
+        with_these, with_others = (make_envs(CartPoleEnv, 6, hooks="compiled") for _ in range(2))
         actions = misaligned(6, np.int64)
         actions[:] = [0, 1, 0, 1, 1, 0]
         for envs in (with_these, with_others):
             envs.reset(seed=0)
         expected = with_others.step(actions.copy())[0]
         np.testing.assert_array_equal(with_these.step(actions)[0], expected)
-        with_these.close()
-        with_others.close()
 
 
 @pytest.fixture(name="pool")

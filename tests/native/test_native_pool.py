@@ -6,13 +6,13 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import building
 import fmu_tools
 import numpy as np
 import pytest
 from plants import ONCE
+from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
@@ -20,7 +20,6 @@ from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
-from fmugym.trial import opening
 from fmugym.trial.trial import compare
 from fmugym.trial.verdict import Neighbours
 
@@ -49,17 +48,9 @@ def make(cls, path, inputs, outputs, count=1, time_step=0.05, **options):
 
 
 @pytest.fixture
-def native():
+def native(opened):
     """Make native pools that are closed after the test."""
-    made = []
-
-    def build(*args, **options):
-        made.append(make(NativePool, *args, **options))
-        return made[-1]
-
-    yield build
-    for pool in made:
-        pool.close()
+    return lambda *args, **options: opened(make(NativePool, *args, **options))
 
 
 def busy_xml(flags=""):
@@ -205,18 +196,6 @@ def test_one_pool_on_several_threads_takes_turns():
 
 
 class TestFastWay:
-    def test_own_arrays(self, native):
-        pool, other = (native(bundled_fmu("CartPole"), ["f"], ["x", "theta"], 5) for _ in range(2))
-        values = np.linspace(1.4, 1.7, 5)[None]
-        for each in (pool, other):
-            each.reset((each.variable("theta_0"),), values)
-        inputs = np.arange(5.0)[None]
-        pool.inputs[:] = inputs
-        assert pool.step_own() == 0
-        outputs, _ = other.step(inputs)
-        np.testing.assert_array_equal(pool.outputs, outputs)
-        np.testing.assert_array_equal(pool.observations, outputs.T.astype(np.float32))
-
     def test_arguments_are_used_where_they_are(self, native):
         pool = native(bundled_fmu("CartPole"), ["f"], ["x"], 5)
         pool.reset((), np.zeros((0, 5)))
@@ -315,26 +294,6 @@ def test_too_many_messages_at_once(native, probe, caplog):
     assert "too many" in caplog.records[-1].getMessage()
 
 
-def test_a_failing_receiver_does_not_break_the_pool(probe):
-    """Its exception comes out, as from any call of ``logging``; the step was done."""
-
-    class Failing(logging.Handler):
-        def emit(self, record):
-            raise RuntimeError("no")
-
-    log = logging.Logger("failing")
-    log.addHandler(Failing())
-    fmu = FMU(probe())
-    spec = PoolSpec((), (fmu.variable("steps"),), 0.1)
-    pool = NativePool(fmu, spec, 1, log)
-    pool.reset((fmu.variable("log_status"),), np.ones((1, 1)))
-    for count in (1, 2):
-        with pytest.raises(RuntimeError, match="no"):
-            pool.step()
-        assert pool.outputs.tolist() == [[count]]
-    pool.close()
-
-
 # Initial states
 
 
@@ -419,7 +378,9 @@ class TestIsolation:
         assert not disturb(FMU(busy))
         assert list(temp_root.iterdir()) == []
 
-    def test_vector_environments_give_private_libraries_by_themselves(self, shared, caplog):
+    def test_vector_environments_give_private_libraries_by_themselves(
+        self, shared, caplog, make_envs
+    ):
         class Counting(fmugym.FMUEnv):
             def __init__(self):
                 config = {"model_input_names": "work", "model_output_names": "total"}
@@ -429,7 +390,7 @@ class TestIsolation:
             def _is_done(self):
                 return False
 
-        envs = fmugym.FMUVectorEnv(Counting, 3, hooks="per_env")  # a probe would count too
+        envs = make_envs(Counting, 3, hooks="per_env")  # a probe would count too
         assert "disturb each other" in caplog.text
         single = Counting()
         single.reset()
@@ -437,7 +398,6 @@ class TestIsolation:
         for work in (0.0, 1.0, 2.0):
             alone = single.step(work)[0].tolist()
             assert envs.step(np.full((3, 1), work, np.float32))[0].tolist() == [alone] * 3
-        envs.close()
         single.close()
 
     @pytest.mark.parametrize(("model", "version"), BUNDLED)
@@ -452,11 +412,6 @@ class TestIsolation:
 
 
 # Memory
-
-
-def resident_bytes():
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 @on_linux
@@ -518,10 +473,3 @@ def test_pools_live_and_die_apart(temp_root):
 
 
 # Choice
-
-
-def test_auto_takes_the_native_pool(probe):
-    fmu = FMU(probe())
-    pool = opening.make_pool(fmu, PoolSpec((), (), 1.0), 1, LOG)
-    assert isinstance(pool, NativePool)
-    pool.close()
