@@ -18,11 +18,9 @@ from system_tools import (
     compiled,  # noqa: F401  # the fixture "fmus"
     linear,
     masses,
-    parted_pendulum,
     play,
     system,
     tank,
-    whole_pendulum,
 )
 
 import fmugym
@@ -237,14 +235,6 @@ class TestLoops:
             else:
                 assert outputs[0, 0] == pytest.approx(1 / (1 - 6))
 
-    def test_are_solved_before_the_first_step(self, make, fmus):
-        plan = loop_of_gains(fmus, Loop())
-        pool = make(plan, ["a.u2"], ["a.y1", "b.y1"])
-        start = (pool.variable("a.u2"),)
-        outputs, statuses = pool.reset(start, np.array([[2.6]]))
-        assert not statuses.any()
-        assert outputs[:, 0] == pytest.approx([2.0, -1.2])
-
     def test_repeat_the_dynamics_from_the_beginning_of_the_step(self, make, fmus):
         """The coupled masses as a loop: what both compute agrees with what both got."""
         plan = masses([fmus[2], fmus[3]])
@@ -254,20 +244,6 @@ class TestLoops:
         rows = play(make(plan, (), outputs, time_step=0.05), 20)
         assert np.allclose(rows[1:, :2], rows[1:, 2:4], rtol=0, atol=1e-11)
         assert np.allclose(rows[1:, 4], rows[1:, 5], rtol=0, atol=1e-11)
-
-
-@by_each_master
-def test_the_pendulum_in_two_parts_comes_near_the_whole(make, fmus, master):
-    errors, plans = [], (whole_pendulum(), replace(parted_pendulum(fmus[2]), master=master))
-    for count in (100, 200, 400):
-        rows = [
-            play(make(plan, (), ["pendulum.theta_dot"], time_step=1.0 / count), count)
-            for plan in plans
-        ]
-        errors.append(np.abs(rows[0] - rows[1]).max())
-    assert np.abs(rows[0]).max() > 1.0
-    assert errors[0] / errors[1] == pytest.approx(2.0, rel=0.1)
-    assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.05)
 
 
 def test_jacobi_steps_are_those_of_the_container_of_fmpy(make, tmp_path):
@@ -313,14 +289,6 @@ class TestValues:
         outputs, _ = pool.step(np.array([[3.0]]))
         assert outputs[:, 0] == pytest.approx([0.6, 29.0 + 35.0])
 
-    def test_start_values_win_over_those_of_the_plan(self, make):
-        pool = make(pendulums(), (), ["a.q", "b.q"], time_step=0.02)
-        assert play(pool, 0)[0] == pytest.approx([0.3, 0.6])
-        outputs, _ = pool.reset((pool.variable("b.q_0"),), np.array([[1.5]]))
-        assert outputs[:, 0] == pytest.approx([0.3, 1.5])
-        outputs, _ = pool.reset(*NO_START)
-        assert outputs[:, 0] == pytest.approx([0.3, 0.6])
-
     def test_types_are_converted_by_each_component(self, make, tmp_path):
         """A Real drives an Integer and a Boolean; Enumerations of FMI 2.0 and 3.0 are read."""
         probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
@@ -338,12 +306,6 @@ class TestValues:
         rows = play(pool, 2, np.array([[[1.0], [2.0], [5.0]]] * 2))
         assert rows[-1, 2:].tolist() == [2.0, 5.0]
         assert rows[-1, 1] == 1.0
-
-    def test_a_driven_input_is_none_of_the_system(self, fmus):
-        description = SystemFMU(masses([fmus[2], fmus[2]])).description
-        assert not description.variable("first.u1").settable_in_step
-        assert description.variable("first.u2").settable_in_step
-        assert not description.variable("second.u1").settable_at_start
 
     def test_capabilities_are_those_of_all(self, fmus):
         able = SystemFMU(masses([fmus[2], fmus[2]])).description.capabilities
@@ -412,18 +374,6 @@ class TestFaults:
         broken = fmu_tools.write_fmu(tmp_path / "broken.fmu", files)
         with pytest.raises(FMULoadError, match=r"component 'second'.*broken\.fmu"):
             make(masses([fmus[2], broken]))
-
-    def test_messages_name_the_component(self, make, tmp_path, caplog):
-        probes = [fmu_tools.probe_fmu(tmp_path, v) for v in (2, 3)]
-        parts = tuple(Component(n, p) for n, p in zip(("one", "two"), probes, strict=True))
-        plan = SystemPlan("talk", parts, groups=(Group(("one",)), Group(("two",))))
-        pool = make(plan, (), ["one.sum"], 2)
-        start = (pool.variable("two.log_status"),)
-        pool.reset(start, np.array([[-1.0, 1.0]]))
-        pool.step()
-        said = [r.getMessage() for r in caplog.records if "talk_" in r.getMessage()]
-        assert said
-        assert all("talk_1.two" in text for text in said)
 
 
 # States

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 import ssp_tools
 from fmu_tools import PlainEnv
-from vector_tools import require_same_alone
 
 import fmugym
-from fmugym import Component, ConfigError, FMUSystem, FMUVectorEnv, TaskError, bundled_fmu
+from fmugym import Component, ConfigError, FMUSystem, TaskError, bundled_fmu
 from fmugym.identification import Trajectory, fit_parameters
 from fmugym.linearization import linearize
 from fmugym.systems.placing import picture_of
@@ -147,29 +146,11 @@ class TestEnvironments:
         options = {"model_parameters": {"west.T_m_0": 295.0}}
         assert env.reset(seed=0, options=options)[0][1] > first[1] + 2
 
-    def test_a_vector_environment_gives_what_single_ones_give(self, archive):
-        require_same_alone(lambda: TwoHouses(archive), 5)
-
     def test_the_checks_of_any_environment(self):
         check_fmu_env(TwoHouses(two_houses()))
 
-    def test_a_snapshot_returns_all_components(self):
-        env = TwoHouses(two_houses())
-        env.reset(seed=0)
-        actions = [np.array([step % 2, 4.0 - step]) for step in range(8)]
-        for action in actions[:3]:
-            env.step(action)
-        snapshot = env.save_state()
-        first = [env.step(action)[0].tolist() for action in actions]
-        env.restore_state(snapshot)
-        assert [env.step(action)[0].tolist() for action in actions] == first
-        other = TwoHouses(two_houses())
-        other.reset(seed=9)
-        other.restore_state(snapshot)
-        assert [other.step(action)[0].tolist() for action in actions] == first
-
-    def test_rollouts_from_a_snapshot_are_what_steps_give(self):
-        env, planner = TwoHouses(two_houses()), FMUVectorEnv(lambda: TwoHouses(two_houses()), 3)
+    def test_rollouts_from_a_snapshot_are_what_steps_give(self, make_envs):
+        env, planner = TwoHouses(two_houses()), make_envs(lambda: TwoHouses(two_houses()), 3)
         planner.reset(seed=1)
         env.reset(seed=0)
         env.step(np.array([1.0, 0.0]))
@@ -180,7 +161,6 @@ class TestEnvironments:
             env.restore_state(snapshot)
             seen = [env.step(action)[0] for action in actions[candidate]]
             assert np.array_equal(found.observations[candidate], seen)
-        planner.close()
 
     def test_parameters_of_a_component_are_identified(self):
         """The data are of a house of 140 m2; the default is 150."""
@@ -256,16 +236,9 @@ class TestTaskFiles:
     @pytest.mark.parametrize(
         ("old", "new", "facts"),
         [
-            (
-                '"outside -> east.T_out"',
-                '"outside -> eest.T_out"',
-                ["system", "eest", "did you mean"],
-            ),
-            ("T_m_0 = 290.0", "T_m_1 = 290.0", ["system", "T_m_1", "T_m_0"]),
             ("gain = 0.1", "gian = 0.1", ["connections", "gian", "gain"]),
             ("gain = 0.1", 'gain = "much"', ["gain", "much"]),
             ('source = "east.Q_em", ', "", ["source"]),
-            ('step_size = "60s"', 'step = "60s"', ["step", "step_size"]),
             ('step_size = "60s"', 'step_size = "soon"', ["step_size", "soon"]),
             ('step_size = "60s"', 'master = "jacob"', ["jacobi"]),
             ('{ bundled = "House" }\nwest', '"none.fmu"\nwest', ["east", "none.fmu"]),

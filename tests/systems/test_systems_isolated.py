@@ -235,23 +235,6 @@ class TestResults:
         assert sorted(told[0]) == sorted(told[1])
 
 
-class Telling(fmu_tools.PlainEnv):
-    """Reads a text that an FMU gives."""
-
-    def __init__(self, source):
-        config = {
-            "model_input_names": ["f.Float64_in"],
-            "model_output_names": ["f.Float64_out"],
-            "model_parameters": {
-                "f.String_parameter": fmugym.Choice(["short", "", "a longer one"])
-            },
-            "monitor_names": ["f.String_told"],
-            "time_step": 0.1,
-            "bounds": {"f.Float64_in": (-1, 1), "f.Float64_out": (-1, 1)},
-        }
-        super().__init__(source, config)
-
-
 class Chain(fmugym.FMUEnv):
     """Pushes the first pendulum of a chain."""
 
@@ -286,19 +269,6 @@ def episodes(env, seed=3):
 
 
 class TestEnvironments:
-    def test_hooks_read_texts(self, tmp_path):
-        path = values_tools.feedthrough_fmu(tmp_path / "F.fmu", 3)
-        told = []
-        for isolate in (False, True):
-            source = FMUSystem({"f": Component(path, isolate=isolate)})
-            with contextlib.closing(Telling(source)) as env:
-                for seed in range(4):
-                    env.reset(seed=seed)
-                    env.step(env.action_space.sample())
-                    told.append(env.out["f.String_told"])
-        assert len(set(told)) > 1
-        assert told[:4] == told[4:]
-
     def test_a_vector_environment(self):
         results = []
         for isolate in (False, True):

@@ -3,17 +3,13 @@
 from contextlib import closing
 from types import SimpleNamespace
 
-import fmpy
-import fmpy.model_description as md
 import numpy as np
 import pytest
 import system_tools
 from combinations import in_turn
-from fmpy.container_fmu import config
-from fmpy.container_fmu.cli import create_container_fmu
 from pool_tools import open_pool, start, step
 
-from fmugym import FMU, Component, Connection, FMUSystem, bundled_fmu
+from fmugym import FMU, Component, FMUSystem, bundled_fmu
 
 HOUSE, PENDULUM = bundled_fmu("House"), bundled_fmu("Pendulum")
 FRICTION = 4e-4  # N m s / rad, the default of the bundled pendulum
@@ -130,91 +126,3 @@ class TestAgainstOneModel:
         assert errors[-1] < 0.2  # kelvin; the water cools by 15
         assert errors[1] / errors[2] == pytest.approx(2.0, rel=0.25)
         assert errors[2] / errors[3] == pytest.approx(2.0, rel=0.2)
-
-    def test_the_loop_of_the_house(self, linear):
-        """Air and heat agree at the start and after each step, by both methods."""
-        start = played(HOUSE, ["T_air", "Q_em"], DAY, 24)[0]
-        found = []
-        for loops in ("newton", "fixed_point"):
-            system = house_in_parts(linear, "gauss_seidel", loops)
-            assert len(system.order.loops) == 1
-            rows = played(system, ["building.y1", "water.y1"], DAY, 24, 2)
-            assert rows[0] == pytest.approx(start, rel=1e-7)
-            found.append(rows)
-        assert found[0] == pytest.approx(found[1], rel=1e-6)
-
-
-def write_container(folder, step_size, connections, starts):
-    """Write FMPy's container of two pendulums of FMI 3.0.
-
-    Args:
-        folder: Where to write it.
-        step_size: In seconds.
-        connections: ``(component, output, component, input)``, components by their numbers.
-        starts: The start value of q of each.
-    """
-    parts = []
-    for name in ("a", "b"):
-        path = folder / f"{name}.fmu"
-        path.write_bytes(bundled_fmu("Pendulum", "3.0").read_bytes())
-        parts.append(config.Component(name, path, fmpy.read_model_description(str(path))))
-    own = [{v.name: v for v in part.modelDescription.modelVariables} for part in parts]
-    kind = {"type": "Float64", "causality": "output", "variability": "continuous"}
-    kind["initial"] = "calculated"
-    fixed = kind | {"causality": "parameter", "variability": "fixed", "initial": "exact"}
-    time = kind | {"causality": "independent", "initial": None}
-    variables, mappings = [md.ModelVariable(name="time", **time)], {}
-    for number, part in enumerate(parts):
-        for name, more in (("q_0", fixed | {"start": str(starts[number])}), ("q", kind)):
-            variable = md.ModelVariable(name=f"{part.name}.{name}", **more)
-            variables.append(variable)
-            mappings[variable] = [(part, own[number][name])]
-    outputs = [md.Unknown(variable=v) for v in variables if v.causality == "output"]
-    description = md.ModelDescription(
-        fmiVersion="3.0",
-        modelName="container",
-        instantiationToken="{container}",
-        coSimulation=md.CoSimulation("container_fmu", fixedInternalStepSize=step_size),
-        modelVariables=variables,
-        outputs=outputs,
-        initialUnknowns=outputs,
-    )
-    links = [
-        config.Connection(parts[i], [own[i][output]], parts[k], [own[k][name]])
-        for i, output, k, name in connections
-    ]
-    (folder / "unpacked").mkdir()
-    create_container_fmu(
-        config.Configuration(False, description, parts, links, mappings),
-        folder / "unpacked",
-        folder / "container.fmu",
-    )
-    return folder / "container.fmu"
-
-
-def test_jacobi_steps_are_those_of_the_container_of_fmpy(tmp_path):
-    """Its container exchanges all values, then steps all components."""
-    starts = (0.5, -0.3)
-    wires = [(0, "theta_dot", 1, "tau"), (1, "theta_dot", 0, "tau")]
-    container = write_container(tmp_path, 0.01, wires, starts)
-    rows = fmpy.simulate_fmu(
-        str(container),
-        stop_time=1.0,
-        step_size=0.01,
-        output_interval=0.01,
-        output=["a.q", "b.q"],
-        validate=False,
-    )
-    theirs = np.array([[row["a.q"], row["b.q"]] for row in rows])
-    assert np.ptp(theirs, axis=0).min() > 0.5  # they swing
-    pendulum = bundled_fmu("Pendulum", "3.0")
-    system = FMUSystem(
-        {n: Component(pendulum, {"q_0": q}) for n, q in zip("ab", starts, strict=True)},
-        [
-            Connection("a.theta_dot", "b.tau", convert_units=False),
-            Connection("b.theta_dot", "a.tau", convert_units=False),
-        ],
-        master="jacobi",
-    )
-    ours = played(system, ["a.q", "b.q"], 1.0, 100)
-    assert theirs == pytest.approx(ours, rel=1e-12, abs=1e-12)

@@ -11,7 +11,7 @@ from system_tools import (
     play,
 )
 
-from fmugym import Component, ConfigError, Connection, FMUSystem, FMUVectorEnv
+from fmugym import Component, ConfigError, Connection, FMUSystem
 from fmugym.tools import cli
 
 VERSIONS = (1, 2, 3)
@@ -81,13 +81,12 @@ def test_one_parameter_of_the_system_is_that_of_several(fmus):
     env.close()
 
 
-def test_vector_environments_have_them(fmus):
-    envs = FMUVectorEnv(lambda: Env(labelled(fmus, b="b"), label="the same"), 3)
+def test_vector_environments_have_them(fmus, make_envs):
+    envs = make_envs(lambda: Env(labelled(fmus, b="b"), label="the same"), 3)
     observations, _ = envs.reset()
     assert observations.tolist() == [[8.0, 1.0, 8.0]] * 3
     observations, *_ = envs.step(np.zeros(3, int))
     assert observations.tolist() == [[8.0, 1.0, 8.0]] * 3
-    envs.close()
 
 
 @pytest.mark.parametrize(
