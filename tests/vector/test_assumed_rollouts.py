@@ -306,21 +306,11 @@ def test_costs_that_are_not_told_are_zero():
     envs.close()
 
 
-def test_costs_are_told_beside_the_five_parts_of_the_result():
-    task = spinning() | {"costs": {"effort": "abs(push)"}}
-    envs = environments(task)
-    found = envs.rollout(root(task)[0], pushes())
-    _, rewards, _, _, _ = found
-    assert rewards is found.rewards
-    assert found.costs["effort"] == pytest.approx(np.abs(pushes()[..., 0]), rel=1e-6)
-    envs.close()
-
-
 @pytest.mark.parametrize("way", WAYS)
-def test_present_episodes_and_their_streams_go_on_as_before(way):
+def test_present_episodes_and_their_streams_go_on_as_before(way, make_envs):
     task = spinning(noise=0.5)
     make = partial(fmugym.load, task)
-    envs, others = (fmugym.FMUVectorEnv(make, 2, **WAYS[way]) for _ in range(2))
+    envs, others = (make_envs(make, 2, **WAYS[way]) for _ in range(2))
     for both in (envs, others):
         both.reset(seed=1)
         both.step([[0.001]] * 2)
@@ -332,5 +322,3 @@ def test_present_episodes_and_their_streams_go_on_as_before(way):
         step, same = envs.step([[0.001]] * 2), others.step([[0.001]] * 2)
         assert step[0].tolist() == same[0].tolist()
         assert step[1].tolist() == same[1].tolist()
-    envs.close()
-    others.close()

@@ -7,7 +7,6 @@ from combinations import in_turn
 from fmu_tools import PlainEnv, probe_config
 from test_snapshots import Track, vector_of
 
-import fmugym
 from fmugym import ConfigError, SimulationError
 from fmugym.envs import CartPoleEnv, PendulumEnv
 
@@ -66,18 +65,15 @@ class TestValues:
             "mode": ["Disabled", "NextStep", "SameStep"],
         }
     )
-    def test_are_those_of_single_environments(self, way, version, mode):
+    def test_are_those_of_single_environments(self, way, version, mode, make_envs):
         env = halfway(fmi_version=version)
-        envs = fmugym.FMUVectorEnv(
-            lambda: Track(fmi_version=version), 3, autoreset_mode=mode, **way
-        )
+        envs = make_envs(lambda: Track(fmi_version=version), 3, autoreset_mode=mode, **way)
         snapshot, actions = env.save_state(), actions_for(env)
         found = envs.rollout(snapshot, actions)
         assert rows_of(found) == one_by_one(env, snapshot, actions)
         assert found.lengths.tolist() == [7] * N  # the limit of 12 steps
         assert found.observations.shape == (N, HORIZON, 2)
         env.close()
-        envs.close()
 
     @in_turn({"threads": [1, 2], "cls": [CartPoleEnv, PendulumEnv]})
     def test_of_many_candidates_in_several_rounds(self, cls, threads):

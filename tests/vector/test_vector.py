@@ -10,13 +10,10 @@ from vector_tools import (
     fixture_outside,  # noqa: F401  # the fixture "outside"
     in_each_mode,
     require_equal,
-    require_pair_equal,
     results_of_both,
     run_side_by_side,
     sampled_actions,
 )
-
-import fmugym
 
 
 @in_each_mode({"env_id": IDS})
@@ -32,11 +29,6 @@ def test_each_environment_is_what_it_is_alone(env_id, mode, hooks, outside):
     rtol = 1e-7 if "Pendulum" in env_id else 0.0  # numpy's powers of arrays and of scalars
     assert run_side_by_side(ours, theirs, 120, rtol=rtol) >= 20
     assert hooks != "auto" or not outside, "the pool starts all episodes"
-
-
-@pytest.mark.parametrize("fmi_version", ["1.0", "3.0"])
-def test_other_fmi_versions(fmi_version):
-    assert require_pair_equal(fmugym.envs.CartPoleEnv, 100, fmi_version=fmi_version) > 5
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
@@ -99,26 +91,6 @@ def test_equal_to_gymnasiums_cart_poles_over_many_episodes(mode):
         assert ends > 120
     ours.close()
     theirs.close()
-
-
-def test_thousands_of_environments_equal_single_ones():
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=4096)
-    first, _ = vector.reset(seed=5)
-    chosen = (0, 499, 4095)
-    singles = [gym.make("fmugym/CartPole-v0") for _ in chosen]
-    for single, index in zip(singles, chosen, strict=True):
-        assert single.reset(seed=5 + index)[0].tolist() == first[index].tolist()
-    ended = np.zeros(4096, bool)
-    for actions in sampled_actions(vector, 40):
-        observations, *_ = result = vector.step(actions)
-        for single, index in zip(singles, chosen, strict=True):
-            alone = single.reset()[0] if ended[index] else single.step(actions[index])[0]
-            assert alone.tolist() == observations[index].tolist()
-        ended = result[2] | result[3]
-    assert ended.any()
-    vector.close()
-    for single in singles:
-        single.close()
 
 
 @each_way

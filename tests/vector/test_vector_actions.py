@@ -17,7 +17,6 @@ from vector_tools import (
 )
 
 from fmugym import ConfigError
-from fmugym.vector import FMUVectorEnv
 
 
 def test_actions_may_be_lists_and_any_integers():
@@ -57,20 +56,18 @@ def test_a_bad_action_is_forgotten():
 
 
 @each_way
-def test_an_action_that_does_not_fit_changes_nothing(hooks):
-    vector = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
+def test_an_action_that_does_not_fit_changes_nothing(hooks, make_envs):
+    vector = make_envs(CART_POLE, 3, hooks=hooks)
     first = vector.reset(seed=0)[0]
     with pytest.raises(ConfigError, match=r"environment 2.* is not in Discrete"):
         vector.step(np.array([0, 1, 7]))
     assert vector.get_attr("step_count") == (0, 0, 0)
     assert vector.get_attr("action") == (0, 0, 0)
     np.testing.assert_array_equal(np.array(vector.get_attr("state"), np.float32), first)
-    twin = FMUVectorEnv(CART_POLE, 3, hooks=hooks)
+    twin = make_envs(CART_POLE, 3, hooks=hooks)
     twin.reset(seed=0)
     for actions in sampled_actions(vector, 20):
         require_equal(vector.step(actions)[0], twin.step(actions)[0])
-    vector.close()
-    twin.close()
 
 
 @in_turn({"hooks": HOOKS, "env_id": ["fmugym/CartPole-v0", "fmugym/Pendulum-v0"]})
@@ -93,13 +90,12 @@ def test_actions_of_environments_about_to_be_reset_are_checked_too(env_id, hooks
 
 
 @each_way
-def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks):
+def test_a_nan_is_refused_even_where_no_hook_reads_it(hooks, make_envs):
     class Uninterested(Drawing):
         def _get_inputs(self):
             return 0.0 * self.step_count
 
-    vector = FMUVectorEnv(Uninterested, 2, hooks=hooks)
+    vector = make_envs(Uninterested, 2, hooks=hooks)
     vector.reset(seed=0)
     with pytest.raises(ConfigError, match="environment 1"):
         vector.step(np.array([[0.0], [np.nan]], np.float32))
-    vector.close()

@@ -6,19 +6,17 @@ from combinations import in_turn
 from vector_tools import HOOKS, Drawing, each_way, sampled_actions
 
 from fmugym import ConfigError, SimulationError
-from fmugym.vector import FMUVectorEnv
 
 
-def test_the_first_reset_is_of_all():
-    vector = FMUVectorEnv(Drawing, 2)
+def test_the_first_reset_is_of_all(make_envs):
+    vector = make_envs(Drawing, 2)
     with pytest.raises(ConfigError, match="first reset must be of all"):
         vector.reset(options={"reset_mask": np.array([True, False])})
-    vector.close()
 
 
 @each_way
-def test_disabled_autoreset_wants_a_reset(hooks):
-    vector = FMUVectorEnv(Drawing, 2, autoreset_mode="disabled", hooks=hooks)
+def test_disabled_autoreset_wants_a_reset(hooks, make_envs):
+    vector = make_envs(Drawing, 2, autoreset_mode="disabled", hooks=hooks)
     vector.reset(seed=0)
     actions = sampled_actions(vector, 4)
     for action in actions[:3]:
@@ -30,12 +28,11 @@ def test_disabled_autoreset_wants_a_reset(hooks):
         vector.step(actions[3])
     vector.reset(options={"reset_mask": np.array([False, True])})
     vector.step(actions[3])
-    vector.close()
 
 
 @in_turn({"own,given,expected": [(3, None, 3), (8, 4, 4), (2, 9, 2)], "hooks": HOOKS})
-def test_truncation_at_the_smaller_limit(own, given, expected, hooks):
-    vector = FMUVectorEnv(
+def test_truncation_at_the_smaller_limit(own, given, expected, hooks, make_envs):
+    vector = make_envs(
         lambda: Drawing(max_episode_steps=own),
         3,
         max_episode_steps=given,
@@ -46,13 +43,12 @@ def test_truncation_at_the_smaller_limit(own, given, expected, hooks):
         said = [vector.step(action)[3].tolist() for action in sampled_actions(vector, expected)]
         assert said == [[False] * 3] * (expected - 1) + [[True] * 3]
         vector.step(sampled_actions(vector, 1)[0])
-    vector.close()
 
 
 @each_way
-def test_the_reset_step_does_not_step_the_fmu(hooks, make_env):
+def test_the_reset_step_does_not_step_the_fmu(hooks, make_env, make_envs):
     """The probe FMU counts its steps."""
-    vector = FMUVectorEnv(
+    vector = make_envs(
         lambda: make_env(model_output_names=["steps", "sum"], max_episode_steps=2),
         2,
         hooks=hooks,
@@ -65,4 +61,3 @@ def test_the_reset_step_does_not_step_the_fmu(hooks, make_env):
         rewards.append(reward[1])
     assert counts == [1, 2, 0, 1, 2, 0, 1]
     assert rewards == [1, 1, 0, 1, 1, 0, 1]
-    vector.close()

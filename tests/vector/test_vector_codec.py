@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from vector_tools import require_equal, require_same_infos
+from vector_tools import require_same_infos
 
 from fmugym import ConfigError
-from fmugym.vector.codec import coded, gathered, handed_out, with_masks
+from fmugym.vector.codec import gathered, handed_out
 
 COUNT = 4
 NUMBERS = st.integers(-100, 100) | st.floats(-1e6, 1e6) | st.booleans()
@@ -62,24 +62,6 @@ def require_equal_parts(value, expected):
             require_equal_parts(value[name], expected[name])
     else:
         np.testing.assert_array_equal(value, expected)
-
-
-def test_rows_make_the_same_infos_as_single_environments():
-    mask = np.array([True, False, True, False])
-    rows = {"x": np.arange(4.0), "inner": {"y": np.arange(8).reshape(4, 2)}}
-    single = {i: {"x": float(i), "inner": {"y": rows["inner"]["y"][i]}} for i in (0, 2)}
-    ours, theirs = coded(rows, mask), gathered(single, COUNT)
-    assert list(ours) == list(theirs)
-    require_same_infos(ours, theirs)
-    require_equal(ours["x"], np.array([0.0, 0.0, 2.0, 0.0]))
-    assert ours["_x"] is not ours["_inner"]
-
-
-def test_objects_are_none_outside_of_the_mask():
-    texts = np.array(["a", "b"], object)
-    mask = np.array([False, True])
-    assert coded({"text": texts}, mask)["text"].tolist() == [None, "b"]
-    assert with_masks({"text": texts}, mask)["text"] is texts
 
 
 @pytest.mark.parametrize(

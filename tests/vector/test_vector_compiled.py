@@ -105,10 +105,10 @@ CHANGES = {
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step"])
 @pytest.mark.parametrize("change", CHANGES)
-def test_compiled_hooks_after_a_change(change, mode, outside):
+def test_compiled_hooks_after_a_change(change, mode, outside, make_envs):
     """Once the episodes from before have ended, the pool starts the next ones as before."""
     ours, theirs = (
-        FMUVectorEnv(CART_POLE, 3, hooks=hooks, max_episode_steps=12, autoreset_mode=mode)
+        make_envs(CART_POLE, 3, hooks=hooks, max_episode_steps=12, autoreset_mode=mode)
         for hooks in ("compiled", "per_env")
     )
     for count, _ in enumerate(results_of_both(ours, theirs, 60)):
@@ -120,8 +120,6 @@ def test_compiled_hooks_after_a_change(change, mode, outside):
         if count == 58:
             already = len(outside)
     assert len(outside) == already < 30
-    ours.close()
-    theirs.close()
 
 
 @pytest.mark.usefixtures("handler")

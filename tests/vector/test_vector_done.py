@@ -105,15 +105,14 @@ def test_snapshots_have_done(hooks):
 
 
 @each_kind
-def test_rollouts_leave_done(hooks):
-    envs = FMUVectorEnv(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
+def test_rollouts_leave_done(hooks, make_envs):
+    envs = make_envs(CART_POLE, 4, autoreset_mode=AutoresetMode.DISABLED, hooks=hooks)
     envs.reset(seed=0)
     while not any(done := envs.get_attr("done")):
         envs.step(np.ones(4, np.int64))
     candidate = envs.save_state(int(np.argmin(done)))
     envs.rollout(candidate, np.ones((8, 30), np.int64))
     assert envs.get_attr("done") == done
-    envs.close()
 
 
 @each_kind

@@ -22,7 +22,6 @@ from vector_tools import (
 )
 
 from fmugym import SimulationError
-from fmugym.vector import FMUVectorEnv
 
 
 def require_same_reasons(first, second):
@@ -51,19 +50,18 @@ def test_faults_are_those_of_single_environments(cls, on_fault, mode, hooks):
 
 
 @in_turn({"hooks": HOOKS, "cls": [Cart, PushedCart]})
-def test_a_fault_may_be_raised(cls, hooks):
-    vector = FMUVectorEnv(lambda: cls(on_fault="raise"), 3, hooks=hooks)
+def test_a_fault_may_be_raised(cls, hooks, make_envs):
+    vector = make_envs(lambda: cls(on_fault="raise"), 3, hooks=hooks)
     vector.reset(seed=0)
     fine, absurd = ([0.5], [ABSURD]) if cls is Cart else (0, 1)
     with pytest.raises(SimulationError, match="returned Discard"):
         vector.step(np.array([fine, absurd, fine]))
     vector.reset(seed=0)
     assert np.isfinite(vector.step(np.array([fine] * 3))[0]).all()
-    vector.close()
 
 
 @in_turn({"hooks": HOOKS, "version": [2, 3]})
-def test_an_fmu_may_ask_for_the_end(version, hooks, probe):
+def test_an_fmu_may_ask_for_the_end(version, hooks, probe, make_envs):
     """The one whose parameters say so stops in its third step."""
 
     class Stopping(fmu_tools.PlainEnv):
@@ -78,26 +76,24 @@ def test_an_fmu_may_ask_for_the_end(version, hooks, probe):
         require_same_infos(*({k: v for k, v in one.items() if "fmu" in k} for one in infos))
 
     stop = {"fault": 6, "fault_step": 3}
-    vector = FMUVectorEnv(Stopping, 3, hooks="compiled" if hooks == "auto" else hooks)
+    vector = make_envs(Stopping, 3, hooks="compiled" if hooks == "auto" else hooks)
     for name, value in stop.items():
         vector.set_attr(name, [0, value, 0])
     theirs = SyncVectorEnv([Stopping, lambda: Stopping(**stop), Stopping])
     results = results_of_both(vector, theirs, 10, same_infos=require_same_wishes)
     ends = np.array([result[2] for result in results])
     assert np.argwhere(ends).tolist() == [[2, 1], [6, 1]]
-    vector.close()
     theirs.close()
 
 
 @each_way
-def test_a_start_that_fails_is_an_error(hooks, make_env):
-    vector = FMUVectorEnv(make_env, 2, hooks=hooks)
+def test_a_start_that_fails_is_an_error(hooks, make_env, make_envs):
+    vector = make_envs(make_env, 2, hooks=hooks)
     vector.reset()
     with pytest.raises(SimulationError, match="init"):
         vector.reset(options={"model_parameters": {"init_status": 3}})
     vector.reset()
     vector.step(np.zeros((2, 1), np.float32))
-    vector.close()
 
 
 class Rewarding(Drawing):
@@ -138,13 +134,12 @@ def test_numbers_that_are_not_finite_are_faults_as_in_single_environments(on_fau
 
 
 @each_way
-def test_a_number_that_is_not_finite_may_be_raised(hooks):
-    vector = FMUVectorEnv(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks)
+def test_a_number_that_is_not_finite_may_be_raised(hooks, make_envs):
+    vector = make_envs(lambda: Rewarding(on_fault="raise"), 9, hooks=hooks)
     vector.reset(seed=1)
     actions = sampled_actions(vector, 12)
     with pytest.raises(SimulationError, match=r"environment \d: (_reward_policy returned|the obs)"):
         list(map(vector.step, actions))
-    vector.close()
 
 
 class Overflowing(Drawing):
@@ -156,9 +151,9 @@ class Overflowing(Drawing):
 
 
 @each_way
-def test_an_observation_that_overflows_is_a_fault(hooks):
+def test_an_observation_that_overflows_is_a_fault(hooks, make_envs):
     logging.getLogger("fmugym.Overflowing").setLevel(logging.CRITICAL)
-    vector = FMUVectorEnv(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks)
+    vector = make_envs(lambda: Overflowing(max_episode_steps=9), 5, hooks=hooks)
     vector.reset(seed=1)
     faults = 0
     for actions in sampled_actions(vector, 30):
@@ -166,19 +161,17 @@ def test_an_observation_that_overflows_is_a_fault(hooks):
         assert np.isfinite(observations).all()
         faults += int(infos["_fault"].sum()) if "_fault" in infos else 0
     assert faults > 5
-    vector.close()
 
 
 @each_way
-def test_a_first_observation_that_is_not_finite(hooks):
+def test_a_first_observation_that_is_not_finite(hooks, make_envs):
     class Blind(Drawing):
         def _get_observation(self):
             return np.array(self.state) / (0.0 * self.step_count + 0.0)
 
-    vector = FMUVectorEnv(Blind, 2, hooks=hooks)
+    vector = make_envs(Blind, 2, hooks=hooks)
     with (
         np.errstate(all="ignore"),
         pytest.raises(SimulationError, match="the first observation"),
     ):
         vector.reset()
-    vector.close()

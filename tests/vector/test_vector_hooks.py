@@ -4,7 +4,6 @@ import fmu_tools
 import numpy as np
 import pytest
 from combinations import in_turn
-from gymnasium.vector import AutoresetMode
 from vector_tools import (
     CART_POLE,
     HOOKS,
@@ -22,7 +21,6 @@ from vector_tools import (
 import fmugym
 from fmugym import ConfigError, SimulationError, Uniform
 from fmugym.pool.native import NativePool
-from fmugym.vector import FMUVectorEnv
 
 
 @each_way
@@ -59,13 +57,12 @@ def test_tasks(cls, hooks):
 
 
 @each_way
-def test_the_rewards_of_goals(hooks):
-    vector = FMUVectorEnv(Reaching, 3, hooks=hooks)
+def test_the_rewards_of_goals(hooks, make_envs):
+    vector = make_envs(Reaching, 3, hooks=hooks)
     vector.reset(seed=0)
     observations, rewards, *_, infos = vector.step(sampled_actions(vector, 1)[0])
     goals = observations["achieved_goal"], observations["desired_goal"]
     assert vector.call("compute_reward", *goals, infos)[0].tolist() == rewards.tolist()
-    vector.close()
 
 
 @pytest.mark.parametrize("hooks", ["array", "auto"])
@@ -96,13 +93,12 @@ def test_types_of_inputs_and_outputs(config, hooks, probe):
     require_pair_equal(Typed, steps=30, hooks=way)
 
 
-def test_discrete_observations(make_env):
+def test_discrete_observations(make_env, make_envs):
     """The default hook looks a value up, which takes one environment at a time."""
-    vector = FMUVectorEnv(lambda: make_env(model_output_names="mode_out"), 3)
+    vector = make_envs(lambda: make_env(model_output_names="mode_out"), 3)
     observations, _ = vector.reset()
     assert observations.dtype == np.int64
     assert observations.tolist() == [0, 0, 0]
-    vector.close()
 
 
 MISTAKES = [
@@ -121,22 +117,10 @@ MISTAKES = [
 
 
 @in_turn({"hook,value,error,text": MISTAKES, "hooks": HOOKS})
-def test_mistakes_in_hooks(hook, value, error, text, hooks):
-    vector = FMUVectorEnv(type("Mistaken", (Drawing,), {hook: value}), 2, hooks=hooks)
+def test_mistakes_in_hooks(hook, value, error, text, hooks, make_envs):
+    vector = make_envs(type("Mistaken", (Drawing,), {hook: value}), 2, hooks=hooks)
     with pytest.raises(error, match=text):
         vector.reset(seed=0), vector.step(np.zeros((2, 1), np.float32))
-    vector.close()
-
-
-class OwnStep(CART_POLE):
-    """Its hooks branch, and its ``step`` does more than the inherited one."""
-
-    def _is_done(self):
-        return True if abs(self.out["x"]) > 0.1 else super()._is_done()
-
-    def step(self, action):
-        *result, info = super().step(action)
-        return *result, info | {"force": self.inputs[0]}
 
 
 class Branching(CART_POLE):
@@ -144,17 +128,11 @@ class Branching(CART_POLE):
         return True if abs(self.out["x"]) > 0.1 else super()._is_done()
 
 
-@in_turn({"mode": list(AutoresetMode), "cls": [OwnStep, Branching]})
-def test_hooks_that_branch(cls, mode):
-    assert require_pair_equal(cls, mode=mode, hooks="per_env") > 5
-
-
-def test_fmus_step_together_whatever_the_hooks_are(monkeypatch):
-    vector = FMUVectorEnv(Branching, 5, hooks="per_env")
+def test_fmus_step_together_whatever_the_hooks_are(monkeypatch, make_envs):
+    vector = make_envs(Branching, 5, hooks="per_env")
     vector.reset(seed=0)
     calls, step = [], NativePool.step
     monkeypatch.setattr(NativePool, "step", lambda *given: calls.append(1) or step(*given))
     for actions in sampled_actions(vector, 30):
         vector.step(actions)
     assert len(calls) == 30
-    vector.close()

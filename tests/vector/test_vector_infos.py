@@ -81,8 +81,8 @@ def require_zero_outside_of_masks(infos):
 
 
 @in_each_mode({"cls": [Remembering, CART_POLE]})
-def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks):
-    vector = FMUVectorEnv(cls, 4, autoreset_mode=mode, hooks=hooks)
+def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks, make_envs):
+    vector = make_envs(cls, 4, autoreset_mode=mode, hooks=hooks)
     require_zero_outside_of_masks(vector.reset(seed=0)[1])
     told = 0
     for actions in sampled_actions(vector, 40):
@@ -94,15 +94,12 @@ def test_infos_are_zero_outside_of_their_masks(cls, mode, hooks):
         require_zero_outside_of_masks(infos)
         told += "drawn" in infos and not infos["_drawn"].all()
     assert told > 0
-    vector.close()
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_infos_that_are_first_read_after_later_steps(mode):
+def test_infos_that_are_first_read_after_later_steps(mode, make_envs):
     """The arrays of drawn values and of last observations serve only until an episode starts."""
-    at_once, later = (
-        FMUVectorEnv(fmugym.envs.CartPoleEnv, 6, autoreset_mode=mode) for _ in range(2)
-    )
+    at_once, later = (make_envs(fmugym.envs.CartPoleEnv, 6, autoreset_mode=mode) for _ in range(2))
     at_once.reset(seed=5)
     later.reset(seed=5)
     read, kept = [], []
@@ -112,5 +109,3 @@ def test_infos_that_are_first_read_after_later_steps(mode):
     assert sum("drawn" in infos for infos in kept) > 5
     for one, other in zip(read, kept, strict=True):
         assert pickle.dumps(dict(other)) == one
-    at_once.close()
-    later.close()

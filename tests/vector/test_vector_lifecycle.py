@@ -114,12 +114,11 @@ class Locked(CART_POLE):
         self.lock = lock
 
 
-def test_what_cannot_be_pickled_is_named():
-    env = FMUVectorEnv(functools.partial(Locked, threading.Lock()), 2)
+def test_what_cannot_be_pickled_is_named(make_envs):
+    env = make_envs(functools.partial(Locked, threading.Lock()), 2)
     with pytest.raises(ConfigError, match=r"cannot be pickled: .*lock.*make_env"):
         pickle.dumps(env)
     copy.copy(env).close()
-    env.close()
 
 
 def test_vector_entry_points_pickle():

@@ -52,14 +52,11 @@ def test_environments_that_differ_in_more_than_values_are_refused(changes, what)
         FMUVectorEnv(lambda: Drawing(**next(given)), 3, hooks="per_env")
 
 
-def test_they_may_differ_in_values():
+def test_they_may_differ_in_values(make_envs):
     given = iter([0.1, 0.2, 0.3])
-    vector = FMUVectorEnv(
-        lambda: Drawing(model_parameters={"q_0": next(given)}), 3, hooks="per_env"
-    )
+    vector = make_envs(lambda: Drawing(model_parameters={"q_0": next(given)}), 3, hooks="per_env")
     observations, _ = vector.reset(seed=1)
     np.testing.assert_allclose(observations[:, 0], [0.1, 0.2, 0.3], rtol=1e-6)
-    vector.close()
 
 
 class WithHelper(Drawing):
@@ -108,7 +105,7 @@ def test_constructors_may_make_and_use_environments(cls, hooks):
 
 
 @pytest.mark.parametrize("hooks", ["array", "per_env"])
-def test_make_env_may_use_another_thread(hooks):
+def test_make_env_may_use_another_thread(hooks, make_envs):
     def make():
         made = []
         thread = threading.Thread(target=lambda: made.append(Drawing()))
@@ -116,10 +113,9 @@ def test_make_env_may_use_another_thread(hooks):
         thread.join()
         return made[0]
 
-    vector = FMUVectorEnv(make, 3, hooks=hooks)
+    vector = make_envs(make, 3, hooks=hooks)
     assert vector.reset(seed=1)[0].shape == (3, 2)
     vector.step(NOTHING)
-    vector.close()
 
 
 def test_all_are_closed(temp_root):
@@ -174,9 +170,11 @@ class Failing(Drawing):
 
 
 @in_turn({"mode": ["next_step", "same_step", "disabled"], "hooks": ["array", "per_env"]})
-def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, monkeypatch):
+def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(
+    hooks, mode, monkeypatch, make_envs
+):
     monkeypatch.setattr("fmugym.vector.choosing.find_difference", lambda env: None)
-    vector = FMUVectorEnv(Failing, 3, hooks=hooks, autoreset_mode=mode)
+    vector = make_envs(Failing, 3, hooks=hooks, autoreset_mode=mode)
     first = vector.reset(seed=1)[0]
     vector.step(NOTHING)
     with pytest.raises(ZeroDivisionError):
@@ -188,7 +186,6 @@ def test_an_exception_of_a_hook_after_the_step_ends_all_episodes(hooks, mode, mo
         vector.reset(options={"reset_mask": np.array([True, False, True])})
     require_equal(vector.reset(seed=1)[0], first)
     vector.step(NOTHING)
-    vector.close()
 
 
 class FailingEarly(Drawing):
@@ -199,26 +196,12 @@ class FailingEarly(Drawing):
 
 
 @pytest.mark.parametrize("hooks", ["array", "per_env"])
-def test_an_exception_before_the_step_leaves_the_episodes(hooks):
-    vector, twin = (FMUVectorEnv(FailingEarly, 3, hooks=hooks) for _ in range(2))
+def test_an_exception_before_the_step_leaves_the_episodes(hooks, make_envs):
+    vector, twin = (make_envs(FailingEarly, 3, hooks=hooks) for _ in range(2))
     vector.reset(seed=1), twin.reset(seed=1)
     with pytest.raises(ZeroDivisionError):
         vector.step(np.array([[0.0], [0.006], [0.0]], np.float32))
     require_equal(vector.step(NOTHING)[0], twin.step(NOTHING)[0])
-    vector.close()
-    twin.close()
-
-
-def test_the_single_environments_are_marked_as_ended():
-    vector = FMUVectorEnv(Failing, 3, hooks="per_env")
-    vector.reset(seed=1)
-    vector.step(NOTHING)
-    with pytest.raises(ZeroDivisionError):
-        vector.step(NOTHING)
-    assert all(inside.ended for inside in vector.get_attr("inside"))
-    vector.reset(seed=1)
-    assert not any(inside.ended for inside in vector.get_attr("inside"))
-    vector.close()
 
 
 def test_bundled_ids_take_any_number():

@@ -242,14 +242,13 @@ def test_parameters_given_before_count():
     second.close()
 
 
-def test_options_that_give_no_parameter():
+def test_options_that_give_no_parameter(make_envs):
     """The FMU gets no start value at all."""
-    envs = FMUVectorEnv(lambda: Drawing(model_parameters={}), 2)
+    envs = make_envs(lambda: Drawing(model_parameters={}), 2)
     usual, _ = envs.reset(seed=1)
     observations, infos = envs.reset(seed=1, options={"model_parameters": {}})
     assert observations.tolist() == usual.tolist()
     assert infos["drawn"] == {}
-    envs.close()
 
 
 class Dividing(Drawing):

@@ -160,15 +160,14 @@ def test_checks_and_traces_leave_nothing_in_the_users_objects(hooks):
 
 
 @pytest.mark.parametrize("hooks", ["array", "per_env"])
-def test_methods_that_were_read_before_read_the_present_values(hooks):
-    vector = FMUVectorEnv(WithCost, 3, hooks=hooks)
+def test_methods_that_were_read_before_read_the_present_values(hooks, make_envs):
+    vector = make_envs(WithCost, 3, hooks=hooks)
     vector.reset(seed=2)
     methods = vector.get_attr("_reward_policy")
     vector.step(np.zeros((3, 1), np.float32))
     expected = [-state[0] * state[0] for state in vector.get_attr("state")]
     assert [method() for method in methods] == expected
     assert list(vector.call("cost")) == [-value for value in expected]
-    vector.close()
 
 
 class TestContents:
@@ -227,9 +226,9 @@ class TestContents:
         env.close()
 
 
-def test_observations_of_one_environment_after_another_are_new_arrays():
+def test_observations_of_one_environment_after_another_are_new_arrays(make_envs):
     """A caller may write to what a step has returned, and reset some environments afterwards."""
-    envs = FMUVectorEnv(Drawing, 3, hooks="per_env", autoreset_mode="disabled")
+    envs = make_envs(Drawing, 3, hooks="per_env", autoreset_mode="disabled")
     envs.reset(seed=0)
     observations = envs.step(envs.action_space.sample())[0]
     before = observations.copy()
@@ -238,7 +237,6 @@ def test_observations_of_one_environment_after_another_are_new_arrays():
     np.testing.assert_array_equal(again[[0, 2]], before[[0, 2]])
     assert (again[1] != before[1]).all()
     assert (np.abs(again) < 2.0).all()
-    envs.close()
 
 
 class LowPass:
@@ -280,18 +278,17 @@ class Stepping(Drawing):
 
 
 @pytest.mark.parametrize("task", [SharedFilter, Recording, Stepping])
-def test_making_a_vector_environment_leaves_nothing_outside_of_it(task):
+def test_making_a_vector_environment_leaves_nothing_outside_of_it(task, make_envs):
     FILTER.value, globals()["STEPS"] = 0.25, 0
-    envs = FMUVectorEnv(task, 3)
+    make_envs(task, 3)
     assert (FILTER.value, RECORD, STEPS) == (0.25, [], 0)
-    envs.close()
 
 
 @pytest.mark.parametrize("task", [SharedFilter, Stepping])
-def test_what_all_environments_share_is_found(task):
+def test_what_all_environments_share_is_found(task, make_envs):
     with pytest.raises(ConfigError, match="_reward_policy changes"):
         FMUVectorEnv(task, 3, hooks="array")
-    envs = FMUVectorEnv(task, 3)
+    envs = make_envs(task, 3)
     envs.reset(seed=0)
     before = FILTER.value
     rewards = envs.step(np.zeros((3, 1), np.float32))[1]
@@ -300,7 +297,6 @@ def test_what_all_environments_share_is_found(task):
     for state in envs.get_attr("state"):
         expected += 0.1 * (state[0] - expected)
     assert task is Stepping or FILTER.value == rewards[-1] == expected
-    envs.close()
 
 
 DATA = {"large": np.zeros(100_000), "small": np.zeros(3), "many": [[0.0] for _ in range(5000)]}

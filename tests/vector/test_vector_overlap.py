@@ -201,7 +201,7 @@ def test_a_fork_has_no_step_under_way(envs):
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
-def test_the_fmus_step_while_the_caller_runs(tmp_path):
+def test_the_fmus_step_while_the_caller_runs(tmp_path, make_envs):
     """The caller's own code runs before the step, which is long, has ended."""
 
     class Busy(fmugym.FMI2CSEnv):
@@ -222,10 +222,9 @@ def test_the_fmus_step_while_the_caller_runs(tmp_path):
         def _is_done(self):
             return self.state[0] < 0
 
-    envs = FMUVectorEnv(Busy, 1)
+    envs = make_envs(Busy, 1)
     envs.reset(seed=0)
     envs.step_async(np.ones(1, np.int64))
     with pytest.raises(StepTimeoutError):
         envs.step_wait(timeout=0.001)
     assert envs.step_wait()[0].tolist() == [[1.0]]
-    envs.close()

@@ -101,10 +101,10 @@ class Limited(PushedCart):
         super().__init__(max_episode_steps=3, on_fault="truncate", fault_reward=-7.0)
 
 
-def test_faults_beside_regular_ends():
+def test_faults_beside_regular_ends(make_envs):
     """An episode that ends by a fault keeps its last observation and its reason."""
     ours, theirs = (
-        FMUVectorEnv(Limited, 6, autoreset_mode=SAME_STEP, hooks=hooks)
+        make_envs(Limited, 6, autoreset_mode=SAME_STEP, hooks=hooks)
         for hooks in ("compiled", "per_env")
     )
     rng, both = np.random.default_rng(0), 0
@@ -113,8 +113,6 @@ def test_faults_beside_regular_ends():
         ended, faulty = result[2] | result[3], result[1] == -7.0
         both += bool(faulty.any() and (ended & ~faulty).any())
     assert both > 2
-    ours.close()
-    theirs.close()
 
 
 class Wide(Drawing):
@@ -142,13 +140,12 @@ def too_wide(seed, episode):
 
 
 @pytest.mark.parametrize("mode", [SAME_STEP, DISABLED], ids=lambda mode: mode.name)
-def test_a_first_observation_that_is_not_finite(mode):
-    envs = FMUVectorEnv(Wide, 1, hooks="compiled", autoreset_mode=mode)
+def test_a_first_observation_that_is_not_finite(mode, make_envs):
+    envs = make_envs(Wide, 1, hooks="compiled", autoreset_mode=mode)
     envs.reset(seed=next(s for s in range(99) if not too_wide(s, 0) and too_wide(s, 1)))
     envs.step(np.zeros(1, np.int64))
     with pytest.raises(SimulationError, match="first observation is not finite"):
         envs.reset() if mode is DISABLED else envs.step(np.zeros(1, np.int64))
-    envs.close()
 
 
 class TestGuards:

@@ -15,7 +15,6 @@ from vector_tools import (
 
 import fmugym
 from fmugym import ConfigError
-from fmugym.vector import FMUVectorEnv
 
 
 class SharedArray(Drawing):
@@ -40,8 +39,8 @@ class SharedDict(SharedArray):
 
 
 @pytest.mark.parametrize("cls", [SharedArray, SharedDict])
-def test_an_array_that_hooks_share_does_not_mix_the_observations(cls):
-    envs = FMUVectorEnv(cls, 3, hooks="per_env")
+def test_an_array_that_hooks_share_does_not_mix_the_observations(cls, make_envs):
+    envs = make_envs(cls, 3, hooks="per_env")
     seen = [envs.reset(seed=0)[0]]
     seen += [envs.step(np.zeros((3, 1), np.float32))[0] for _ in range(2)]
     states = [np.float32(env) for env in envs.get_attr("state")]
@@ -50,7 +49,6 @@ def test_an_array_that_hooks_share_does_not_mix_the_observations(cls):
     assert len(set(rows[:, 0])) == 3
     first = seen[0] if cls is SharedArray else seen[0]["all"]
     assert not np.array_equal(first, rows)  # a later step leaves earlier observations alone
-    envs.close()
 
 
 class OfOtherTypes(Drawing):
@@ -71,8 +69,8 @@ class OfOtherTypes(Drawing):
         }
 
 
-def test_observations_become_the_types_of_their_space():
-    envs = FMUVectorEnv(OfOtherTypes, 3, hooks="per_env")
+def test_observations_become_the_types_of_their_space(make_envs):
+    envs = make_envs(OfOtherTypes, 3, hooks="per_env")
     envs.reset(seed=0)
     seen = envs.step(np.zeros((3, 1), np.float32))[0]
     states = np.float32(envs.get_attr("state"))
@@ -80,7 +78,6 @@ def test_observations_become_the_types_of_their_space():
     for rows in (seen["list"], seen["wide"], seen["pair"][0]):
         np.testing.assert_array_equal(rows, states)
     np.testing.assert_array_equal(seen["sign"], states[:, 0] > 0)
-    envs.close()
 
 
 class Stepping(Drawing):
@@ -94,13 +91,12 @@ class Stepping(Drawing):
 
 
 @pytest.mark.usefixtures("handler")
-def test_what_a_signal_handler_raises_in_a_conversion_comes_out(monkeypatch):
-    envs = FMUVectorEnv(Stepping, 2, hooks="per_env")
+def test_what_a_signal_handler_raises_in_a_conversion_comes_out(monkeypatch, make_envs):
+    envs = make_envs(Stepping, 2, hooks="per_env")
     envs.reset(seed=0)
     monkeypatch.setattr(Stepping, "observed", Ringing())
     with pytest.raises(RingError):
         envs.step(np.zeros((2, 1), np.float32))
-    envs.close()
 
 
 @pytest.mark.usefixtures("handler")
@@ -116,13 +112,12 @@ def test_so_it_does_in_a_single_environment(cls, monkeypatch):
 
 
 @pytest.mark.parametrize("observed", [np.zeros(3, np.float32), np.zeros(1), "text", 2**70, None])
-def test_an_observation_that_is_no_element_of_the_space_is_named(observed, monkeypatch):
-    envs = FMUVectorEnv(Stepping, 2, hooks="per_env")
+def test_an_observation_that_is_no_element_of_the_space_is_named(observed, monkeypatch, make_envs):
+    envs = make_envs(Stepping, 2, hooks="per_env")
     envs.reset(seed=0)
     monkeypatch.setattr(Stepping, "observed", observed)
     with pytest.raises(ConfigError, match=r"_get_observation returned .*Box"):
         envs.step(np.zeros((2, 1), np.float32))
-    envs.close()
 
 
 class Failing(Drawing):
@@ -134,9 +129,9 @@ class Failing(Drawing):
         return self.action
 
 
-def test_a_step_that_one_environment_refuses_changes_none():
+def test_a_step_that_one_environment_refuses_changes_none(make_envs):
     """The inputs too are those of the last step, in the environments and in the pool."""
-    envs = FMUVectorEnv(Failing, 3, hooks="per_env")
+    envs = make_envs(Failing, 3, hooks="per_env")
     envs.reset(seed=0)
     good = np.float32([[0.001], [0.002], [0.003]])
     envs.step(good)
@@ -148,25 +143,6 @@ def test_a_step_that_one_environment_refuses_changes_none():
     for name, values in zip(names, before, strict=True):
         np.testing.assert_array_equal(envs.get_attr(name), values, err_msg=name)
     np.testing.assert_array_equal(envs.inside.pool.inputs, given)
-    envs.close()
-
-
-def test_inputs_reach_the_environments_that_go_on():
-    """In a step that starts some episodes anew, each input belongs to its own environment."""
-    envs = FMUVectorEnv(Failing, 3, hooks="per_env", autoreset_mode="next_step")
-    alone = Failing()
-    envs.reset(seed=[1, 2, 3])
-    actions = np.float32([[0.001], [0.002], [0.003]])
-    envs.inside.engine.ended[1] = envs.inside.engine.any_ended = True
-    for _ in range(2):
-        envs.step(actions)
-    alone.reset(seed=3)
-    for _ in range(2):
-        alone.step(actions[2])
-    assert envs.get_attr("state")[2] == alone.state
-    assert envs.get_attr("inputs") == tuple((float(action),) for action in actions[:, 0])
-    envs.close()
-    alone.close()
 
 
 class Breaking(Drawing):
@@ -223,9 +199,9 @@ class Replacing(Drawing):
         self._get_inputs = lambda: 0.5 * self.action[0]
 
 
-def test_inputs_are_asked_of_a_hook_that_was_set_later():
+def test_inputs_are_asked_of_a_hook_that_was_set_later(make_envs):
     """Before, the actions were the inputs without any hook."""
-    envs = FMUVectorEnv(Replacing, 2, hooks="per_env")
+    envs = make_envs(Replacing, 2, hooks="per_env")
     envs.reset(seed=0)
     actions = np.full((2, 1), 0.004, np.float32)
     envs.step(actions)
@@ -235,7 +211,6 @@ def test_inputs_are_asked_of_a_hook_that_was_set_later():
     envs.step(actions)
     assert envs.get_attr("inputs") == ((0.5 * plain,), (0.5 * plain,))
     np.testing.assert_array_equal(envs.inside.pool.inputs, [[0.5 * plain] * 2])
-    envs.close()
 
 
 class Informing(Drawing):
@@ -248,8 +223,8 @@ class Informing(Drawing):
         return {"part": self.step_count / 2 if self.step_count else 0}
 
 
-def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments():
-    envs = FMUVectorEnv(Informing, 2, hooks="per_env", autoreset_mode="next_step")
+def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments(make_envs):
+    envs = make_envs(Informing, 2, hooks="per_env", autoreset_mode="next_step")
     envs.reset(seed=0)
     actions = np.zeros((2, 1), np.float32)
     envs.step(actions)
@@ -258,4 +233,3 @@ def test_infos_of_starts_and_of_steps_mix_in_the_order_of_the_environments():
     infos = envs.step(actions)[-1]
     assert infos["part"].tolist() == [1.0, 0.0]
     assert infos["part"].dtype == np.float64
-    envs.close()

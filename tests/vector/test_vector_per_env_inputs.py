@@ -66,8 +66,8 @@ def test_inputs_of_any_form_are_those_of_single_environments(forms):
 
 
 @pytest.mark.parametrize("form", [None, np.float32, list])
-def test_an_input_that_is_not_finite_names_its_environment(form):
-    envs = FMUVectorEnv(TwoTorques, 3, hooks="per_env")
+def test_an_input_that_is_not_finite_names_its_environment(form, make_envs):
+    envs = make_envs(TwoTorques, 3, hooks="per_env")
     envs.reset(seed=0)
     envs.set_attr("form", form)
     envs.step(ACTIONS[0][:3])
@@ -80,7 +80,6 @@ def test_an_input_that_is_not_finite_names_its_environment(form):
         np.testing.assert_array_equal(old, new)
     envs.set_attr("form", form)
     envs.step(ACTIONS[1][:3])
-    envs.close()
 
 
 @pytest.mark.parametrize("mode", ["next_step", "same_step", "disabled"])

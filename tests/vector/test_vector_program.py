@@ -186,7 +186,7 @@ def test_generated_expressions(prototype, reward, observed, variable):
         require_same_programs(env, batch, task)
 
 
-def test_no_warnings_of_numpy_come_from_compiled_code():
+def test_no_warnings_of_numpy_come_from_compiled_code(make_envs):
     class Dividing(Task):
         def _reward_policy(self):
             quotient = np.log(self.state[0] - 5.0) + 1.0 / (self.state[0] - self.state[0])
@@ -194,12 +194,11 @@ def test_no_warnings_of_numpy_come_from_compiled_code():
                 np.isfinite(quotient), quotient, np.exp(1e4 * np.abs(self.state[1])) > 2
             )
 
-    envs = FMUVectorEnv(Dividing, 3, hooks="compiled")
+    envs = make_envs(Dividing, 3, hooks="compiled")
     envs.reset(seed=0)
     for actions in sampled_actions(envs, 5):
         envs.step(actions)  # warnings are errors in tests
         assert np.sqrt(np.ones(2)).tolist() == [1.0, 1.0]
-    envs.close()
 
 
 # Actions
@@ -246,7 +245,7 @@ def test_actions_of_other_types_run_on_arrays(name, caplog):
     assert f"its actions are {name}" in caplog.text
 
 
-def test_minus_zero_is_zero_for_integers():
+def test_minus_zero_is_zero_for_integers(make_envs):
     """It was -0.0, because programs computed with floats only."""
 
     class Negating(Task):
@@ -258,22 +257,20 @@ def test_minus_zero_is_zero_for_integers():
         def _reward_policy(self):
             return -self.action
 
-    envs = FMUVectorEnv(Negating, 2, hooks="compiled")
+    envs = make_envs(Negating, 2, hooks="compiled")
     envs.reset(seed=0)
     rewards = envs.step(np.array([0, 1]))[1]
     assert rewards.tolist() == [0.0, -1.0]
     assert np.signbit(rewards).tolist() == [False, True]
-    envs.close()
 
 
 @in_turn({"dtype": [np.float32, np.float64], "bad": [np.nan, "x"]})
-def test_bad_actions_are_refused(bad, dtype):
+def test_bad_actions_are_refused(bad, dtype, make_envs):
     cls = type("Acting", (Task,), {"space": gym.spaces.Box(-1.0, 1.0, (2,), dtype)})
-    envs = FMUVectorEnv(cls, 3, hooks="compiled")
+    envs = make_envs(cls, 3, hooks="compiled")
     envs.reset(seed=0)
     for actions in ([[0.0, bad]] * 3, np.zeros((3, 3)), np.zeros(3)):
         given = np.array(actions)
         with pytest.raises(ConfigError, match="action"):
             envs.step(given if bad == "x" else given.astype(dtype))
     envs.step(np.zeros((3, 2)))  # a float64 is converted, as on arrays
-    envs.close()

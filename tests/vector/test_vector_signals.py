@@ -9,8 +9,6 @@ from vector_tools import (
     handler,  # noqa: F401  # the fixture "handler"
 )
 
-from fmugym.vector import FMUVectorEnv
-
 pytestmark = pytest.mark.usefixtures("handler")
 HOOKS = ("per_env", "array")
 ZEROS = np.zeros((2, 1), np.float32)
@@ -38,15 +36,14 @@ class Returning(Drawing):
 
 
 @pytest.mark.parametrize("hooks", HOOKS)
-def test_it_comes_out_of_actions(hooks):
-    envs = FMUVectorEnv(Returning, 2, hooks=hooks)
+def test_it_comes_out_of_actions(hooks, make_envs):
+    envs = make_envs(Returning, 2, hooks=hooks)
     envs.reset(seed=0)
     with pytest.raises(RingError):
         envs.step(Ringing())
     envs.step(ZEROS)  # the FMUs have not moved
     with pytest.raises(RingError):
         envs.reset(options={"reset_mask": Ringing()})
-    envs.close()
 
 
 @pytest.mark.parametrize(
@@ -54,15 +51,14 @@ def test_it_comes_out_of_actions(hooks):
     [("per_env", "_get_inputs")]
     + [("array", f"_{n}") for n in ("get_inputs", "reward_policy", "get_info", "is_truncated")],
 )
-def test_it_comes_out_of_what_hooks_return(hooks, hook, monkeypatch):
-    envs = FMUVectorEnv(Returning, 2, hooks=hooks)
+def test_it_comes_out_of_what_hooks_return(hooks, hook, monkeypatch, make_envs):
+    envs = make_envs(Returning, 2, hooks=hooks)
     envs.reset(seed=0)
     envs.step(ZEROS)
     monkeypatch.setattr(Returning, "hook", hook)
     monkeypatch.setattr(Returning, "value", Ringing())
     with pytest.raises(RingError):
         envs.step(ZEROS)
-    envs.close()
 
 
 def test_it_comes_out_of_a_single_environment(monkeypatch):

@@ -222,19 +222,18 @@ def test_how_far_results_may_differ(prototype, name):
         require_same_programs(env, batch, task)
 
 
-def test_an_index_outside_of_its_table_is_an_error():
+def test_an_index_outside_of_its_table_is_an_error(make_envs):
     class Beyond(Drawing):
         def _get_info(self):
             return {"count": PAIRS[1, self.step_count]}
 
-    envs = FMUVectorEnv(lambda: Beyond(max_episode_steps=9), 3, hooks="compiled")
+    envs = make_envs(lambda: Beyond(max_episode_steps=9), 3, hooks="compiled")
     envs.reset(seed=0)
     actions = np.zeros((3, 1), np.float32)
     for count in range(11, 18):
         assert envs.step(actions)[4]["count"].tolist() == [count] * 3
     with pytest.raises(IndexError):
         envs.step(actions)
-    envs.close()
 
 
 def test_tables_are_arrays_again_after_tracing():

@@ -137,7 +137,7 @@ def test_tasks(cls, mode):
         assert require_same(cls, num_envs=num_envs, steps=30, mode=mode) >= num_envs
 
 
-def test_inputs_outside_of_their_type(probe):
+def test_inputs_outside_of_their_type(probe, make_envs):
     class Typed(PlainEnv):
         def __init__(self):
             names = {"model_input_names": "n", "model_output_names": ["n_out", "steps"]}
@@ -146,11 +146,10 @@ def test_inputs_outside_of_their_type(probe):
         def _get_inputs(self):
             return np.where(self.action > 2, 3e9, 1.0)
 
-    envs = FMUVectorEnv(Typed, 2, hooks="compiled")
+    envs = make_envs(Typed, 2, hooks="compiled")
     envs.reset(seed=0)
     with pytest.raises(ConfigError, match="expected an integer from"):
         envs.step(np.array([1, 5]))
-    envs.close()
 
 
 # Faults
@@ -210,12 +209,12 @@ def test_only_the_hook_that_cannot_be_traced_leaves_the_pass(hook, mode, caplog)
 
 
 @in_turn({"hook": list(LEFT), "mode": ["same_step", "disabled"]})
-def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(hook, mode, monkeypatch):
+def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(
+    hook, mode, monkeypatch, make_envs
+):
     """numpy started them, which took two to three times the time of a step."""
     cls = type("Partial", (Tracking,), {hook: LEFT[hook]})
-    ours, theirs = (
-        FMUVectorEnv(cls, 20, hooks=way, autoreset_mode=mode) for way in ("auto", "array")
-    )
+    ours, theirs = (make_envs(cls, 20, hooks=way, autoreset_mode=mode) for way in ("auto", "array"))
     monkeypatch.setattr(ours.inside.engine, "_begin", None)
     ended = np.zeros(20, np.bool_)
     for result in results_of_both(ours, theirs, 25, same=require_bits):
@@ -224,8 +223,6 @@ def test_the_pool_starts_episodes_of_tasks_with_a_hook_that_is_left(hook, mode, 
             require_equal(ours.get_attr(name), theirs.get_attr(name))
         require_variables(ours, theirs)
     assert ended.all()
-    ours.close()
-    theirs.close()
 
 
 def test_faults_of_hooks_that_are_left():
@@ -239,10 +236,10 @@ def test_faults_of_hooks_that_are_left():
 
 
 @each_mode
-def test_failures_of_the_fmu_are_those_on_arrays(mode):
+def test_failures_of_the_fmu_are_those_on_arrays(mode, make_envs):
     """Variables, actions and states of the step before stay what they are on arrays."""
     one, other = (
-        FMUVectorEnv(FailingCart, 50, hooks=hooks, autoreset_mode=mode)
+        make_envs(FailingCart, 50, hooks=hooks, autoreset_mode=mode)
         for hooks in ("compiled", "array")
     )
     logging.getLogger("fmugym.FailingCart").setLevel(logging.CRITICAL)
@@ -250,8 +247,6 @@ def test_failures_of_the_fmu_are_those_on_arrays(mode):
         require_variables(one, other)
     assert one.health["discards"].tolist() == other.health["discards"].tolist()
     assert one.health["discards"].sum() > 50
-    one.close()
-    other.close()
 
 
 class FailingCart(fmugym.FMUEnv):

@@ -184,12 +184,10 @@ class Adding(Summing):
         self.variables["sum"] = self.variables["sum"] + self.state[0]
 
 
-def test_sums_go_on_when_steps_are_compiled_again():
+def test_sums_go_on_when_steps_are_compiled_again(make_envs):
     """While one episode has parameters of its own, all steps are done on arrays."""
     ours, theirs = (
-        FMUVectorEnv(
-            lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks
-        )
+        make_envs(lambda: Adding(max_episode_steps=50), 3, autoreset_mode="Disabled", hooks=hooks)
         for hooks in ("compiled", "per_env")
     )
     first = np.array([True, False, False])
@@ -200,8 +198,6 @@ def test_sums_go_on_when_steps_are_compiled_again():
         for actions in sampled_actions(ours, 4):
             for mine, other in zip(ours.step(actions)[:4], theirs.step(actions)[:4], strict=True):
                 require_equal(mine, other)
-    ours.close()
-    theirs.close()
 
 
 class Scaling(Drawing):

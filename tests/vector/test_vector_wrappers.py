@@ -1,15 +1,13 @@
 """Vector environments in Gymnasium's wrappers, pictures, videos and specs."""
 
-import json
 import warnings
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from vector_tools import IDS, Drawing, each_way, require_equal, sampled_actions
+from vector_tools import Drawing, each_way, sampled_actions
 
 from fmugym import SimulationError, Uniform
-from fmugym.vector import FMUVectorEnv
 
 
 def test_wrappers_for_statistics_and_normalization():
@@ -79,11 +77,10 @@ def test_pictures_of_all(hooks):
         vector.render()
 
 
-def test_no_pictures_without_a_render_mode():
-    vector = FMUVectorEnv(Drawing, 2)
+def test_no_pictures_without_a_render_mode(make_envs):
+    vector = make_envs(Drawing, 2)
     assert vector.render() is None
     assert vector.render_mode is None
-    vector.close()
 
 
 def test_videos(tmp_path):
@@ -99,16 +96,3 @@ def test_videos(tmp_path):
         recorder.close()
     (video,) = tmp_path.glob("*.mp4")
     assert video.stat().st_size > 1000
-
-
-@pytest.mark.parametrize("env_id", IDS)
-def test_specs(env_id):
-    vector = gym.make_vec(env_id, num_envs=2, max_episode_steps=11, hooks="array")
-    spec = json.loads(vector.spec.to_json())
-    assert spec["id"] == env_id
-    assert spec["kwargs"]["max_episode_steps"] == 11
-    again = gym.make_vec(gym.envs.registration.EnvSpec.from_json(vector.spec.to_json()), num_envs=2)
-    require_equal(vector.reset(seed=0)[0], again.reset(seed=0)[0])
-    assert repr(vector.unwrapped).startswith(f"<FMUVectorEnv of 2: <{env_id[7:-3]}Env of ")
-    vector.close()
-    again.close()
