@@ -251,11 +251,3 @@ class TestRefused:
     def test_what_does_not_fit_the_fmu(self, probe, version, changes, match):
         with pytest.raises(ConfigError, match=match):
             resolved(probe(version), **changes).pool_spec()
-
-    def test_arrays(self, probe):
-        for key, role in (("model_input_names", "inputs"), ("model_output_names", "outputs")):
-            found = getattr(resolved(probe(3), **{key: "array"}), role)
-            assert [variable.name for variable in found] == ["array[1]", "array[2]"]
-
-    def test_tunable_parameters_may_be_inputs(self, probe):
-        assert resolved(probe(2), model_input_names="trim").inputs[0].name == "trim"

@@ -75,22 +75,6 @@ def test_inputs_after_a_reset_are_their_start_values():
     env.close()
 
 
-def test_substeps_divide_the_step():
-    """With one internal step per communication step, ten substeps are ten Euler steps."""
-    euler = {"solver": "explicit_euler", "max_step": 1.0, "q_0": 1.0}
-    coarse = Swing(model_parameters=euler, time_step=0.02, substeps=10)
-    fine = Swing(model_parameters=euler, time_step=0.002)
-    coarse.reset()
-    fine.reset()
-    coarse.step(0.01)
-    for _ in range(10):
-        fine.step(0.01)
-    assert coarse.state == pytest.approx(fine.state, abs=1e-15)
-    assert coarse.time == fine.time == 0.02
-    coarse.close()
-    fine.close()
-
-
 def test_warm_up_runs_before_the_first_observation():
     warm, cold = Swing(warm_up=0.1), Swing()
     first, _ = warm.reset()
@@ -130,47 +114,6 @@ def test_default_reward(positive, negative):
         _, reward, terminated, _, _ = env.step(1.0)
         rewards.append(reward)
     assert rewards == [positive] * (len(rewards) - 1) + [negative]
-    env.close()
-
-
-def test_hooks_are_called_in_order():
-    calls = []
-
-    class Logged(Swing):
-        def _get_inputs(self):
-            calls.append("inputs")
-            return self.action
-
-        def _update(self):
-            calls.append("update")
-
-        def _is_done(self):
-            calls.append("done")
-            return False
-
-        def _is_truncated(self):
-            calls.append("truncated")
-            return False
-
-        def _reward_policy(self):
-            calls.append("reward")
-            return 0
-
-        def _get_observation(self):
-            calls.append("observation")
-            return np.array(self.state, np.float32)
-
-        def _get_info(self):
-            calls.append("info")
-            return {}
-
-    env = Logged()
-    env.reset()
-    assert calls == ["observation", "info"]
-    calls.clear()
-    env.step(0.0)
-    order = ["inputs", "update", "done", "truncated", "reward", "observation", "info"]
-    assert calls == order
     env.close()
 
 
@@ -259,14 +202,6 @@ def test_parameters_of_one_episode():
     assert info["drawn"] == {}
     assert (env.state[0], env.read_variables("m")["m"]) == (1.0, 0.06)
     env.close()
-
-
-def test_enumeration_parameters_by_name_and_value():
-    for solver in ("rk4", 3):
-        env = Swing(model_parameters={"solver": solver})
-        env.reset()
-        assert env.read_variables("solver") == {"solver": 3.0}
-        env.close()
 
 
 def test_a_fault_truncates_with_the_last_good_observation():

@@ -244,17 +244,16 @@ class TestFitted:
         np.savez(tmp_path / "rows.npz", names=np.array(["l", "c"]), rows=rows)
         return tomllib.loads(TASK) | {"fitted": str(tmp_path / "rows.npz")}
 
-    def test_rows_are_drawn_whole_by_all_environments(self, document):
+    def test_rows_are_drawn_whole_by_all_environments(self, document, make_envs):
         with fmugym.load(document) as env:
             assert env.inside.draws.recipes[-1].kind == "same_row"
             single = [drawn(env, seed) for seed in range(20)]
         assert all(one["c"] == pytest.approx(0.5 * one["l"], rel=1e-12) for one in single)
         assert len({one["l"] for one in single}) > 10
-        many = fmugym.FMUVectorEnv(partial(fmugym.load, document), 20)
+        many = make_envs(partial(fmugym.load, document), 20)
         info = many.reset(seed=0)[1]["drawn"]
         assert info["l"].tolist() == [one["l"] for one in single]
         assert info["c"].tolist() == [one["c"] for one in single]
-        many.close()
 
     def test_python_draws_the_same_where_c_cannot(self, document):
         """A distribution of the user's between them is drawn by Python."""

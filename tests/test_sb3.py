@@ -314,15 +314,14 @@ def test_pictures(make):
         assert blind.get_images() == [None] * 3
 
 
-def test_only_vector_environments_of_fmugym_in_the_right_mode_are_taken():
+def test_only_vector_environments_of_fmugym_in_the_right_mode_are_taken(make_envs):
     with pytest.raises(ConfigError, match="CartPole-v1"):
         make_sb3_env("CartPole-v1")
     with pytest.raises(ConfigError, match="got SyncVectorEnv"):
         FMUVecEnv(gym.make_vec("fmugym/CartPole-v0", 2, vectorization_mode="sync"))
-    env = FMUVectorEnv(CartPoleEnv, 2)
+    env = make_envs(CartPoleEnv, 2)
     with pytest.raises(ConfigError, match="NEXT_STEP, expected SAME_STEP"):
         FMUVecEnv(env)
-    env.close()
 
 
 def test_a_vector_environment_of_ones_own_and_an_id_with_a_module(make):

@@ -285,7 +285,7 @@ class TestSuperOfObservation:
         assert env.observation_space.contains(env.step(0.3)[0])
 
     @pytest.mark.parametrize("hooks", ["array", "per_env"])
-    def test_in_a_vector_environment(self, probe, hooks):
+    def test_in_a_vector_environment(self, probe, hooks, make_envs):
         class Longer(PlainEnv):
             def __init__(self):
                 super().__init__(
@@ -299,11 +299,10 @@ class TestSuperOfObservation:
             def _get_observation(self):
                 return np.concatenate([super()._get_observation(), np.float32(self.state)])
 
-        envs = fmugym.FMUVectorEnv(Longer, 3, hooks=hooks)
+        envs = make_envs(Longer, 3, hooks=hooks)
         envs.reset()
         observations, *_ = envs.step(np.float32([[0.1], [0.2], [0.3]]))
         assert observations.tolist() == [[value] * 2 for value in observations[:, 0]]
-        envs.close()
 
 
 class TestKindsOfObservations:

@@ -50,14 +50,6 @@ class TestTemporaryFolders:
         assert list(temp_root.iterdir()) == []
         env.close()
 
-    def test_gone_at_garbage_collection(self, probe, temp_root):
-        env = PlainEnv(probe(), probe_config())
-        for _ in range(3):
-            env.reset()
-        del env
-        gc.collect()
-        assert list(temp_root.iterdir()) == []
-
     @in_turn(
         {
             "ending": ["", "del env", "env.close()", "raise SystemExit", "globals().clear()"],

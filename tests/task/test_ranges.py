@@ -9,7 +9,7 @@ from fmu_tools import PlainEnv, edited_fmu
 from scipy import stats
 
 import fmugym
-from fmugym import Choice, ConfigError, FMUVectorEnv, LogUniform, Normal, Uniform, errors
+from fmugym import Choice, ConfigError, LogUniform, Normal, Uniform, errors
 from fmugym.task import ranges
 from fmugym.testing import check_fmu_env
 
@@ -117,14 +117,13 @@ class TestRefused:
         with pytest.raises(ConfigError, match=FRICTION):
             env.reset(options={"model_parameters": {"c": -0.1}})
 
-    def test_in_one_of_many_environments(self):
-        envs = FMUVectorEnv(lambda: PlainEnv(FMU, config(c=0.1)), 3)
+    def test_in_one_of_many_environments(self, make_envs):
+        envs = make_envs(lambda: PlainEnv(FMU, config(c=0.1)), 3)
         with pytest.raises(ConfigError, match=FRICTION):
             envs.set_attr("c", [0.1, 0.2, -0.1])
         envs.set_attr("c", [0.1, 0.2, 0.3])
         envs.reset(seed=0)
         assert list(envs.get_attr("c")) == [0.1, 0.2, 0.3]
-        envs.close()
 
     def test_by_the_range_that_the_config_gives(self, make):
         with pytest.raises(ConfigError, match=r"'c'.*0\.1 and 0\.2.*task gives.*0\.3"):
@@ -167,9 +166,9 @@ class TestTaken:
 
 class TestTruncated:
     @pytest.mark.parametrize("kind", UNBOUNDED)
-    def test_single_and_vector_environments_draw_the_same(self, kind, make):
+    def test_single_and_vector_environments_draw_the_same(self, kind, make, make_envs):
         distribution = UNBOUNDED[kind]
-        envs = FMUVectorEnv(lambda: PlainEnv(FMU, config(c=distribution, b=Uniform(0, 1))), 100)
+        envs = make_envs(lambda: PlainEnv(FMU, config(c=distribution, b=Uniform(0, 1))), 100)
         singles = [make(c=distribution, b=Uniform(0, 1)) for _ in range(4)]
         for seed in (7, None):
             envs.reset(seed=seed)
@@ -178,7 +177,6 @@ class TestTruncated:
                 for name in ("c", "b"):
                     assert env.parameters[name] == envs.get_attr(name)[index]
             assert min(envs.get_attr("c")) >= 0
-        envs.close()
 
     @pytest.mark.parametrize("kind", UNBOUNDED)
     def test_distributed_as_in_scipy(self, kind, make):

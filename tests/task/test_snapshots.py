@@ -234,34 +234,10 @@ class TestSingle:
 
 
 class TestVector:
-    @in_turn({"hooks": ["compiled", "array", "per_env"], "threads": [2, 1]})
-    def test_goes_on_as_the_original(self, hooks, threads):
-        envs = vector_of(Track, hooks=hooks, threads=threads)
-        envs.reset(seed=3)
-        for action in ACTIONS[:5]:
-            envs.step(np.repeat(action[None], 3, axis=0))
-        snapshot = pickle.loads(pickle.dumps(envs.save_state()))
-        expected = play_vector(envs, 1)
-        envs.restore_state(snapshot)
-        assert play_vector(envs, 1) == expected
-        other = vector_of(Track, hooks=hooks)
-        other.restore_state(snapshot[[1, 1, 0]])
-        assert play_vector(other, 0) == expected
-        envs.close()
-        other.close()
-
-    @in_turn(
-        {
-            "hooks,isolation": [
-                *(("auto", None), ("array", None), ("per_env", None)),
-                *(("array", "process"), ("per_env", "process")),
-            ],
-            "version": VERSIONS,
-        }
-    )
-    def test_goes_on_from_a_single_environment(self, halfway, hooks, isolation, version):
+    @in_turn({"hooks": ["auto", "array", "per_env"], "version": VERSIONS})
+    def test_goes_on_from_a_single_environment(self, halfway, hooks, version):
         env = halfway(fmi_version=version)
-        envs = vector_of(lambda: Track(fmi_version=version), hooks=hooks, isolation=isolation)
+        envs = vector_of(lambda: Track(fmi_version=version), hooks=hooks)
         observations = envs.restore_state(env.save_state())
         assert observations.tolist() == [np.array(env.state, np.float32).tolist()] * 3
         back = envs.save_state([2])
@@ -271,22 +247,8 @@ class TestVector:
         assert play(env) == expected
         envs.close()
 
-    @pytest.mark.parametrize("hooks", ["compiled", "array", "per_env"])
-    def test_some_go_on_from_another(self, hooks):
-        envs = vector_of(Track, 4, hooks=hooks)
-        envs.reset(seed=3)
-        envs.step(np.zeros((4, 1), np.float32))
-        before = envs.save_state()
-        envs.restore_state(before[2], [0, 3])
-        after = envs.save_state()
-        assert after[[1, 2]] == before[[1, 2]]
-        assert after[0] == after[3] == before[2]
-        envs.restore_state(before[[0, 3]], np.array([True, False, False, True]))
-        assert envs.save_state() == before
-        envs.close()
-
-    def test_ended_episodes_stay_ended(self):
-        envs = fmugym.FMUVectorEnv(Track, 2, max_episode_steps=2)
+    def test_ended_episodes_stay_ended(self, make_envs):
+        envs = make_envs(Track, 2, max_episode_steps=2)
         envs.reset(seed=0)
         actions = np.zeros((2, 1), np.float32)
         envs.step(actions)
@@ -297,7 +259,6 @@ class TestVector:
         again = envs.step(actions)
         assert again.observations.tolist() == expected.observations.tolist()
         assert again.rewards.tolist() == [0.0, 0.0]
-        envs.close()
 
     @pytest.mark.parametrize("hooks", ["compiled", "array"])
     def test_parameters_from_options_are_restored(self, hooks):
@@ -357,6 +318,10 @@ class TestValues:
         assert repr(snapshot) == "Snapshot(3 environment(s), method='state')"
         with pytest.raises(ConfigError, match="no environments of a snapshot of 3"):
             snapshot[3]
+        other = vector_of(Track, 3)
+        other.restore_state(snapshot[[1, 1, 0]])
+        assert other.save_state() == snapshot[[1, 1, 0]]
+        other.close()
         envs.close()
 
     def test_outlive_their_environment(self, halfway):

@@ -5,10 +5,12 @@ import numpy as np
 from vector_tools import Drawing
 
 import fmugym
-from fmugym.task.step import ORDER
-from fmugym.vector import FMUVectorEnv
 from fmugym.vector.hooks.trace import trace_hooks
 
+ORDER = (
+    *("_get_inputs", "_update", "_is_done", "_is_truncated", "_reward_policy"),
+    *("_get_observation", "_get_info"),
+)
 CALLED = []
 
 
@@ -62,25 +64,26 @@ def test_of_one_environment():
     called, values = played(env, np.zeros(1, np.float32))
     assert called == [*ORDER, *ORDER]
     assert values == EXPECTED
+    CALLED.clear()
+    env.reset()
+    assert tuple(CALLED) == ORDER[-2:]
     env.close()
 
 
-def test_on_arrays():
-    env = FMUVectorEnv(Recording, 3, hooks="array")
+def test_on_arrays(make_envs):
+    env = make_envs(Recording, 3, hooks="array")
     called, values = played(env, np.zeros((3, 1), np.float32))
     assert called == [*ORDER, *ORDER]
     assert values == EXPECTED
-    env.close()
 
 
-def test_one_environment_at_a_time():
+def test_one_environment_at_a_time(make_envs):
     """The FMUs step between the first hook of all environments and the others."""
-    env = FMUVectorEnv(Recording, 3, hooks="per_env")
+    env = make_envs(Recording, 3, hooks="per_env")
     called, values = played(env, np.zeros((3, 1), np.float32))
     step = [ORDER[0]] * 3 + [*ORDER[1:]] * 3
     assert called == [*step, *step]
     assert values == EXPECTED
-    env.close()
 
 
 class Plain(Recording):
@@ -103,14 +106,13 @@ class Plain(Recording):
         return self._note("_reward_policy", np.where(self.done, -1.0, 1.0 * self.step_count))
 
 
-def test_compiled():
+def test_compiled(make_envs):
     env = Plain()
     CALLED.clear()
     trace_hooks(env)
     assert [hook for hook in ORDER if hook in CALLED] == list(dict.fromkeys(CALLED))
     env.close()
-    vector = FMUVectorEnv(Plain, 3, hooks="compiled")
+    vector = make_envs(Plain, 3, hooks="compiled")
     called, values = played(vector, np.zeros(3, np.int64))
     assert called == []
     assert values == EXPECTED
-    vector.close()

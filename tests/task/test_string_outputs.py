@@ -97,7 +97,7 @@ def test_the_other_hooks_stay_compiled(feedthrough, caplog):
 
 
 @pools
-def test_snapshots_hold_the_texts(feedthrough, options):
+def test_snapshots_hold_the_texts(feedthrough, options, make_envs):
     env = Echo(feedthrough[3], **options)
     env.reset(seed=1)
     env.step(0)
@@ -108,7 +108,7 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     env.restore_state(saved)
     assert env.out["String_told"] == env.parameters["String_parameter"] == word
     assert env.step(0)[4]["told"] == word
-    envs = FMUVectorEnv(lambda: Echo(feedthrough[3], **options), 2)
+    envs = make_envs(lambda: Echo(feedthrough[3], **options), 2)
     envs.reset()
     envs.restore_state(saved)
     assert [one["String_parameter"] for one in envs.get_attr("parameters")] == [word] * 2
@@ -116,7 +116,6 @@ def test_snapshots_hold_the_texts(feedthrough, options):
     env.restore_state(envs.save_state()[1])
     assert env.out["String_told"] == word
     env.close()
-    envs.close()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs forks")
@@ -154,10 +153,10 @@ def test_a_fork_while_a_pool_reads_texts(feedthrough):
 @pytest.mark.usefixtures("wine")
 class TestInWine:
     @pytest.mark.parametrize("version", [1, 3])
-    def test_each_environment_has_its_own(self, tmp_path, version):
+    def test_each_environment_has_its_own(self, tmp_path, version, make_envs):
         with wine_tools.building_for_windows():
             path = values_tools.feedthrough_fmu(tmp_path / "Windows.fmu", version)
-        envs = FMUVectorEnv(lambda: Echo(path), 2)
+        envs = make_envs(lambda: Echo(path), 2)
         for episode in range(3):
             _, infos = envs.reset(seed=None if episode else 3)
             drawn = infos["drawn"]["String_parameter"].tolist()
@@ -168,7 +167,6 @@ class TestInWine:
         envs.reset()
         envs.restore_state(saved)
         assert [out["String_told"] for out in envs.get_attr("out")] == drawn
-        envs.close()
 
 
 class Pair(test_strings.Reading):
@@ -432,9 +430,9 @@ def test_what_cannot_be_read(feedthrough, changes, facts):
         Echo(feedthrough[3], **changes)
 
 
-def test_an_environment_without_hooks_that_read_texts(feedthrough):
+def test_an_environment_without_hooks_that_read_texts(feedthrough, make_envs):
     """All hooks are compiled, though a String is monitored."""
-    envs = FMUVectorEnv(
+    envs = make_envs(
         lambda: test_strings.Reading(feedthrough[3], monitor_names="String_told"),
         2,
         hooks="compiled",
@@ -443,4 +441,3 @@ def test_an_environment_without_hooks_that_read_texts(feedthrough):
     envs.step(np.zeros(2, np.int64))
     told = [out["String_told"] for out in envs.get_attr("out")]
     assert told == [one["String_parameter"] for one in envs.get_attr("parameters")]
-    envs.close()

@@ -113,8 +113,8 @@ def test_a_text_for_one_episode(feedthrough, options):
 
 
 @in_turn({"hooks": ["auto", "array", "per_env"], "options": POOLS})
-def test_each_environment_has_its_own_text(feedthrough, options, hooks):
-    envs = FMUVectorEnv(lambda: Telling(feedthrough[3], words="abc", **options), 3, hooks=hooks)
+def test_each_environment_has_its_own_text(feedthrough, options, hooks, make_envs):
+    envs = make_envs(lambda: Telling(feedthrough[3], words="abc", **options), 3, hooks=hooks)
     assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
     envs.set_attr("String_parameter", ["a", "bbbb", "cc"])
     for _ in range(2):
@@ -128,7 +128,6 @@ def test_each_environment_has_its_own_text(feedthrough, options, hooks):
     assert envs.reset()[0][:, 0].tolist() == [3, 3, 3]
     with pytest.raises(ConfigError, match=r"'String_parameter'.*String.*3"):
         envs.set_attr("String_parameter", ["a", "b", 3])
-    envs.close()
 
 
 def test_another_process_learns_the_text_of_a_snapshot(feedthrough, tmp_path):
@@ -149,14 +148,13 @@ env.close()
     assert result.stdout.split() == ["sixsix", "6.0"], result.stderr
 
 
-def test_a_weighted_choice(feedthrough):
-    envs = FMUVectorEnv(lambda: Reading(feedthrough[2], words=Choice(["a", "bb"], [0.25, 0.75])), 2)
+def test_a_weighted_choice(feedthrough, make_envs):
+    envs = make_envs(lambda: Reading(feedthrough[2], words=Choice(["a", "bb"], [0.25, 0.75])), 2)
     rng = [np.random.default_rng(seed) for seed in (8, 9)]
     for episode in range(20):
         observations, _ = envs.reset(seed=None if episode else 8)
         wanted = [(1, 2)[one.choice(2, p=[0.25, 0.75])] for one in rng]
         assert observations[:, 0].tolist() == wanted
-    envs.close()
 
 
 class Alternating:
@@ -170,11 +168,11 @@ class Alternating:
 
 
 @pytest.mark.parametrize("hooks", ["auto", "per_env"])
-def test_a_distribution_of_the_users_own(feedthrough, hooks):
+def test_a_distribution_of_the_users_own(feedthrough, hooks, make_envs):
     def make():
         return Reading(feedthrough[3], words=Alternating(), max_episode_steps=1)
 
-    envs = FMUVectorEnv(make, 2, hooks=hooks)
+    envs = make_envs(make, 2, hooks=hooks)
     streams = [np.random.default_rng(seed) for seed in (8, 9)]
     envs.reset(seed=8)
     wanted = [[1 + (one.random() < 0.5) for _ in range(4)] for one in streams]
@@ -182,7 +180,6 @@ def test_a_distribution_of_the_users_own(feedthrough, hooks):
     assert seen[0] == [row[0] for row in wanted]
     assert seen[1] == [row[1] for row in wanted]
     assert seen[3] == [row[2] for row in wanted]
-    envs.close()
 
 
 def test_a_task_file_draws_texts(feedthrough, tmp_path):

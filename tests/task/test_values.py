@@ -33,11 +33,6 @@ class TestNamedValues:
         assert ("x" in named, "z" in named, [] in named) == (True, False, False)
         assert named == {"x": 1.0, "y": 2.0}
 
-    def test_unknown_name(self):
-        named = NamedValues("output", ["theta"], lambda: [0.0])
-        with pytest.raises(ConfigError, match="unknown output 'thet'; did you mean 'theta'"):
-            named["thet"]
-
     def test_it_cannot_be_written(self):
         named = NamedValues("output", ["x"], lambda: [0.0])
         with pytest.raises(TypeError):
