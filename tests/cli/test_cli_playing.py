@@ -247,12 +247,6 @@ def test_arguments_of_an_algorithm_may_stand_anywhere():
 class TestInterruption:
     """Ctrl-C in an episode keeps those before it."""
 
-    def test_of_simulate(self, cli, monkeypatch):
-        monkeypatch.setattr(fmugym.FMUEnv, "step", interrupted_after(130, fmugym.FMUEnv.step))
-        options = "--episodes", "9", "--steps", "60", "--json"
-        code, out, _ = cli("simulate", "fmugym/House-v0", *options)
-        assert (code, len(json.loads(out)["episodes"])) == (130, 2)
-
     def test_of_bench(self, monkeypatch, cli):
         def interrupted(*_):
             raise KeyboardInterrupt

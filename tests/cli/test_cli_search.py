@@ -39,14 +39,9 @@ SMALL = "--episodes", "3"
 ROUNDS = 45
 
 
-def run(capsys, *arguments):
-    code = main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
-
-
-def searched(capsys, task, folder, *options):
-    return run(capsys, "train", task, "--output", folder, *SMALL, *options)
+@pytest.fixture
+def searched(cli):
+    return lambda task, folder, *options: cli("train", task, "--output", folder, *SMALL, *options)
 
 
 @pytest.fixture
@@ -54,28 +49,28 @@ def task(tmp_path):
     return written(tmp_path)
 
 
-def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_path, capsys):
+def test_a_folder_is_replaced_only_by_force_and_only_by_a_new_agent(task, tmp_path, searched):
     folder = tmp_path / "agent"
     short = "--rounds", "3"
-    assert searched(capsys, task, folder, *short)[0] == 0
+    assert searched(task, folder, *short)[0] == 0
     before = facts_of(folder)
-    code, _, err = searched(capsys, task, folder, *short, "--seed", "9")
+    code, _, err = searched(task, folder, *short, "--seed", "9")
     assert (code, "--force" in err) == (1, True)
     wrong = written(tmp_path, "wrong", reward="-abs(qq)")
-    assert searched(capsys, wrong, folder, *short, "--force")[0] == 1
+    assert searched(wrong, folder, *short, "--force")[0] == 1
     assert facts_of(folder) == before
-    assert searched(capsys, task, folder, *short, "--seed", "9", "--force")[0] == 0
+    assert searched(task, folder, *short, "--seed", "9", "--force")[0] == 0
     assert facts_of(folder) != before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["agent", "task.toml", "wrong.toml"]
     before = facts_of(folder)
     few = written(tmp_path, "few", controllers={"pi": TASK["controllers"]["pi"]})
-    code, _, err = searched(capsys, few, folder, "--minutes", "1e-9", "--force")
+    code, _, err = searched(few, folder, "--minutes", "1e-9", "--force")
     assert (code, "rounds are too few" in err) == (1, True)
     assert facts_of(folder) == before
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "file").touch()
-    assert searched(capsys, task, precious, "--force")[0] == 1
+    assert searched(task, precious, "--force")[0] == 1
     assert (precious / "file").exists()
 
 
@@ -133,9 +128,9 @@ def whole(tmp_path_factory):
 
 
 class TestCourse:
-    def test_rounds_repeat_a_search_and_its_output(self, whole, task, tmp_path, capsys):
+    def test_rounds_repeat_a_search_and_its_output(self, whole, task, tmp_path, searched):
         folder, told = whole
-        code, out, err = searched(capsys, task, tmp_path / "b", "--rounds", ROUNDS, "--envs", "7")
+        code, out, err = searched(task, tmp_path / "b", "--rounds", ROUNDS, "--envs", "7")
         assert (code, out) == (0, told)
         assert content(tmp_path / "b") == content(folder)
         assert f"--rounds {ROUNDS}" in err
@@ -143,59 +138,59 @@ class TestCourse:
     @pytest.mark.parametrize("within", [False, True])
     @pytest.mark.parametrize("rounds", [7, 20, 33])
     def test_an_interrupted_search_goes_on_as_if_it_was_not(
-        self, rounds, within, whole, task, tmp_path, capsys, monkeypatch
+        self, rounds, within, whole, task, tmp_path, cli, searched, monkeypatch
     ):
         folder, parts = whole[0], tmp_path / "parts"
         with monkeypatch.context() as patch:
             Interruption(patch, rounds, within=within)
-            code, out, err = searched(capsys, task, parts, "--rounds", ROUNDS)
+            code, out, err = searched(task, parts, "--rounds", ROUNDS)
         assert (code, out) == (130, "")
         assert "--resume" in err
         assert Agent.load(parts).name == facts_of(parts)["agent"]  # the best until then
         options = "--output", parts, "--episodes", "3", "--rounds", ROUNDS, "--resume"
-        code, out, err = run(capsys, "train", task, *options)
+        code, out, err = cli("train", task, *options)
         assert (code, out) == (0, whole[1]), err
         assert content(parts) == content(folder)
         assert curve(parts) == curve(folder)
 
-    def test_a_resumed_search_may_be_longer(self, whole, task, tmp_path, capsys):
+    def test_a_resumed_search_may_be_longer(self, whole, task, tmp_path, cli, searched):
         """And is then like one that was as long from the beginning."""
         options = "--rounds", ROUNDS + 12
-        code, *_ = searched(capsys, task, tmp_path / "longer", *options)
+        code, *_ = searched(task, tmp_path / "longer", *options)
         assert code == 0
         folder = shutil.copytree(whole[0], tmp_path / "whole")
         options = "--output", folder, "--episodes", "3", *options, "--resume"
-        assert run(capsys, "train", task, *options)[0] == 0
+        assert cli("train", task, *options)[0] == 0
         assert content(folder) == content(tmp_path / "longer")
 
     @pytest.mark.parametrize("ceiling", [20_000, 60_000, 75_000])
-    def test_steps_are_a_ceiling(self, ceiling, task, tmp_path, capsys):
+    def test_steps_are_a_ceiling(self, ceiling, task, tmp_path, searched):
         """The rounds that it tells repeat what was found until then."""
-        code, out, err = searched(capsys, task, tmp_path / "a", "--steps", ceiling)
+        code, out, err = searched(task, tmp_path / "a", "--steps", ceiling)
         assert code == 0, err
         facts = facts_of(tmp_path / "a")
         assert 0.5 * ceiling < facts["steps"] <= ceiling
         options = words_after(err, "agent;")
-        code, again, err = searched(capsys, task, tmp_path / "b", *options)
+        code, again, err = searched(task, tmp_path / "b", *options)
         assert (code, again) == (0, out), err
         assert content(tmp_path / "b") == content(tmp_path / "a")
 
-    def test_a_search_that_time_has_ended_is_repeated(self, task, tmp_path, capsys, monkeypatch):
+    def test_a_search_that_time_has_ended_is_repeated(self, task, tmp_path, cli, monkeypatch):
         """Also if the FMU was slow, so that only the baseline was tuned."""
         monkeypatch.setattr(Probe, "round_time", lambda *_: 1.6)
         arguments = "train", task, "--episodes", "3"
         options = "--minutes", "0.2", "--output", tmp_path / "a"
-        code, out, err = run(capsys, *arguments, *options)
+        code, out, err = cli(*arguments, *options)
         assert code == 0, err
         assert "baseline only; for more, give --minutes" in err
         assert facts_of(tmp_path / "a")["agent"] == facts_of(tmp_path / "a")["baseline"]
         monkeypatch.undo()
         options = words_after(err, "agent;")
-        code, again, err = run(capsys, *arguments, *options, "--output", tmp_path / "b")
+        code, again, err = cli(*arguments, *options, "--output", tmp_path / "b")
         assert (code, again) == (0, out), err
         assert content(tmp_path / "b") == content(tmp_path / "a")
 
-    def test_what_cannot_be_resumed(self, whole, task, tmp_path, capsys):
+    def test_what_cannot_be_resumed(self, whole, task, tmp_path, cli):
         folder = shutil.copytree(whole[0], tmp_path / "whole")
         before = content(folder)
         other = written(tmp_path, "other", time_step=0.1)
@@ -207,17 +202,17 @@ class TestCourse:
             (other, folder, ["--rounds", "1"], "time_step"),
             (another, folder, ["--rounds", "1"], "observations"),
         ):
-            code, out, err = run(capsys, "train", path, "--output", output, *options, "--resume")
+            code, out, err = cli("train", path, "--output", output, *options, "--resume")
             assert (code, out, err.count("\n")) == (1, "", 1), options
             assert fact in err
         assert content(folder) == before
         (folder / "search.pkl").write_bytes(b"broken")
-        code, _, err = run(capsys, "train", task, "--output", folder, "--resume")
+        code, _, err = cli("train", task, "--output", folder, "--resume")
         assert (code, "cannot be resumed" in err) == (1, True)
 
-    def test_an_interruption_before_anything_is_found(self, task, tmp_path, capsys, monkeypatch):
+    def test_an_interruption_before_anything_is_found(self, task, tmp_path, searched, monkeypatch):
         Interruption(monkeypatch, 0)
-        code, out, err = searched(capsys, task, tmp_path / "a", "--rounds", ROUNDS)
+        code, out, err = searched(task, tmp_path / "a", "--rounds", ROUNDS)
         assert (code, out) == (130, "")
         assert "nothing" in err
         assert not (tmp_path / "a").exists()
@@ -251,13 +246,13 @@ CRANE = {
     [("fmugym/CartPole-v0", 40, 475), ("fmugym/CloudPendulum-v0", 100, -95), (CRANE, 150, -75)],
     ids=["cart-pole", "cloud-pendulum", "crane"],
 )
-def test_targets_are_reached(task, rounds, target, tmp_path, capsys):
+def test_targets_are_reached(task, rounds, target, tmp_path, cli):
     """By the mean of 100 episodes of the test."""
     if task is CRANE:
         task = tmp_path / "crane.toml"
         fmugym.Task.from_dict(CRANE).write(task)
     options = "--output", tmp_path / "a", "--rounds", rounds, "--json"
-    code, out, err = run(capsys, "train", task, *options)
+    code, out, err = cli("train", task, *options)
     assert code == 0, err
     told = json.loads(out)
     assert told["test"][told["agent"]]["total_reward"] >= target
@@ -284,10 +279,8 @@ class Bar:
 
 
 class TestOutput:
-    def test_it_tells_what_it_does(self, task, tmp_path, capsys):
-        code, out, err = searched(
-            capsys, task, tmp_path / "a", "--rounds", "25", "--steps", "1e9"[:1] + "0" * 9
-        )
+    def test_it_tells_what_it_does(self, task, tmp_path, searched):
+        code, out, err = searched(task, tmp_path / "a", "--rounds", "25", "--steps", 10**9)
         assert code == 0
         first, plan, *_ = err.splitlines()
         assert "lazy" in first
@@ -302,7 +295,7 @@ class TestOutput:
         ("is_terminal", "has_tqdm"), [(True, True), (False, True), (True, False)]
     )
     def test_scores_are_a_bar_or_plain_lines(
-        self, is_terminal, has_tqdm, task, tmp_path, capsys, monkeypatch
+        self, is_terminal, has_tqdm, task, tmp_path, searched, monkeypatch
     ):
         """There is a line every ten seconds, and in any case at the end; a round takes a second."""
         told = []
@@ -311,7 +304,7 @@ class TestOutput:
         module = SimpleNamespace(tqdm=partial(Bar, told)) if has_tqdm else None
         monkeypatch.setitem(sys.modules, "tqdm", module)
         monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
-        code, _, err = searched(capsys, task, tmp_path / "a", "--rounds", "35")
+        code, _, err = searched(task, tmp_path / "a", "--rounds", "35")
         assert code == 0
         lines = [line for line in err.splitlines() if line.startswith("round")]
         if told:
@@ -324,8 +317,8 @@ class TestOutput:
         for text in (lines[-1], *told[-1:]):
             assert re.fullmatch(r"round 35, best -[\d.]+, lazy -[\d.]+", text)
 
-    def test_json(self, task, tmp_path, capsys):
-        code, out, _ = searched(capsys, task, tmp_path / "a", "--rounds", "32", "--json")
+    def test_json(self, task, tmp_path, searched):
+        code, out, _ = searched(task, tmp_path / "a", "--rounds", "32", "--json")
         told = json.loads(out)
         assert code == 0
         assert told["output"] == str(tmp_path / "a")
@@ -340,8 +333,8 @@ class TestOutput:
             assert one["total_reward"] == pytest.approx(np.mean(rewards))
             assert one["mean_costs"]["effort"] >= 0
 
-    def test_its_curve(self, task, tmp_path, capsys):
-        code, *_ = searched(capsys, task, tmp_path / "a", "--rounds", "32")
+    def test_its_curve(self, task, tmp_path, searched):
+        code, *_ = searched(task, tmp_path / "a", "--rounds", "32")
         assert code == 0
         rows = list(csv.DictReader((tmp_path / "a" / "evaluations.csv").read_text().splitlines()))
         steps = [int(row["steps"]) for row in rows]
@@ -350,23 +343,23 @@ class TestOutput:
         assert rewards == sorted(rewards)
         assert len({row["baseline"] for row in rows}) == 1
 
-    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, capsys):
+    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, searched):
         path = written(tmp_path, reward=3, terminated=None)
-        code, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "5")
+        code, _, err = searched(path, tmp_path / "a", "--rounds", "5")
         assert code == 0
         assert err.count("warning") == err.count("reached 120") == 1
         path = written(tmp_path, "ends", reward=3)
-        _, _, err = searched(capsys, path, tmp_path / "b", "--rounds", "5")
+        _, _, err = searched(path, tmp_path / "b", "--rounds", "5")
         assert "warning" not in err
 
-    def test_episodes_without_a_length_are_told(self, tmp_path, capsys, monkeypatch):
+    def test_episodes_without_a_length_are_told(self, tmp_path, searched, monkeypatch):
         monkeypatch.setattr("fmugym.search.probe.MOST_STEPS", 50)
         path = written(tmp_path, episode_length=None, controllers={"lazy": 0})
-        _, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "3")
+        _, _, err = searched(path, tmp_path / "a", "--rounds", "3")
         assert "no length" in err
         assert "50 steps" in err
 
-    def test_scenarios_are_the_test(self, tmp_path, capsys):
+    def test_scenarios_are_the_test(self, tmp_path, searched):
         more = {
             "data": {"goal": {"values": [0, 1, 2], "step": "1d"}},
             "clock": {"from": "01-01", "to": "01-03", "step": "1h", "exclude": "scenarios"},
@@ -378,7 +371,7 @@ class TestOutput:
             "terminated": None,
         }
         path = written(tmp_path, **more)
-        code, out, _ = searched(capsys, path, tmp_path / "a", "--rounds", "5", "--json")
+        code, out, _ = searched(path, tmp_path / "a", "--rounds", "5", "--json")
         assert code == 0
         (one, *_) = json.loads(out)["test"].values()
         assert one["rewards"] == {"early": [-10.0] * 3, "late": [-30.0] * 3}
@@ -407,61 +400,56 @@ class TestOutput:
         ],
         ids=lambda one: " ".join(one),
     )
-    def test_mistakes(self, arguments, facts, task, tmp_path, capsys):
-        code, out, err = run(capsys, "train", task, "--output", tmp_path / "a", *arguments)
+    def test_mistakes(self, arguments, facts, task, tmp_path, cli):
+        code, out, err = cli("train", task, "--output", tmp_path / "a", *arguments)
         assert (code, out, err.count("\n")) == (1, "", 1)
         for fact in facts:
             assert fact in err
         assert not (tmp_path / "a").exists()
 
-    def test_a_folder_with_files_is_refused(self, task, tmp_path, capsys):
-        code, _, err = searched(capsys, task, tmp_path, "--rounds", "3")
-        assert code == 1
-        assert f"{tmp_path} exists" in err
-
-    def test_a_task_that_no_search_can_take(self, tmp_path, capsys):
+    def test_a_task_that_no_search_can_take(self, tmp_path, searched):
         path = written(tmp_path, reward=None)
-        code, _, err = searched(capsys, path, tmp_path / "a", "--rounds", "3")
+        code, _, err = searched(path, tmp_path / "a", "--rounds", "3")
         assert (code, err.count("\n")) == (1, 1)
         assert "reward" in err
         assert not (tmp_path / "a").exists()
 
 
 class TestAgents:
-    def test_all_who_play_take_them(self, whole, task, tmp_path, capsys):
+    def test_all_who_play_take_them(self, whole, task, tmp_path, cli):
         folder, told = whole[0], facts_of(whole[0])
         expected = told["test"][told["agent"]]["rewards"]["unseen episodes"]
         options = "--agent", folder, "--episodes", "3", "--seed", "1000000", "--json"
-        code, out, _ = run(capsys, "evaluate", task, *options)
+        code, out, _ = cli("evaluate", task, *options)
         assert code == 0
         assert json.loads(out)["scores"][1]["rewards"] == expected
-        code, out, _ = run(capsys, "simulate", task, *options)
+        code, out, _ = cli("simulate", task, *options)
         assert code == 0
         assert [one["total_reward"] for one in json.loads(out)["episodes"]] == expected
         table = tmp_path / "table.csv"
-        code, out, _ = run(capsys, "simulate", task, *options, "--output", table)
+        code, out, _ = cli("simulate", task, *options, "--output", table)
         assert code == 0
         assert [one["total_reward"] for one in json.loads(out)["runs"][str(folder)]] == expected
         assert table.exists()
 
-    def test_beside_controllers_they_reach_what_the_verdict_tells(self, whole, task, capsys):
+    def test_beside_controllers_they_reach_what_the_verdict_tells(self, whole, task, cli):
         told = facts_of(whole[0])["test"]["lazy"]
         options = "--controller", "lazy", "--episodes", "3", "--json"
-        code, out, _ = run(capsys, "evaluate", task, *options)
+        code, out, _ = cli("evaluate", task, *options)
         assert code == 0
         score = json.loads(out)["scores"][1]
         assert score["rewards"] == told["rewards"]["unseen episodes"]
         assert score["mean_cost"] == pytest.approx(told["mean_costs"]["effort"])
 
-    def test_another_task_is_refused_by_what_differs(self, whole, tmp_path, capsys):
+    def test_another_task_is_refused_by_what_differs(self, whole, tmp_path, cli):
         other = written(tmp_path, "other", agent=TASK["agent"] | {"observations": ["theta"]})
         for command in ("evaluate", "simulate"):
-            code, _, err = run(capsys, command, other, "--agent", whole[0])
+            code, _, err = cli(command, other, "--agent", whole[0])
             assert (code, err.count("\n")) == (1, 1)
             assert "theta_dot" in err
 
-    def test_a_controller_with_a_range_plays_nowhere(self, task, capsys):
-        code, _, err = run(capsys, "simulate", task, "--controller", "pi")
+    def test_a_controller_with_a_range_plays_nowhere(self, task, cli):
+        code, _, err = cli("simulate", task, "--controller", "pi")
         assert (code, err.count("\n")) == (1, 1)
         assert "kp=-2..-0.01 is a range" in err
 

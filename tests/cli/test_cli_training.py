@@ -18,8 +18,6 @@ import fmugym
 from fmugym import ConfigError
 from fmugym.episodes.evaluation import HELD_OUT_SEED, evaluate, warning_of_one_reward
 from fmugym.episodes.simulation import Player, action_of
-from fmugym.series.intervals import confidence
-from fmugym.tools.cli import main
 from fmugym.training.training import TrainingSettings, arguments_of, train
 
 CART_POLE = str(Path(__file__).parents[2] / "examples" / "cart_pole.toml")
@@ -67,35 +65,30 @@ class Parts(fmugym.FMI2CSEnv):
         return False
 
 
-def run(capsys, *arguments):
-    code = main([str(argument) for argument in arguments])
-    printed = capsys.readouterr()
-    return code, printed.out, printed.err
-
-
-def trained(capsys, task, *arguments):
-    """By PPO, if ``arguments`` name no other algorithm."""
-    return run(capsys, "train", task, "--algorithm", "PPO", *arguments)
+@pytest.fixture
+def trained(cli):
+    """By PPO, if the arguments name no other algorithm."""
+    return lambda task, *arguments: cli("train", task, "--algorithm", "PPO", *arguments)
 
 
 @pytest.mark.parametrize(
     ("function", "options"), [("train", ["--algorithm", "PPO"]), ("Searching.run", [])]
 )
-def test_a_full_disk_is_told_with_the_folder(function, options, tmp_path, capsys, monkeypatch):
+def test_a_full_disk_is_told_with_the_folder(function, options, tmp_path, cli, monkeypatch):
     def fill(*_, **__):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(f"fmugym.tools.learning.{function}", fill)
     options = "--output", tmp_path / "agent", *options
-    code, out, err = run(capsys, "train", CART_POLE, *options)
+    code, out, err = cli("train", CART_POLE, *options)
     assert (code, out) == (1, "")
     assert err == f"fmugym: error: {tmp_path / 'agent'}: No space left on device\n"
 
 
 class TestEvaluate:
-    def test_controllers_play_the_same_episodes(self, capsys):
+    def test_controllers_play_the_same_episodes(self, cli):
         arguments = "--action", "-10", "--action", "10", "--episodes", "4", "--json"
-        code, out, _ = run(capsys, "evaluate", CART_POLE, *arguments)
+        code, out, _ = cli("evaluate", CART_POLE, *arguments)
         scores = json.loads(out)["scores"]
         assert code == 0
         assert [score["name"] for score in scores] == ["random", "action -10", "action 10"]
@@ -114,10 +107,10 @@ class TestEvaluate:
         assert low < np.mean(lengths) < high
         assert scores[2]["ends"] == {"terminated": 4}
 
-    def test_a_table_with_costs_and_a_scenario(self, tmp_path, capsys):
+    def test_a_table_with_costs_and_a_scenario(self, tmp_path, cli):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         arguments = "--scenario", "late", "--action", "0.1", "--episodes", "2"
-        code, out, _ = run(capsys, "evaluate", tmp_path / "a.toml", *arguments)
+        code, out, _ = cli("evaluate", tmp_path / "a.toml", *arguments)
         assert code == 0
         header, random, constant = (line.split() for line in out.splitlines())
         assert header[:4] == ["reward", "+-", "cost", "steps"]
@@ -125,16 +118,6 @@ class TestEvaluate:
         assert constant[:2] == ["action", "0.1"]
         assert float(constant[4]) == pytest.approx(1.0)
         assert constant[5:8] == ["10", "2", "truncated"]
-
-
-def test_the_interval_is_students():
-    stats = pytest.importorskip("scipy.stats", reason="needs scipy: the extra test")
-    for count in (2, 3, 4, 5, 10, 100):
-        values = np.random.default_rng(count).normal(size=count)
-        error = values.std(ddof=1) / np.sqrt(count)
-        expected = stats.t.ppf(0.975, count - 1) * error
-        assert confidence(values) == pytest.approx(expected, rel=0.01)
-    assert confidence([1.0]) is None
 
 
 def test_arguments_of_an_algorithm():
@@ -150,22 +133,22 @@ def test_arguments_of_an_algorithm():
         arguments_of(["gamma"])
 
 
-def test_without_sb3_training_names_the_extra(tmp_path, capsys, monkeypatch):
+def test_without_sb3_training_names_the_extra(tmp_path, trained, monkeypatch):
     monkeypatch.setitem(sys.modules, "fmugym.sb3", None)
-    code, out, err = trained(capsys, CART_POLE, "--output", tmp_path / "agent")
+    code, out, err = trained(CART_POLE, "--output", tmp_path / "agent")
     assert (code, out) == (1, "")
     assert "pip install '.[sb3]'" in err
     assert not (tmp_path / "agent").exists()
 
 
 @pytest.mark.parametrize("command", ["simulate", "evaluate", "tune", "train"])
-def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, capsys):
+def test_an_fmu_has_no_reward_to_play_for(command, tmp_path, cli):
     fmu = fmugym.bundled_fmu("Pendulum")
     more = {
         "tune": ["pid of=q setpoint=0 kp=0..1"],
         "train": ["--output", tmp_path / "agent"],
     }
-    code, out, err = run(capsys, command, fmu, *more.get(command, []))
+    code, out, err = cli(command, fmu, *more.get(command, []))
     assert (code, out) == (1, "")
     assert "fmugym new Pendulum.fmu" in err
     assert list(tmp_path.iterdir()) == []
@@ -195,11 +178,11 @@ class TestTrain:
     def sb3(self):
         pytest.importorskip("stable_baselines3", reason="needs the extra test-sb3")
 
-    def test_an_agent_learns_is_kept_and_evaluated(self, tmp_path, capsys):
+    def test_an_agent_learns_is_kept_and_evaluated(self, tmp_path, cli, trained):
         folder = tmp_path / "agent"
         options = "--steps", "6000", "--episodes", "3", "--output", folder
         arguments = "n_steps=128", "batch_size=256"
-        code, out, err = trained(capsys, CART_POLE, *arguments, *options)
+        code, out, err = trained(CART_POLE, *arguments, *options)
         assert code == 0
         plan = "PPO learns for up to 6000 steps of 8 environments; 3 episodes are played every 600"
         assert err.startswith(plan)
@@ -210,27 +193,27 @@ class TestTrain:
         best = max(float(row["reward"]) for row in rows)
         assert json.loads((folder / "agent.json").read_text())["reward"] == best > 100
         names = "--agent", folder, "--episodes", "3", "--json"
-        code, out, _ = run(capsys, "evaluate", CART_POLE, *names)
+        code, out, _ = cli("evaluate", CART_POLE, *names)
         random, agent = json.loads(out)["scores"]
         assert code == 0
         assert agent["mean_reward"] == best > 2 * random["mean_reward"]
-        code, _, err = trained(capsys, CART_POLE, *options)
+        code, _, err = trained(CART_POLE, *options)
         assert code == 1
         assert "exists" in err
 
-    def test_no_agent_is_evaluated_twice(self, tmp_path, capsys):
+    def test_no_agent_is_evaluated_twice(self, tmp_path, trained):
         """PPO learns after every 128 steps here, and an evaluation is due after every 27."""
         folder = tmp_path / "agent"
         options = "--steps", "270", "--envs", "4", "--episodes", "1", "--output", folder
-        code, _, err = trained(capsys, CART_POLE, "n_steps=32", *options)
+        code, _, err = trained(CART_POLE, "n_steps=32", *options)
         assert code == 0
         assert "n_steps" not in err
         rows = list(csv.DictReader((folder / "evaluations.csv").read_text().splitlines()))
         assert [int(row["steps"]) for row in rows] == [28, 132, 256]
 
-    def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, capsys):
+    def test_a_rollout_that_is_longer_than_the_training_is_an_error(self, tmp_path, trained):
         options = "--steps", "100", "--envs", "2", "--output", tmp_path / "a"
-        code, _, err = trained(capsys, CART_POLE, "n_steps=64", *options)
+        code, _, err = trained(CART_POLE, "n_steps=64", *options)
         assert code == 1
         assert "128 steps (n_steps=64 in 2 environments)" in err
         assert not (tmp_path / "a").exists()
@@ -244,15 +227,15 @@ class TestTrain:
             (["--algorithm", "SAC", "learning_starts=10"], 33, 32),
         ],
     )
-    def test_steps_are_a_ceiling(self, tmp_path, capsys, arguments, steps, done):
+    def test_steps_are_a_ceiling(self, tmp_path, trained, arguments, steps, done):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         options = "--steps", steps, "--envs", "2", "--episodes", "1", "--output", tmp_path / "a"
-        code, *_ = trained(capsys, tmp_path / "a.toml", *arguments, *options)
+        code, *_ = trained(tmp_path / "a.toml", *arguments, *options)
         assert code == 0
         last = (tmp_path / "a" / "evaluations.csv").read_text().splitlines()[-1]
         assert int(last.partition(",")[0]) == done
 
-    def test_the_scores_are_those_of_the_agent_that_is_kept(self, tmp_path, capsys, monkeypatch):
+    def test_the_scores_are_those_of_the_agent_that_is_kept(self, tmp_path, trained, monkeypatch):
         """A training whose agent gets worse: it pushes, where none should."""
         pushes = iter([0.0, 5.0, 5.0])
 
@@ -265,7 +248,7 @@ class TestTrain:
         monkeypatch.setattr("stable_baselines3.PPO.train", train)
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         options = "--steps", "192", "--envs", "2", "--output", tmp_path / "agent", "n_steps=32"
-        code, out, err = trained(capsys, tmp_path / "a.toml", *options, "--json")
+        code, out, err = trained(tmp_path / "a.toml", *options, "--json")
         told = json.loads(out)
         text = (tmp_path / "agent" / "evaluations.csv").read_text()
         rows = list(csv.DictReader(text.splitlines()))
@@ -276,29 +259,29 @@ class TestTrain:
             assert score["mean_reward"] == float(best[score["name"]])
         assert f"the agent after {best['steps']} steps" in err
 
-    def test_scenarios_are_the_evaluation(self, tmp_path, capsys):
+    def test_scenarios_are_the_evaluation(self, tmp_path, trained):
         fmugym.Task.from_dict(SCENARIOS).write(tmp_path / "a.toml")
         arguments = "learning_starts=10", "train_freq=20"
         options = "--steps", "100", "--envs", "2", "--episodes", "1", "--algorithm", "SAC"
         output = "--output", tmp_path / "agent"
-        code, out, _ = trained(capsys, tmp_path / "a.toml", *arguments, *options, *output)
+        code, out, _ = trained(tmp_path / "a.toml", *arguments, *options, *output)
         assert code == 0
         assert [line.split()[0] for line in out.splitlines()[1:]] == ["early", "late"]
         text = (tmp_path / "agent" / "evaluations.csv").read_text()
         rows = list(csv.DictReader(text.splitlines()))
         assert {"early", "late"} < rows[0].keys()
 
-    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, capsys):
+    def test_a_reward_that_never_changes_is_told_once(self, tmp_path, trained):
         fmugym.Task.from_dict(SCENARIOS | {"reward": "0"}).write(tmp_path / "a.toml")
         options = "--steps", "64", "--envs", "2", "--episodes", "1", "--output", tmp_path / "agent"
         own = "n_steps=8", "batch_size=16"
-        code, _, err = trained(capsys, tmp_path / "a.toml", *own, *options)
+        code, _, err = trained(tmp_path / "a.toml", *own, *options)
         assert code == 0
         assert err.count("the reward was 0") == 1
         assert err.count("in evaluation") > 2
 
     @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
-    def test_actions_are_scaled_and_observations_normalized(self, algorithm, tmp_path, capsys):
+    def test_actions_are_scaled_and_observations_normalized(self, algorithm, tmp_path, trained):
         """Gymnasium's wrapper of the same model gives the rewards that are told."""
         from stable_baselines3 import PPO, SAC
 
@@ -310,7 +293,7 @@ class TestTrain:
         options = "--steps", "64", "--envs", "2", "--episodes", "1", "--json"
         folder = tmp_path / "agent"
         chosen = "--algorithm", algorithm, "--output", folder
-        code, out, _ = trained(capsys, tmp_path / "a.toml", *own, *options, *chosen)
+        code, out, _ = trained(tmp_path / "a.toml", *own, *options, *chosen)
         assert code == 0
         model = {"PPO": PPO, "SAC": SAC}[algorithm].load(folder / "model.zip")
         normalization = pickle.loads((folder / "normalization.pkl").read_bytes())
@@ -340,21 +323,10 @@ class TestTrain:
         assert normalization.obs_rms["angle"].mean == pytest.approx(1000.0, rel=0.01)
         assert PPO.load(tmp_path / "agent" / "model.zip").action_space.high == [1.0]
 
-    def test_an_interruption_keeps_the_best_agent(self, tmp_path, capsys, monkeypatch):
-        def train(self):
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr("stable_baselines3.PPO.train", train)
-        folder = tmp_path / "agent"
-        options = "--output", folder, "--episodes", "1", "--envs", "2"
-        code, *_ = trained(capsys, CART_POLE, "n_steps=16", "batch_size=32", *options)
-        assert code == 130
-        assert (folder / "model.zip").exists()
-        code, out, _ = run(capsys, "evaluate", CART_POLE, "--agent", folder, "--episodes", "1")
-        assert (code, str(folder) in out) == (0, True)
-
     @pytest.mark.parametrize("evaluations", [1, 0])
-    def test_an_interruption_in_an_evaluation(self, tmp_path, capsys, monkeypatch, evaluations):
+    def test_an_interruption_in_an_evaluation(
+        self, tmp_path, cli, trained, monkeypatch, evaluations
+    ):
         """The agent is kept, although it was never evaluated if there is a second Ctrl-C."""
         from fmugym.training import training
 
@@ -370,13 +342,11 @@ class TestTrain:
         folder = tmp_path / "agent"
         options = "--output", folder, "--episodes", "1", "--envs", "2", "--steps", "400"
         arguments = "n_steps=32", "batch_size=32"
-        code, _, err = trained(capsys, tmp_path / "a.toml", *arguments, *options)
+        code, _, err = trained(tmp_path / "a.toml", *arguments, *options)
         assert code == 130
         assert "nothing was trained" not in err
         assert str(folder) in err
-        code, *_ = run(
-            capsys, "evaluate", tmp_path / "a.toml", "--agent", folder, "--episodes", "1"
-        )
+        code, *_ = cli("evaluate", tmp_path / "a.toml", "--agent", folder, "--episodes", "1")
         assert code == 0
         assert ("reward" in json.loads((folder / "agent.json").read_text())) == bool(evaluations)
 
@@ -390,9 +360,9 @@ class TestTrain:
             (["--steps", "0"], "--steps"),
         ],
     )
-    def test_mistakes(self, arguments, fact, tmp_path, capsys):
+    def test_mistakes(self, arguments, fact, tmp_path, trained):
         options = "--output", tmp_path / "agent"
-        code, _, err = trained(capsys, CART_POLE, *arguments, *options)
+        code, _, err = trained(CART_POLE, *arguments, *options)
         assert code == 1
         assert fact in err
         assert not (tmp_path / "agent").exists()
