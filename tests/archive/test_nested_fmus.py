@@ -11,8 +11,6 @@ from fmpy.container_fmu.config import Component, Configuration, Connection
 from fmpy.model_description import CoSimulation, ModelDescription, ModelVariable
 from fmu_tools import PlainEnv
 
-import fmugym
-
 STEP = 0.1
 CONFIG = {
     "model_input_names": ["u"],
@@ -127,11 +125,10 @@ def test_single(container, way):
 
 
 @pytest.mark.parametrize("way", list(WAYS))
-def test_vector(container, way):
-    envs = fmugym.FMUVectorEnv(lambda: PlainEnv(container, CONFIG, **WAYS[way]), num_envs=3)
+def test_vector(container, way, make_envs):
+    envs = make_envs(lambda: PlainEnv(container, CONFIG, **WAYS[way]), num_envs=3)
     x = np.array(envs.reset(seed=1)[0], float).T
     for u in np.random.default_rng(1).uniform(-1, 1, (5, 3)).astype(np.float32):
         found = envs.step(u[:, None])[0]
         x = by_hand(x, u)
         np.testing.assert_allclose(found.T, x, rtol=1e-5, atol=1e-6)
-    envs.close()

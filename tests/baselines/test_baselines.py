@@ -69,17 +69,13 @@ def controller_action(env, action):
 
 
 @pytest.fixture
-def house():
-    env = House()
-    yield env
-    env.close()
+def house(opened):
+    return opened(House())
 
 
 @pytest.fixture
-def pendulum():
-    env = Pendulum()
-    yield env
-    env.close()
+def pendulum(opened):
+    return opened(Pendulum())
 
 
 class TestPID:
@@ -252,8 +248,8 @@ def test_many_environments_are_controlled_as_single_ones(controller):
         env.close()
 
 
-def test_episodes_begin_where_the_mask_says():
-    envs = FMUVectorEnv(House, 2)
+def test_episodes_begin_where_the_mask_says(make_envs):
+    envs = make_envs(House, 2)
     controller = PID("T_air", 294.0, kp=0.05, ti=900.0).bind(envs)
     rows = np.array([[293.0, 300.0], [293.0, 300.0]])
     for _ in range(3):
@@ -261,7 +257,6 @@ def test_episodes_begin_where_the_mask_says():
     controller.reset(np.array([True, False]))
     first, second = controller.act(rows).ravel()
     assert first < second
-    envs.close()
 
 
 class TestMistakes:

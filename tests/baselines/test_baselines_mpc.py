@@ -63,51 +63,38 @@ def mpc(horizon="1h 40min", **arguments):
 
 
 @pytest.fixture
-def opened():
-    envs = []
-
+def env_of(opened):
     def make(task, **changes):
-        envs.append(fmugym.load(task) if isinstance(task, dict) else task(**changes))
-        return envs[-1].unwrapped
+        return opened(fmugym.load(task) if isinstance(task, dict) else task(**changes)).unwrapped
 
-    yield make
-    for env in envs:
-        env.close()
+    return make
 
 
 @pytest.fixture
-def bound():
-    controllers = []
-
-    def make(*arguments, **options):
-        controllers.append(mpc(*arguments, **options))
-        return controllers[-1]
-
-    yield make
-    for controller in controllers:
-        controller.close()
+def bound(opened):
+    return lambda *arguments, **options: opened(mpc(*arguments, **options))
 
 
 class TestPlans:
-    def test_are_nearly_the_best(self, opened, bound):
+    def test_are_nearly_the_best(self, env_of, bound):
         """The best is full push for four steps, and none afterwards."""
         best = [-((1 - 0.25 * step) ** 2) for step in (1, 2, 3, 4)]
         for arguments in ({}, {"perfect": True}):
-            actions, rewards = play(opened(wheel()), bound(**arguments), 12)
+            actions, rewards = play(env_of(wheel()), bound(**arguments), 12)
             assert rewards[:4] == pytest.approx(best, abs=0.02)
             assert np.abs(rewards[4:]).max() < 0.01
             assert actions[:3] == pytest.approx(np.ones((3, 1)), abs=0.05)
 
-    def test_are_the_same_again(self, opened, bound):
+    def test_are_the_same_again(self, env_of, bound):
         first, second, other = (
-            play(opened(wheel()), bound(seed=seed), 6)[0].tolist() for seed in (1, 1, 2)
+            play(env_of(wheel()), bound(seed=seed), 6)[0].tolist() for seed in (1, 1, 2)
         )
         assert first == second != other
 
-    def test_differ_by_two_pulses(self, opened, bound):
+    def test_differ_by_two_pulses(self, env_of, bound):
         """Most of them begin in the first half, with heights of all magnitudes."""
         controller = bound("10h")
-        controller.bind(opened(wheel()))
+        controller.bind(env_of(wheel()))
         changes = controller._changes(np.random.default_rng(0), 1000)[:, :, 0]
         jumps = np.diff(changes, axis=1, prepend=0.0, append=0.0) != 0
         assert jumps.any(axis=1).all()
@@ -116,25 +103,25 @@ class TestPlans:
         heights = np.abs(changes).max(axis=1)
         assert np.quantile(heights, [0.1, 0.9]) == pytest.approx([0.05, 0.6], rel=0.5)
 
-    def test_go_on_with_that_of_the_step_before(self, opened, bound):
+    def test_go_on_with_that_of_the_step_before(self, env_of, bound):
         """A search that finds nothing keeps what it had, step by step."""
         controller = bound(candidates=8, rounds=2)
-        env = opened(wheel())
+        env = env_of(wheel())
         play(env, controller, 1)
         episode = controller._episodes[0]
         before = episode.plan = np.linspace(1.0, 0.0, 10)[:, None]
         first = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
         assert first[0].ravel().tolist() == [*before[1:, 0], 0.0]
 
-    def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, opened, bound):
+    def test_are_not_worse_than_those_of_the_controller_they_begin_with(self, env_of, bound):
         """A search of two candidates a round finds little itself."""
         pid = {"of": "q_dot", "setpoint": 1.0, "kp": 2.0}
         few = {"candidates": 16, "rounds": 2}
-        _, alone = play(opened(wheel()), PID(**pid), 10)
-        _, rewards = play(opened(wheel()), bound(warm=PID(**pid), **few), 10)
+        _, alone = play(env_of(wheel()), PID(**pid), 10)
+        _, rewards = play(env_of(wheel()), bound(warm=PID(**pid), **few), 10)
         assert rewards.sum() > alone.sum() - 0.01
 
-    def test_begin_with_what_the_task_file_declares(self, opened, bound):
+    def test_begin_with_what_the_task_file_declares(self, env_of, bound):
         """Ranges have their middle; other plans are none."""
         given = {
             "pi": "pid of=q_dot setpoint=1 kp=1..4",
@@ -143,7 +130,7 @@ class TestPlans:
             "still": 0.0,
         }
         controller = bound()
-        env = opened(wheel(controllers=given))
+        env = env_of(wheel(controllers=given))
         play(env, controller, 2)
         episode = controller._episodes[0]
         pid, thermostat = episode.warm
@@ -152,11 +139,11 @@ class TestPlans:
         plans = controller._first_plans(episode, episode.snapshot[0], {}, np.zeros(4))
         assert plans.shape == (3, 10, 1)
         expected = PID("q_dot", 1.0, kp=2.5)
-        copies = opened(wheel())
+        copies = env_of(wheel())
         actions, _ = play(copies, expected, 11)
         assert 2 * plans[1, :, 0] - 1 == pytest.approx(actions[1:, 0], abs=0.01)
 
-    def test_of_several_environments_are_those_of_single_ones(self, opened, bound):
+    def test_of_several_environments_are_those_of_single_ones(self, env_of, bound):
         task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0, 0.5)})
         envs = fmugym.FMUVectorEnv(partial(fmugym.load, task), 2, autoreset_mode="Disabled")
         controller = bound().bind(envs)
@@ -167,45 +154,45 @@ class TestPlans:
             observations, *_, infos = envs.step(rows[-1])
         envs.close()
         for index in range(2):
-            alone, _ = play(opened(task), bound(), 4, seed=3 + index)
+            alone, _ = play(env_of(task), bound(), 4, seed=3 + index)
             assert np.array(rows)[:, index].tolist() == alone.tolist()
 
-    def test_balance_a_cart_pole(self, opened, bound):
-        _, rewards = play(opened(CartPoleEnv), bound("0.4s", perfect=True), 60)
+    def test_balance_a_cart_pole(self, env_of, bound):
+        _, rewards = play(env_of(CartPoleEnv), bound("0.4s", perfect=True), 60)
         assert len(rewards) == 60
 
 
 class TestCosts:
     @pytest.mark.parametrize(("limit", "length"), [(2.0, "10h"), (1.0, None)])
-    def test_stay_within_their_limits(self, opened, bound, limit, length):
+    def test_stay_within_their_limits(self, env_of, bound, limit, length):
         """Four full pushes would be best."""
         costs = {"effort": {"expr": "abs(push)", "limit": limit}}
-        env = opened(wheel(costs=costs, episode_length=length))
+        env = env_of(wheel(costs=costs, episode_length=length))
         actions, _ = play(env, bound("3h 20min"), 20)
         spent = np.abs(actions).sum()
         assert 0.03 * limit < spent <= limit
-        free, _ = play(opened(wheel()), bound("3h 20min"), 20)
+        free, _ = play(env_of(wheel()), bound("3h 20min"), 20)
         assert np.abs(free).sum() > 3.9
 
 
 class TestFuture:
-    def test_is_not_known_beyond_the_forecast(self, opened, bound):
+    def test_is_not_known_beyond_the_forecast(self, env_of, bound):
         later = CALM.copy()
         later[8:] = 1e-3
-        same = [play(opened(wheel(wind)), bound("4h"), 12)[0].tolist() for wind in (CALM, later)]
+        same = [play(env_of(wheel(wind)), bound("4h"), 12)[0].tolist() for wind in (CALM, later)]
         assert same[0] == same[1]
         known = [
-            play(opened(wheel(wind)), bound("8h", perfect=True), 4)[0].tolist()
+            play(env_of(wheel(wind)), bound("8h", perfect=True), 4)[0].tolist()
             for wind in (CALM, later)
         ]
         assert known[0] != known[1]
 
-    def test_is_known_as_far_as_the_forecast_goes(self, opened, bound):
+    def test_is_known_as_far_as_the_forecast_goes(self, env_of, bound):
         """Wind comes in half an hour; who knows brakes before it."""
         gust = CALM.copy()
         gust[3] = 1.5e-3
         rewards = {
-            forecast: play(opened(wheel(gust, forecast)), bound(), 18)[1].sum()
+            forecast: play(env_of(wheel(gust, forecast)), bound(), 18)[1].sum()
             for forecast in ("2h", None)
         }
         assert rewards["2h"] > rewards[None] + 0.05
@@ -240,7 +227,7 @@ class TestFuture:
         assert foresight.observed(np.zeros(1), np.zeros(1), 9.0)["wind"] == ([8.0, 9.0], [1.5, 1.5])
 
     @pytest.mark.parametrize("interpolation", ["linear", "previous"])
-    def test_mean_leaves_scenarios_out(self, opened, interpolation):
+    def test_mean_leaves_scenarios_out(self, env_of, interpolation):
         """Values of 1 from 10 to 12 January and on 30 December, which are held out; else 3."""
         days = np.full(365, 3.0)
         days[[9, 10, 11, 363]] = 1.0
@@ -251,7 +238,7 @@ class TestFuture:
         }
         task = wheel(observed=False, forecast=None, data={"wind": rows}, scenarios=scenarios)
         for scenario in (None, "frost"):
-            env = opened(partial(fmugym.load, task, scenario=scenario))
+            env = env_of(partial(fmugym.load, task, scenario=scenario))
             future = env.inside.future
             assert future.lookups["wind"].mean() < 2.99
             foresight = _Foresight(("q_dot",), future, DT, 3)
@@ -259,7 +246,7 @@ class TestFuture:
             assert values == pytest.approx([3.0], abs=1e-12)
 
     @pytest.mark.parametrize("scenario", [None, "autumn"])
-    def test_mean_is_that_of_the_season(self, opened, scenario):
+    def test_mean_is_that_of_the_season(self, env_of, scenario):
         """Values of 1 from November to March, with a week that begins on 1 March; else 5."""
         days = np.full(365, 5.0)
         days[304:], days[:66] = 1.0, 1.0
@@ -271,7 +258,7 @@ class TestFuture:
             data={"wind": {"values": days.repeat(24).tolist(), "step": HOUR}},
             scenarios={"autumn": {"start": "09-01", "length": "2d"}},
         )
-        future = opened(partial(fmugym.load, task, scenario=scenario)).inside.future
+        future = env_of(partial(fmugym.load, task, scenario=scenario)).inside.future
         assert future.lookups["wind"].mean(future.held_out) == pytest.approx(1.0, abs=0.01)
 
     def test_mean_of_a_day_that_repeats_is_that_of_the_day(self):
@@ -280,9 +267,9 @@ class TestFuture:
 
 
 class TestModel:
-    def test_is_corrected_by_offsets(self, opened, bound):
+    def test_is_corrected_by_offsets(self, env_of, bound):
         """The wheel begins by 0.24 faster than the copies, and so it stays."""
-        env = opened(wheel(parameters=wheel()["parameters"] | {"q_dot_0": 0.24}))
+        env = env_of(wheel(parameters=wheel()["parameters"] | {"q_dot_0": 0.24}))
         errors = {}
         for correction in (0.0, 0.5):
             controller = bound(correction=correction, model=partial(fmugym.load, wheel()))
@@ -291,44 +278,44 @@ class TestModel:
         assert errors[0.0] == pytest.approx(0.24, abs=0.03)
         assert errors[0.5] < 0.08
 
-    def test_begins_in_the_nominal_state(self, opened, bound):
+    def test_begins_in_the_nominal_state(self, env_of, bound):
         """Speeds are drawn around 0.5; that of the first copy begins there, others beside it."""
         task = wheel(parameters=wheel()["parameters"] | {"q_dot_0": fmugym.Uniform(0.4, 0.6)})
         controller = bound()
-        play(opened(task), controller, 1)
+        play(env_of(task), controller, 1)
         speeds = controller._episodes[0].seen[:, 0]
         assert speeds[0] == pytest.approx(0.5, abs=0.01)
         assert sorted(speeds[:9]) == pytest.approx(0.4 + 0.2 * (np.arange(9) + 0.5) / 9, abs=0.01)
 
-    def test_is_the_copy_that_fits_best(self, opened, bound):
+    def test_is_the_copy_that_fits_best(self, env_of, bound):
         """The wheel is lighter than the median; a thrust moves it further."""
         own = wheel()["parameters"] | {"m": fmugym.Uniform(0.5, 1.5)}
-        env, controller = opened(wheel(parameters=own)), bound(seed=1)
+        env, controller = env_of(wheel(parameters=own)), bound(seed=1)
         seed = next(s for s in range(99) if env.reset(seed=s)[1]["drawn"]["m"] < 0.6)
         play(env, controller, 4, seed)
         episode = controller._episodes[0]
         errors = np.abs(episode.seen[:, 0] - env.state[0])
         assert errors[episode.observer.best] < 0.5 * errors[0]
 
-    def test_copies_of_a_fitted_task_have_whole_rows(self, opened, bound, tmp_path):
+    def test_copies_of_a_fitted_task_have_whole_rows(self, env_of, bound, tmp_path):
         mass = np.random.default_rng(0).uniform(0.5, 1.5, 50)
         rows = np.stack([mass, 2.0 - mass], axis=1)
         np.savez(tmp_path / "rows.npz", names=np.array(["m", "l"]), rows=rows)
-        env = opened(wheel() | {"fitted": str(tmp_path / "rows.npz")})
+        env = env_of(wheel() | {"fitted": str(tmp_path / "rows.npz")})
         values = spread(env, 0)
         np.testing.assert_allclose(values["m"] + values["l"], 2.0)
         assert abs(values["m"][0] - np.median(mass)) < 0.05
         assert np.ptp(values["m"]) > 0.5
         play(env, bound(), 2)
 
-    def test_may_be_another_environment(self, opened, bound):
+    def test_may_be_another_environment(self, env_of, bound):
         """That of the planner is twice as heavy: it pushes too hard."""
         heavy = wheel(parameters=wheel()["parameters"] | {"m": 2.0})
         controller = bound(model=partial(fmugym.load, heavy), correction=0.0)
-        play(opened(wheel()), controller, 2)
+        play(env_of(wheel()), controller, 2)
         assert controller._episodes[0].seen[0, 0] == pytest.approx(0.125, abs=0.02)
 
-    def test_may_begin_in_the_observed_state(self, opened, bound):
+    def test_may_begin_in_the_observed_state(self, env_of, bound):
         """A pendulum swings up that is too heavy to be lifted; its sensors are noisy."""
         task = {
             "fmu": {"bundled": "Pendulum"},
@@ -355,7 +342,7 @@ class TestModel:
         }
         states = "theta:theta_0,theta_dot:theta_dot_0"
         controller = bound("1.5s", candidates=512, states=states)
-        _, rewards = play(opened(task), controller, 200, seed=2)
+        _, rewards = play(env_of(task), controller, 200, seed=2)
         assert rewards[:10].max() < -7.0
         assert rewards[-60:].min() > -4 * (1 - np.cos(np.radians(15))) - 0.1  # upright
 
@@ -368,9 +355,9 @@ class TestText:
         assert (controller.horizon, controller.candidates, controller.perfect) == (86400, 64, True)
         assert isinstance(controller.warm, PID)
 
-    def test_stands_in_task_files(self, opened):
+    def test_stands_in_task_files(self, env_of):
         text = "mpc horizon=1h candidates=32"
-        env = opened(wheel(controllers={"ahead": text}))
+        env = env_of(wheel(controllers={"ahead": text}))
         summary = simulate(env, policy_of(env, "ahead"), 0, 6)
         assert summary.total_reward > -2.0
 
@@ -405,11 +392,11 @@ class TestRefusals:
             (wheel(), {"model": CartPoleEnv}, "the model observes x, x_dot"),
         ],
     )
-    def test_of_tasks(self, opened, bound, task, arguments, reason):
+    def test_of_tasks(self, env_of, bound, task, arguments, reason):
         with pytest.raises(ConfigError, match=reason):
-            bound(**arguments).bind(opened(task))
+            bound(**arguments).bind(env_of(task))
 
-    def test_of_actions_that_are_several_choices(self, opened, bound):
+    def test_of_actions_that_are_several_choices(self, env_of, bound):
         class Several(CartPoleEnv):
             def _get_action_space(self):
                 return gymnasium.spaces.MultiDiscrete([2, 2])
@@ -420,17 +407,17 @@ class TestRefusals:
         with pytest.raises(
             ConfigError, match="gives one number, but the action space is MultiDiscrete"
         ):
-            bound().bind(opened(Several))
+            bound().bind(env_of(Several))
 
-    def test_of_plants(self, opened, bound):
-        plant = opened(partial(CartPoleEnv, backend="fmpy"))
+    def test_of_plants(self, env_of, bound):
+        plant = env_of(partial(CartPoleEnv, backend="fmpy"))
         with pytest.raises(ConfigError, match="a backend stands in for this one: give 'model'"):
             bound().bind(plant)
         _, rewards = play(plant, bound("0.4s", model=CartPoleEnv), 15)
         assert len(rewards) == 15
 
-    def test_of_slow_replays(self, opened, bound):
-        env = opened(partial(CartPoleEnv, fmi_version="1.0"))
+    def test_of_slow_replays(self, env_of, bound):
+        env = env_of(partial(CartPoleEnv, fmi_version="1.0"))
         controller = bound("0.4s", budget=1e-6).bind(env)
         observation, info = env.reset(seed=0)
         with pytest.raises(ConfigError, match="cannot save its state"):
@@ -524,7 +511,7 @@ class TestCommandLine:
         assert main(["tune", path, "mpc horizon=3600..7200"]) == 1
         assert "'mpc' cannot be tuned; known are: hysteresis, pid" in capsys.readouterr().err
 
-    def test_it_does_not_act_in_a_warm_up(self, opened):
+    def test_it_does_not_act_in_a_warm_up(self, env_of):
         table = {"period": "1h", "controller": "mpc horizon=1h"}
         with pytest.raises(ConfigError, match="none of in a warm-up"):
-            opened(wheel(warm_up=table))
+            env_of(wheel(warm_up=table))

@@ -92,22 +92,6 @@ def test_the_same_arguments_give_the_same_result():
     assert 0.05 <= first.parameters["kp"] <= 5
 
 
-def test_its_mean_return_is_that_of_single_environments():
-    """With the tuned controller and the same seeds; the steps are limited."""
-    found = tuned_house(seed=5)
-    env = HouseEnv()
-    returns = []
-    for seed in (5, 6):
-        controller, total = found.controller.bind(env), 0.0
-        observation, info = env.reset(seed=seed)
-        for _ in range(200):
-            observation, reward, *_, info = env.step(controller.act(observation, info))
-            total += reward
-        returns.append(total)
-    env.close()
-    assert found.mean_return == pytest.approx(np.mean(returns), rel=1e-9)
-
-
 def test_what_follows_the_end_of_an_episode_does_not_count():
     """A pendulum without torque falls; its one reward of the end is -1e4 and less."""
     found = tune(lambda action: _Same(action), Balance, {"action": fmugym.Uniform(0, 0)}, **TINY)
@@ -197,11 +181,10 @@ class TestMistakes:
         with pytest.raises(ValueError, match="this is wrong"):
             tune(Wrong, HouseEnv, {"action": fmugym.Uniform(0, 1)}, **TINY)
 
-    def test_an_array_of_another_size(self):
-        envs = FMUVectorEnv(HouseEnv, 3)
+    def test_an_array_of_another_size(self, make_envs):
+        envs = make_envs(HouseEnv, 3)
         for arguments in ({"kp": np.ones(2)}, {"kp": 1.0, "setpoint": np.ones(4)}):
             with pytest.raises(fmugym.ConfigError, match="numbers, but there are 3 environments"):
                 PID(**{"of": "T", "setpoint": 21.0, **arguments}).bind(envs)
         with pytest.raises(fmugym.ConfigError, match="each kp"):
             PID("T", 21.0, kp=np.array([1.0, np.nan]))
-        envs.close()

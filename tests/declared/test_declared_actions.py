@@ -8,7 +8,6 @@ from combinations import in_turn
 from vector_tools import require_same_alone
 
 import fmugym
-from fmugym import FMUVectorEnv
 from fmugym.errors import ConfigError, TaskError
 
 DT = 0.1
@@ -154,11 +153,11 @@ REWARDS = {
         "mode": ["next_step", "same_step"],
     }
 )
-def test_a_failed_step_costs_no_less_than(kind, hooks, mode):
+def test_a_failed_step_costs_no_less_than(kind, hooks, mode, make_envs):
     reward, expected = REWARDS[kind]
     own = {"config": {"fault_reward": -7}} if kind == "the file" else {}
     make = partial(fmugym.load, FAILING | {"reward": reward} | own)
-    envs, single = FMUVectorEnv(make, 2, hooks=hooks, autoreset_mode=mode), make()
+    envs, single = make_envs(make, 2, hooks=hooks, autoreset_mode=mode), make()
     envs.reset(seed=0)
     single.reset(seed=0)
     for _ in range(2):
@@ -175,5 +174,4 @@ def test_a_failed_step_costs_no_less_than(kind, hooks, mode):
         single.reset()
         if mode == "next_step":
             envs.step(action)
-    envs.close()
     single.close()

@@ -69,14 +69,13 @@ def test_noise_without_other_draws_differs_from_episode_to_episode(load):
     np.testing.assert_array_equal(first, same)
 
 
-def test_noise_differs_between_environments_of_a_vector():
-    envs = fmugym.FMUVectorEnv(partial(fmugym.load, task(parameters={}, noise=1.0)), 8)
+def test_noise_differs_between_environments_of_a_vector(make_envs):
+    envs = make_envs(partial(fmugym.load, task(parameters={}, noise=1.0)), 8)
     observed, info = envs.reset(seed=1)
     assert len(set(info["drawn"]["noise key"])) == 8
     for _ in range(3):
         assert len(set(observed[:, 0])) == 8
         observed, *_ = envs.step(np.full((8, 1), 0.01))
-    envs.close()
 
 
 def test_values_come_late(load):

@@ -137,9 +137,9 @@ def test_many_environments_equal_single_ones(caches, kind, hooks, mode):
 
 
 @pytest.mark.parametrize("controller", [PID, THERMOSTAT, "schedule 05:00=0.7 21:00=0.3", 0.5])
-def test_those_that_go_on_do_not_change(controller):
+def test_those_that_go_on_do_not_change(controller, make_envs):
     task = house(controller, clock=CLOCKS)
-    envs = FMUVectorEnv(partial(fmugym.load, task), 3, autoreset_mode="disabled")
+    envs = make_envs(partial(fmugym.load, task), 3, autoreset_mode="disabled")
     envs.reset(seed=2)
     envs.action_space.seed(1)
     envs.step(envs.action_space.sample())
@@ -147,7 +147,6 @@ def test_those_that_go_on_do_not_change(controller):
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     assert envs.call("inputs")[1] == before[1] != envs.call("inputs")[0]
     assert (envs.inside.pool.outputs == outputs).all(axis=0).tolist() == [False, True, False]
-    envs.close()
 
 
 def test_histories_hold_what_was_before_the_episode(load):
@@ -215,9 +214,9 @@ class TestCache:
         assert env.health["steps"] == 2 * 2 * STEPS
 
     @pytest.mark.parametrize("hooks", ["compiled", "array"])
-    def test_one_warm_up_serves_many_environments(self, hooks, load):
+    def test_one_warm_up_serves_many_environments(self, hooks, load, make_envs):
         task = self.task(clock=["01-15", "07-01 03:00"])
-        envs = FMUVectorEnv(partial(fmugym.load, task), 6, hooks=hooks)
+        envs = make_envs(partial(fmugym.load, task), 6, hooks=hooks)
         observations, infos = envs.reset(seed=0)
         assert len(set(infos["drawn"]["clock"])) == 2
         assert envs.health["steps"].sum() == 2 * 2 * STEPS
@@ -226,7 +225,6 @@ class TestCache:
             np.testing.assert_array_equal(single.reset(seed=seed)[0], observations[seed])
         envs.reset(seed=6)
         assert envs.health["steps"].sum() == 2 * 2 * STEPS
-        envs.close()
 
     def test_it_survives_on_disk(self, monkeypatch, load):
         agent = {"history": {"of": ["T", "u"], "length": "2h"}}

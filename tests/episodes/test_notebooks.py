@@ -11,11 +11,11 @@ from fmugym.envs import CartPoleEnv
 from fmugym.episodes.progress_bars import no_progress, progress
 
 
-def test_objects_are_shown_in_one_informative_line():
+def test_objects_are_shown_in_one_informative_line(make_envs):
     env = CartPoleEnv()
     single = "<CartPoleEnv of CartPole.fmu: f -> x, x_dot, phi, phi_dot every 0.02 s>"
     assert repr(env) == single
-    many = fmugym.FMUVectorEnv(CartPoleEnv, 3)
+    many = make_envs(CartPoleEnv, 3)
     assert repr(many) == f"<FMUVectorEnv of 3: {single}>"
     path = fmugym.bundled_fmu("House")
     told = f"FMU({str(path)!r}: House, FMI 2.0, 4 inputs, 9 outputs, 17 parameters)"
@@ -24,7 +24,6 @@ def test_objects_are_shown_in_one_informative_line():
     assert repr(task).startswith("Task('cart_pole.toml': ['f'] -> ['x', ")
     assert repr(fmugym.Task.from_dict({"class": "a:B"})) == "Task('task': 'a:B')"
     env.close()
-    many.close()
 
 
 class Failing(fmugym.FMI2CSEnv):

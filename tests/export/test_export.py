@@ -12,6 +12,7 @@ from export_tools import (
     TIMED,
     TIMES,
     acting,
+    agent_named,
     arguments_of,
     built,
     closed_loop,
@@ -359,12 +360,10 @@ class TestFiles:
         assert "malloc" not in source.read_text()
 
     def test_two_agents_live_in_one_program(self, tmp_path):
-        env = made("CartPole")
         agents = [
-            compiled(agent_of(env, network_for(env, seed=seed), name=name), tmp_path)
+            compiled(agent_named(name, seed), tmp_path)
             for seed, name in enumerate(["left", "right"])
         ]
-        env.close()
         for agent in agents:
             agent.begin()
         seen = np.random.default_rng(0).normal(size=(50, 4)).tolist()
@@ -372,9 +371,7 @@ class TestFiles:
         assert chosen[0] != chosen[1]
 
     def test_nothing_is_overwritten(self, tmp_path):
-        env = made("CartPole")
-        agent = agent_of(env, network_for(env))
-        env.close()
+        agent = agent_named()
         write_c(agent, tmp_path)
         with pytest.raises(FileExistsError, match=r"agent\.h"):
             write_c(agent, tmp_path)
@@ -383,10 +380,8 @@ class TestFiles:
 
     @pytest.mark.parametrize("name", ["math", "agent_fmi2", "a-b", "ä", "2a", ""])
     def test_names_that_are_none(self, name):
-        env = made("CartPole")
         with pytest.raises(ConfigError, match="name"):
-            agent_of(env, network_for(env), name=name)
-        env.close()
+            agent_named(name)
 
     @pytest.mark.parametrize("bad", [np.nan, np.inf])
     def test_a_measurement_that_is_not_finite_changes_nothing(self, bad, tmp_path):

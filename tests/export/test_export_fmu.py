@@ -18,6 +18,7 @@ from export_tools import (
     TIMED,
     TIMES,
     acting,
+    agent_named,
     differences,
     drawn_in,
     made,
@@ -347,9 +348,7 @@ class TestMistakes:
                 controller.step(0.0, 900.0)
 
     def test_are_refused_by_the_writer(self, tmp_path):
-        env = made("CartPole")
-        agent = agent_of(env, network_for(env))
-        env.close()
+        agent = agent_named()
         for arguments, fact in [
             ({"fmi_version": "1.0"}, "'1.0'"),
             ({"platforms": ["x86-linux"]}, "'x86_64-linux'"),
@@ -364,10 +363,7 @@ class TestMistakes:
 
 @in_turn({"name": ["get", "agent", "controller"], "version": VERSIONS}, ["version"])
 def test_names_of_agents_meet_no_others(name, version, tmp_path):
-    env = made("CartPole")
-    agent = agent_of(env, network_for(env), name=name)
-    env.close()
-    path = write_fmu(agent, tmp_path / f"{name}.fmu", fmi_version=version)
+    path = write_fmu(agent_named(name), tmp_path / f"{name}.fmu", fmi_version=version)
     with controller_of(path, tmp_path) as controller:
         controller.begin()
         controller.step(0.0, 0.02)
@@ -381,9 +377,7 @@ class TestTypes:
         [("Boolean", "Boolean", ctypes.c_bool), ("Integer", "Int32", ctypes.c_int32)],
     )
     def test_of_outputs(self, type_, named, dtype, version, tmp_path):
-        env = made("CartPole")
-        agent = agent_of(env, network_for(env), name="agent")
-        env.close()
+        agent = agent_named()
         (force,) = agent.logic.inputs
         force = dataclasses.replace(force, type=type_, minimum=-np.inf, maximum=np.inf)
         logic = dataclasses.replace(agent.logic, inputs=(force,))

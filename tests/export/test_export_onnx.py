@@ -12,6 +12,7 @@ from export_tools import (
     FUNCTIONS,
     Runner,
     acting,
+    agent_named,
     arguments_of,
     closed_loop,
     exported,
@@ -168,9 +169,7 @@ class TestModel:
         env.close()
 
     def test_nothing_is_overwritten(self, tmp_path):
-        env = made("CartPole")
-        agent = agent_of(env, network_for(env))
-        env.close()
+        agent = agent_named()
         write_onnx(agent, tmp_path / "agent.onnx")
         with pytest.raises(FileExistsError, match=r"agent\.onnx"):
             write_onnx(agent, tmp_path / "agent.onnx")

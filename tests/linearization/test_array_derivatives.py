@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from values_tools import LARGER, STEP, Env
 
 import fmugym
-from fmugym import ConfigError, FMUVectorEnv
+from fmugym import ConfigError
 from fmugym.linearization import derivatives, linearize, linearize_along
 
 KINDS = pytest.mark.parametrize("kind", ["Directional", "Adjoint"])
@@ -66,14 +66,14 @@ def discrete():
 
 
 @in_turn({"method": ["directional", "differences"], "options": [{}, {"isolation": "process"}]})
-def test_along_a_trajectory(tmp_path, method, options):
+def test_along_a_trajectory(tmp_path, method, options, make_envs):
     path = made(tmp_path)
 
     def make():
         parameters = {"model_parameters": LARGER, "model_input_names": "u"}
         return Env(path, model_output_names=["y"], **parameters, **options)
 
-    envs = FMUVectorEnv(make, 2)
+    envs = make_envs(make, 2)
     envs.reset(seed=0)
     start = envs.save_state()[0]
     states = {"x": "x_0"} if method == "differences" else None
@@ -90,15 +90,14 @@ def test_along_a_trajectory(tmp_path, method, options):
     for step, u in enumerate(U):
         assert found.x[step] == pytest.approx(x, abs=1e-7)
         x = a @ x + b @ u
-    envs.close()
 
 
-def test_derivatives_of_a_rollout(tmp_path):
+def test_derivatives_of_a_rollout(tmp_path, make_envs):
     def make():
         parameters = {"model_parameters": LARGER, "model_input_names": "u"}
         return Env(made(tmp_path), model_output_names=["y", "x[2]"], **parameters)
 
-    envs = FMUVectorEnv(make, 2)
+    envs = make_envs(make, 2)
     envs.reset(seed=0)
     found = derivatives(envs, envs.save_state()[0], U)
     a, b = discrete()
@@ -111,4 +110,3 @@ def test_derivatives_of_a_rollout(tmp_path):
                 wanted = rows @ np.linalg.matrix_power(a, step - action) @ b
                 wanted = wanted + direct * (action == step)
             assert found.by_actions[step, :, action] == pytest.approx(wanted, abs=1e-3)
-    envs.close()

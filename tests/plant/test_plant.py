@@ -125,10 +125,8 @@ class TestShadow:
 
 
 @pytest.fixture
-def line(server):
-    found = Line(server.address)
-    yield found
-    found.close()
+def line(server, opened):
+    return opened(Line(server.address))
 
 
 def tags_with(**others):
@@ -166,22 +164,19 @@ class TestFaults:
         assert len(text.splitlines()) == 10
 
     @pytest.mark.parametrize("hold", [0, "1h"])
-    def test_what_held_is_a_gap_of_the_log(self, clock, tmp_path, monkeypatch, hold):
+    def test_what_held_is_a_gap_of_the_log(self, shadowed, tmp_path, monkeypatch, hold):
         """An agent goes on with the last value; whoever reads the record finds nothing measured."""
         gone = []
         changed(monkeypatch, lambda values: {"T": (np.nan,)} if gone else {})
         task = house(stale_after="1min", hold=hold)
-        with (
-            Server(house(), "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as shadow,
-        ):
-            env, seen = RecordSeries(shadow, path=tmp_path / "plant.csv"), []
-            env.reset(seed=0)
-            for step in range(9):
-                gone[:] = [True] * (step in (4, 5))
-                observation, *_, info = env.step(np.float32([0.1 * step]))
-                seen.append((float(observation[0]), info["missing"]))
-            env.complete()
+        shadow = shadowed(task, house())
+        env, seen = RecordSeries(shadow, path=tmp_path / "plant.csv"), []
+        env.reset(seed=0)
+        for step in range(9):
+            gone[:] = [True] * (step in (4, 5))
+            observation, *_, info = env.step(np.float32([0.1 * step]))
+            seen.append((float(observation[0]), info["missing"]))
+        env.complete()
         assert [missing for _, missing in seen] == [("T",) * (k in (4, 5)) for k in range(9)]
         acted = [4 if k in (5, 6) and hold == 0 else k for k in range(9)]
         np.testing.assert_allclose(env.series["proposed.u"][1:], np.multiply(acted, 0.1), atol=1e-6)
@@ -224,43 +219,34 @@ class TestFaults:
         ):
             env.reset()
 
-    def test_a_tag_that_does_not_exist(self, server, clock):
+    def test_a_tag_that_does_not_exist(self, shadowed):
         task = house(tags=tags_with(T_floor={"register": 900, "type": "int16"}))
-        with (
-            watched(clock, server.address, task) as env,
-            pytest.raises(
-                ConfigError, match=r"T_floor: holding 900 of unit 1: .*ILLEGAL_ADDRESS"
-            ) as told,
-        ):
+        env, said = shadowed(task, house()), r"T_floor: holding 900 of unit 1: .*ILLEGAL_ADDRESS"
+        with pytest.raises(ConfigError, match=said) as told:
             env.reset()
         assert "power: " not in str(told.value)
 
-    def test_a_wrong_type(self, server, clock):
+    def test_a_wrong_type(self, shadowed):
         wrong = {"register": 0, "type": "float64", "unit": "K", "word_order": "little"}
-        with (
-            watched(clock, server.address, house(tags=tags_with(T=wrong))) as env,
-            pytest.raises(ConfigError, match=r"T: got .*expected 10 to 30.*'type'"),
-        ):
+        env = shadowed(house(tags=tags_with(T=wrong)), house())
+        with pytest.raises(ConfigError, match=r"T: got .*expected 10 to 30.*'type'"):
             env.reset()
 
-    def test_a_clock_that_jumps(self, clock, monkeypatch):
+    def test_a_clock_that_jumps(self, shadowed, monkeypatch):
         jump = [0.0]
         changed(monkeypatch, lambda values: {"clock": (values["clock"][0] + jump[0],)})
-        with (
-            Server(house(), "thermostat", clock=clock) as server,
-            watched(clock, server.address, house()) as env,
-        ):
-            env.reset(seed=0)
-            env.step(np.float32([0.5]))
-            before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
-            *_, truncated, info = env.step(np.float32([0.5]))
-            assert truncated
-            assert "clock has jumped by 14400 s" in info["fault"]
-            env.reset()
-            assert float(env.unwrapped.time) >= before + jump[0]
-            *_, truncated, info = env.step(np.float32([0.5]))
-            assert not truncated
-            assert "fault" not in info
+        env = shadowed(house())
+        env.reset(seed=0)
+        env.step(np.float32([0.5]))
+        before, jump[0] = float(env.unwrapped.time), 4 * 3600.0
+        *_, truncated, info = env.step(np.float32([0.5]))
+        assert truncated
+        assert "clock has jumped by 14400 s" in info["fault"]
+        env.reset()
+        assert float(env.unwrapped.time) >= before + jump[0]
+        *_, truncated, info = env.step(np.float32([0.5]))
+        assert not truncated
+        assert "fault" not in info
 
     def test_answers_that_are_two_seconds_late(self):
         """Values are older then, but ticks come in time."""
@@ -375,38 +361,32 @@ class TestData:
         with pytest.raises(ConfigError, match=r"T_out.* 14400 s ahead.*got 2 and 7200"):
             connect(self.task(prices, count=2))
 
-    def test_is_what_the_agent_sees(self, clock, prices):
+    def test_is_what_the_agent_sees(self, shadowed, prices):
         task = self.task(prices)
         year = fmugym.load(house(), physical=True)
         table = read_data(year.task.root.child("data").child("T_out"))
         year.close()
-        with (
-            Server(task, "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as env,
-        ):
-            observation, _ = env.reset(seed=0)
-            for _ in range(3):
-                names = env.unwrapped.observation_names
-                seen = dict(zip(names, observation.tolist(), strict=True))
-                now = float(env.unwrapped.time)
-                for name, ahead in (("", 0.0), ("[+7200 s]", 7200.0), ("[+14400 s]", 14400.0)):
-                    price = (now + ahead) // 3600 - 300 * 24
-                    assert seen[f"price{name}"] == pytest.approx(price)
-                    outside = np.interp(now + ahead, table.times, table.values)
-                    assert seen[f"T_out{name}"] == pytest.approx(outside, abs=0.15)
-                observation, *_, info = env.step(np.float32([0.3]))
-                assert "fault" not in info
+        env = shadowed(task)
+        observation, _ = env.reset(seed=0)
+        for _ in range(3):
+            names = env.unwrapped.observation_names
+            seen = dict(zip(names, observation.tolist(), strict=True))
+            now = float(env.unwrapped.time)
+            for name, ahead in (("", 0.0), ("[+7200 s]", 7200.0), ("[+14400 s]", 14400.0)):
+                price = (now + ahead) // 3600 - 300 * 24
+                assert seen[f"price{name}"] == pytest.approx(price)
+                outside = np.interp(now + ahead, table.times, table.values)
+                assert seen[f"T_out{name}"] == pytest.approx(outside, abs=0.15)
+            observation, *_, info = env.step(np.float32([0.3]))
+            assert "fault" not in info
 
-    def test_is_in_the_record(self, clock, prices, tmp_path):
+    def test_is_in_the_record(self, shadowed, prices, tmp_path):
         """Prices and time of the record make its rewards, not those of the task."""
         task = self.task(prices)
-        with (
-            Server(task, "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as shadow,
-        ):
-            env = RecordSeries(shadow, path=tmp_path / "plant.csv")
-            simulate(env, action_of(env.unwrapped, "0.5"), 0, 6)
-            env.complete()
+        shadow = shadowed(task)
+        env = RecordSeries(shadow, path=tmp_path / "plant.csv")
+        simulate(env, action_of(env.unwrapped, "0.5"), 0, 6)
+        env.complete()
         task.document["clock"] = {"from": "01-01", "to": "02-01"}
         log = PlantLog.read(tmp_path / "plant.csv")
         found = as_logged(task, log)
@@ -415,17 +395,14 @@ class TestData:
         (recording,) = play_log(log, lambda **more: fmugym.load(task, physical=True, **more))
         assert abs(recording.rewards.sum() - env.series["reward"][1:].sum()) > 0.01
 
-    def test_a_file_that_is_not_refreshed(self, clock, prices):
+    def test_a_file_that_is_not_refreshed(self, shadowed, prices):
         task = self.task(prices)
         prices[1](5)
-        with (
-            Server(task, "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as env,
-        ):
-            env.reset(seed=0)
-            infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
-            prices[1](24)
-            *_, info = env.step(np.float32([0.3]))
+        env = shadowed(task)
+        env.reset(seed=0)
+        infos = [env.step(np.float32([0.3]))[-1] for _ in range(5)]
+        prices[1](24)
+        *_, info = env.step(np.float32([0.3]))
         assert infos[0]["missing"] == ()
         assert infos[-1]["missing"] == ("price",)
         assert "prices.csv" in infos[-1]["fault"]
@@ -527,17 +504,14 @@ class TestMPC:
 
 
 class TestServer:
-    def test_tells_what_sensors_show(self, clock):
+    def test_tells_what_sensors_show(self, shadowed):
         task = house()
         task.document["variables"]["T"]["noise"] = 0.5
-        with (
-            Server(task, "thermostat", clock=clock) as server,
-            watched(clock, server.address, house()) as shadow,
-        ):
-            env = RecordSeries(shadow)
-            env.reset(seed=0)
-            for _ in range(10):
-                env.step(np.float32([0.5]))
+        shadow = shadowed(house(), task)
+        env = RecordSeries(shadow)
+        env.reset(seed=0)
+        for _ in range(10):
+            env.step(np.float32([0.5]))
         assert np.diff(env.series["T"], 2).std() > 0.5
         assert np.diff(env.series["T_floor"], 2).std() < 5.0
 
@@ -584,16 +558,6 @@ class TestCommands:
         assert f"seed 0: reward {reward:.6g}, cost" in said
         assert "in 3 steps (2700 s)" in said
 
-    def test_simulate_plant_with_mpc(self, file, clock, capsys, monkeypatch):
-        monkeypatch.setattr("fmugym.tools.plants.RealClock", lambda speed: clock)
-        with Server(house(), "thermostat", clock=clock) as server:
-            given = ["--plant", server.address, "--ahead", "30min", "--steps", "4"]
-            controller = "mpc horizon=4h candidates=32"
-            assert main(["simulate", file, *given, "--controller", controller, "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert told["episodes"][0]["steps"] == 4
-        assert {one["ahead"] for one in told["predictions"]} == {900.0, 1800.0}
-
     def test_simulate_plant(self, file, clock, capsys, monkeypatch):
         monkeypatch.setattr("fmugym.tools.plants.RealClock", lambda speed: clock)
         controller = "pid of=T setpoint=21 kp=0.5 ti=14400"
@@ -636,7 +600,7 @@ class TestCommands:
         assert "--modbus or --opcua" in capsys.readouterr().err
 
     @pytest.mark.parametrize("protocol", ["modbus", "opcua"])
-    def test_serve_proposes_tags(self, protocol, clock, tmp_path, monkeypatch, capsys):
+    def test_serve_proposes_tags(self, protocol, shadowed, tmp_path, monkeypatch, capsys):
         """With what is printed, the task reads all that it needs: here 48 hours of prices."""
         if protocol == "opcua":
             pytest.importorskip("asyncua", reason="needs asyncua, of the extra plant")
@@ -653,13 +617,10 @@ class TestCommands:
         pasted = Task.read("house.toml")
         assert set(pasted.document["plant"]["tags"]) == {"u", "T", "T_floor", "power"}
         assert pasted.document["plant"]["data"]["price"]["count"] == 97
-        with (
-            Server(pasted, "thermostat", clock=clock) as server,
-            watched(clock, server.address, pasted) as env,
-        ):
-            observation, _ = env.reset(seed=0)
-            names = env.unwrapped.observation_names
-            seen = dict(zip(names, observation.tolist(), strict=True))
+        env = shadowed(pasted)
+        observation, _ = env.reset(seed=0)
+        names = env.unwrapped.observation_names
+        seen = dict(zip(names, observation.tolist(), strict=True))
         table = read_data(pasted.root.child("data").child("price"))
         later = float(env.unwrapped.time) + 48 * 3600.0
         here = np.searchsorted(table.times, later % table.period, side="right") - 1

@@ -97,19 +97,15 @@ def test_a_server_that_goes_and_comes_back(server, clock):
     assert np.all(np.diff(series["time"]) == STEP)
 
 
-def test_bad_quality(clock, monkeypatch):
+def test_bad_quality(shadowed, monkeypatch):
     bad = []
     changed(monkeypatch, lambda values: {"T": (np.nan,)} if bad else {})
     task = house("opcua", stale_after="2min", hold="20min")
-    with (
-        Server(task, "thermostat", clock=clock) as server,
-        watched(clock, server.address, task) as shadow,
-    ):
-        env = RecordSeries(shadow)
-        env.reset(seed=0)
-        env.step(np.float32([0.5]))
-        bad.append(True)
-        infos = [env.step(np.float32([u]))[-1] for u in (0.4, 0.3, 0.2)]
+    env = RecordSeries(shadowed(task))
+    env.reset(seed=0)
+    env.step(np.float32([0.5]))
+    bad.append(True)
+    infos = [env.step(np.float32([u]))[-1] for u in (0.4, 0.3, 0.2)]
     assert "T: node ns=2;s=House.T: BadSensorFailure" in infos[0]["fault"]
     assert "T_floor" not in infos[0]["fault"]
     assert [one["missing"] for one in infos] == [("T",)] * 3
@@ -126,12 +122,10 @@ def test_bad_quality(clock, monkeypatch):
     ],
     ids=["a tag that does not exist", "a wrong type"],
 )
-def test_tags_that_are_refused(server, clock, node, message):
+def test_tags_that_are_refused(shadowed, node, message):
     tags = dict(house("opcua").document["plant"]["tags"]) | {"T_floor": node}
-    with (
-        watched(clock, server.address, house("opcua", tags=tags)) as env,
-        pytest.raises(ConfigError, match=message),
-    ):
+    env = shadowed(house("opcua", tags=tags), house("opcua"))
+    with pytest.raises(ConfigError, match=message):
         env.reset()
 
 
@@ -167,22 +161,16 @@ class TestEncryption:
         assert b"House.T" not in line.sent
         assert b"secret of the plant" not in line.sent
 
-    def test_a_certificate_that_is_refused(self, clock, keys):
+    def test_a_certificate_that_is_refused(self, shadowed, keys):
         task = self.task(keys, "other")
-        with (
-            Server(self.task(keys), "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as env,
-            pytest.raises(SimulationError, match=r"refuses this client: BadCertificateUntrusted"),
-        ):
+        env = shadowed(task, self.task(keys))
+        with pytest.raises(SimulationError, match=r"refuses this client: BadCertificateUntrusted"):
             env.reset()
 
-    def test_a_server_with_another_certificate(self, clock, keys):
+    def test_a_server_with_another_certificate(self, shadowed, keys):
         task = self.task(keys, server_certificate=keys["other"]["certificate"])
-        with (
-            Server(self.task(keys), "thermostat", clock=clock) as server,
-            watched(clock, server.address, task) as env,
-            pytest.raises(SimulationError, match=r"its certificate is not that of '.*other.der'"),
-        ):
+        env = shadowed(task, self.task(keys))
+        with pytest.raises(SimulationError, match=r"its certificate is not that of '.*other.der'"):
             env.reset()
 
     def test_needs_a_certificate(self):

@@ -330,17 +330,11 @@ class TestWindow:
         pygame.display.quit()
 
     @pytest.fixture
-    def open_window(self):
-        renderers = []
-
+    def open_window(self, opened):
         def open_window(scene=CART_POLE, size=(600, 400), fps=1000.0, **options):
-            renderer = Renderer(scene, size, fps, render_mode="human", **options)
-            renderers.append(renderer)
-            return renderer
+            return opened(Renderer(scene, size, fps, render_mode="human", **options))
 
-        yield open_window
-        for renderer in renderers:
-            renderer.close()
+        return open_window
 
     def test_a_frame_is_shown(self, open_window):
         assert open_window(title="My cart").render(UPRIGHT) is None
