@@ -142,7 +142,7 @@ class Arena:
         Environments from ``count`` on rest, as do those whose episodes have ended.
         """
         observations, infos = envs.reset(seed=seeds)
-        totals: FloatArray = np.empty(0)
+        totals: FloatArray = np.zeros(())
         running = np.arange(len(seeds)) < count
         for _ in range(self._most_steps):
             count = int(np.count_nonzero(running))
@@ -157,8 +157,6 @@ class Arena:
             observations, rewards, terminated, truncated, infos = result
             moments = controller.moments if has_moments else ()
             values = rewards, *(infos["costs"][name] for name in self._limits), *moments
-            totals = totals if len(totals) else np.zeros((len(values), len(seeds)))
-            for total, value in zip(totals, values, strict=True):
-                np.add(total, value, out=total, where=running)
+            totals = totals + np.where(running, np.stack(values), 0.0)
             running = running & ~(terminated | truncated)
         return totals

@@ -80,6 +80,7 @@ class ResolvedTask:
         warm_up: What happens in warm-ups; None if there is none, or inputs do not move in it.
         cost_limits: What the costs of an episode may add up to, by name.
         unphysical_keys: The keys for which observations or actions are not in the task's units.
+        expressions: All expressions of the task.
 
     Raises:
         ConfigError: If the task has mistakes, does not fit the FMU, or contradicts itself. The text
@@ -116,7 +117,7 @@ class ResolvedTask:
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
         self.warm_up = self._make_warm_up() if self._warm_steps else None
         self.action_masks = self._action_masks()
-        self.unphysical_keys = declared.unphysical_keys
+        self.unphysical_keys, self.expressions = declared.unphysical_keys, declared.expressions
         limits = {name: term.limit for name, term in declared.costs.items()}
         self.cost_limits = {name: limit for name, limit in limits.items() if limit is not None}
 

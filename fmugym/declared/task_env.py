@@ -42,6 +42,7 @@ class TaskEnv(FMUEnv):
         cost_limits: What the costs of an episode may add up to, by name, as the task says.
         unphysical_keys: The keys of the task for which observations or actions are not in its
             units; none in its physical form, which controllers need, see ``Task.physical``.
+        expressions: Those of the task, of rewards and costs among others, as they are parsed.
 
     Raises:
         ConfigError: If the task has a mistake or does not fit its FMU. The text tells the file, the
@@ -72,7 +73,7 @@ class TaskEnv(FMUEnv):
         self.inside.quantities, self.inside.future = resolved.quantities, resolved.future
         self.inside.controllers = resolved.controllers
         self.cost_limits, self._warm_up = resolved.cost_limits, resolved.warm_up
-        self.unphysical_keys = resolved.unphysical_keys
+        self.unphysical_keys, self.expressions = resolved.unphysical_keys, resolved.expressions
         if resolved.warm_up is not None and "_get_inputs" in _own_hooks(type(self)):
             raise self.task.root.child("warm_up").error(
                 f"{type(self).__name__} has a _get_inputs of its own, so that the file cannot say "

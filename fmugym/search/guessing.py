@@ -18,15 +18,16 @@ _NOT_MEASURED: Final = ("setpoints", "data", "memory")
 
 
 def guessed_controllers(document: Mapping[str, Any], env: Any) -> list[str]:
-    """PI controllers for the differences in the reward, each with both signs of the gain.
+    """PI controllers for the differences in a task, each with both signs of the gain.
 
     Args:
         document: What the task declares.
         env: Its environment in the physical form, with one action that is a number.
 
     Returns:
-        Texts for ``search_of``; none if the reward has no difference between something measured
-        that the agent observes, and a set point that it observes, or a number.
+        Texts for ``search_of``; none if no expression of the task, such as its reward, has a
+        difference between something measured that the agent observes, and a set point that it
+        observes, or a number.
     """
     space, seen, names = env.action_space, env.observation_space, env.observation_names
     if not isinstance(space, spaces.Box) or space.shape not in ((), (1,)) or names is None:
@@ -35,7 +36,7 @@ def guessed_controllers(document: Mapping[str, Any], env: Any) -> list[str]:
     reach = (space.high - space.low).item()
     longest = (env.config.max_episode_steps or 100) * env.config.time_step
     found: set[str] = set()
-    for of, setpoint in _pairs(document, set(names)):
+    for of, setpoint in _pairs(document, env):
         known = abs(setpoint) if isinstance(setpoint, float) else 0.0
         width = widths[of] if np.isfinite(widths[of]) else known or 1.0
         found |= {*both_controllers(of, setpoint, reach / width, (env.config.time_step, longest))}
@@ -59,31 +60,20 @@ def both_controllers(
     return f"{text}{low}..{high} {rest}", f"{text}-{high}..-{low} {rest}"
 
 
-def _pairs(document: Mapping[str, Any], observed: set[str]) -> Iterator[tuple[Any, Any]]:
-    """What is measured, and its set point: from the set points, and the differences in rewards."""
-    for name, entry in document.get("setpoints", {}).items():
-        of = entry.get("of") if isinstance(entry, Mapping) else None
-        if {of, name} <= observed:
-            yield of, name
+def _pairs(document: Mapping[str, Any], env: Any) -> Iterator[tuple[Any, Any]]:
+    """What is measured, and what it shall be: the two sides of a minus in an expression."""
+    observed = {*env.observation_names}
     given = {name for section in _NOT_MEASURED for name in document.get(section, {})}
-    for sides in _differences(document):
-        for of, setpoint in (sides, sides[::-1]):
-            is_known = isinstance(setpoint, float) or setpoint in observed
-            if of in observed - given and is_known:
-                yield of, setpoint
-                break
-
-
-def _differences(document: Mapping[str, Any]) -> Iterator[tuple[Any, Any]]:
-    """What is on both sides of each minus: a name, a number, or None for anything else."""
-    for section in ("reward", "costs", "expressions"):
-        terms = document.get(section, {})
-        for term in terms.values() if isinstance(terms, Mapping) else [terms]:
-            text = term.get("expr") if isinstance(term, Mapping) else term
-            tree = ast.parse(text.strip() if isinstance(text, str) else "0", mode="eval")
-            for node in ast.walk(tree):
-                if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
-                    yield _side(node.left), _side(node.right)
+    measured = observed - given
+    for expression in getattr(env, "expressions", ()):
+        for node in ast.walk(expression.tree):
+            if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+                sides = _side(node.left), _side(node.right)
+                for of, setpoint in (sides, sides[::-1]):
+                    is_known = isinstance(setpoint, float) or setpoint in observed
+                    if of in measured and is_known:
+                        yield of, setpoint
+                        break
 
 
 def _side(node: ast.expr) -> str | float | None:

@@ -135,6 +135,11 @@ class Agent:
                 raise ValueError(f"expected finite numbers of the shapes {shapes}")
             return agent
 
+    @property
+    def is_found(self) -> bool:
+        """Whether nothing is missing."""
+        return not has_range(self.text) and len(self.weights) == self.size
+
     # Its network.
 
     @property

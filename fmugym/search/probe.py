@@ -43,7 +43,7 @@ class Probe:
         task: See ``task_of``.
         linear: The linear policy without a controller, whose weights are missing.
         agents: Controllers that the task declares and that do not plan ahead. Without any, those
-            that suggest themselves.
+            that suggest themselves, or else a constant action.
         limits: What each cost may add up to in an episode.
         length: The steps of an episode; None if they are not limited.
         is_same: Whether all episodes are the same.
@@ -84,6 +84,7 @@ class Probe:
             if not plans_ahead(one)
         ]
         linear = Agent("linear", None, len(policy.names), policy.acting)
+        constant = Agent("constant action", acting=policy.acting)
         rows = linear.extended(np.random.default_rng(0).uniform(-1, 1, (FEW, policy.acting)))
 
         def play(actions: int, most_steps: int) -> tuple[Any, float]:
@@ -99,7 +100,7 @@ class Probe:
         return cls(
             task,
             linear,
-            agents or [Agent("PI", text) for text in guesses],
+            agents or [Agent("PI", one) for one in guesses] or [constant],
             limits,
             length,
             is_same=bool((seen == seen[:, :1]).all()),

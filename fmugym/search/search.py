@@ -91,15 +91,8 @@ class Search:
         self.episodes = 1 if probe.is_same else _EPISODES
         self.rounds, self.steps = 0, MOST_PROBED
         self._rng = np.random.default_rng(seed)
-        self._fixed = [one for one in probe.agents if not has_range(one.text)]
-        self._tuned = [
-            Entrant(Axes(search_of(one.text).ranges).search(FEW, self._rng), one, self.episodes)
-            for one in probe.agents
-            if has_range(one.text)
-        ]
-        if not probe.agents:
-            constant = Agent("constant action", acting=probe.linear.acting)
-            self._tuned = [self._entrant(constant)]
+        self._fixed = [one for one in probe.agents if one.is_found]
+        self._tuned = [self._entrant(one) for one in probe.agents if not one.is_found]
         self._contenders: list[Entrant] = []
         self.best: Agent | None = None
         self.baseline: Agent | None = None
@@ -191,7 +184,9 @@ class Search:
         return Entrant(self._cma(agent), agent, self.episodes, then)
 
     def _cma(self, agent: Agent) -> CMA:
-        """The search for the weights of an agent, which begins with those that it has, or 0."""
+        """The search for what an agent lacks; that for weights begins with its own ones, or 0."""
+        if has_range(agent.text):
+            return Axes(search_of(agent.text).ranges).search(FEW, self._rng)
         mean = agent.weights if len(agent.weights) else np.zeros(agent.size)
         sigma = _OF_NETWORKS if agent.hidden else 1.0
         sigma *= 1.0 if agent.text is None else _OF_CORRECTIONS

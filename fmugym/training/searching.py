@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from fmugym.baselines.arena import MOST_ENVS, Arena, CeilingError
-from fmugym.baselines.parsing import has_range, plans_ahead, warmed
+from fmugym.baselines.parsing import plans_ahead, warmed
 from fmugym.env import FMUEnv
 from fmugym.episodes.progress_bars import Advance, no_progress
 from fmugym.errors import ConfigError, reading, shown
@@ -323,14 +323,5 @@ def _first_lines(probe: Probe) -> Iterator[str]:
         )
     if probe.length is None:
         yield f"warning: episodes have no length; they are stopped after {probe.most_steps} steps"
-    agents = probe.agents
-    if not agents:
-        yield "to be beaten: the best constant action, since no controller suggests itself"
-    elif agents[0].name in probe.task.get("controllers", ()):
-        tuned = (one.name + " (to be tuned)" * has_range(one.text) for one in agents)
-        yield f"to be beaten: {', '.join(tuned)}, as the task declares"
-    else:
-        yield (
-            f"to be beaten: the best of {len(agents)} PI controllers for the differences in the "
-            "reward, since the task declares no controllers"
-        )
+    agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
+    yield f"to be beaten: {', '.join(dict.fromkeys(agents))}"
