@@ -78,7 +78,7 @@ _MEANS: Final = ("Radiation", "Illuminance", "Luminance")
 _WIDTH: Final = len(_DATES) + len(_CODES)
 _PERIODS: Final = re.compile(r"^DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,.*)?$", re.M)
 _TABLE: Final = re.compile(
-    r"^\s*(?:double|float)\s+([^\s(]+)\s*\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\).*$", re.M
+    r"^\s*(?:double|float)\s+([^\s(]+)\s*\(\s*([1-9]\d{0,8})\s*,\s*([1-9]\d{0,8})\s*\).*$", re.M
 )
 _SEPARATORS: Final = str.maketrans(",;", "  ")
 
@@ -184,8 +184,6 @@ def _modelica_table(what: str, shape: tuple[str, str], cells: str, is_weather: b
     with reading(f"{what} is damaged"):
         numbers = np.array(cells.translate(_SEPARATORS).split(), np.float64)
         numbers = numbers.reshape(*map(int, shape))
-    if not numbers.size:
-        raise ConfigError(f"{what} has no rows")
     times, width = numbers[:, 0], len(numbers.T)
     period = float(times[-1] - times[0])
     is_left = np.append(np.diff(times) == 0, True)  # the first row comes again after the last one

@@ -208,7 +208,7 @@ class Policy(Controller):
         """See ``Controller.bind``; observations may be of any numeric space."""
         is_vector = hasattr(env, "single_observation_space")
         self._seen = env.single_observation_space if is_vector else env.observation_space
-        names = tuple(names or self._names_of(env))
+        names = names and tuple(names)
         if self.baseline is not None:
             self.baseline.bind(env, names)
         base, self.masks = env.unwrapped, None

@@ -133,11 +133,9 @@ class Searching:
         Raises:
             ConfigError: If there is none, it is damaged, or it is of another task.
         """
-        path, name = self.folder / STATE, shown(str(self.folder))
-        if not path.exists():
-            raise ConfigError(f"{name} has no search to resume")
-        with reading(f"the search in {name} cannot be resumed"):
-            found: Search = pickle.loads(path.read_bytes())
+        name = shown(str(self.folder))
+        with reading(f"{name} has no search to resume"):
+            found: Search = pickle.loads((self.folder / STATE).read_bytes())
             before = found.probe.task
         with closing(self.make_env()) as env:
             now = task_of(env)

@@ -208,7 +208,7 @@ class TestCourse:
         assert content(folder) == before
         (folder / "search.pkl").write_bytes(b"broken")
         code, _, err = cli("train", task, "--output", folder, "--resume")
-        assert (code, "cannot be resumed" in err) == (1, True)
+        assert (code, "no search to resume" in err) == (1, True)
 
     def test_an_interruption_before_anything_is_found(self, task, tmp_path, searched, monkeypatch):
         Interruption(monkeypatch, 0)

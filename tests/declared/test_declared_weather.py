@@ -321,7 +321,7 @@ class TestModelica:
             (TABLES.replace("50", ""), {"table": "tab1"}, "'tab1' of x.txt.* 8 .*3, ?3"),
             (TABLES.replace("50", "fifty"), {"table": "tab1"}, "fifty"),
             (TABLES.replace("7200", "60"), {"table": "prices"}, "60 s"),
-            ("#1\ndouble a(0,2)\n", {}, "no rows"),
+            ("#1\ndouble a(0,2)\n", {}, "no table"),
             ("#1\ndouble a(999999999,999999999)\n1\n", {}, "'a'"),
             ("#1\n1 2\n", {}, "no table"),
         ],

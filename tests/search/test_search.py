@@ -746,6 +746,7 @@ def test_episodes_become_twice_as_many_while_halves_of_them_hardly_correlate(noi
 
 
 GIVEN = Agent("given", "pid of=theta setpoint=0 kp=1")
+CONSTANT = Agent("constant action", acting=1)
 
 
 def search_of_agents(*agents):
@@ -768,7 +769,7 @@ def test_only_the_best_controller_is_tuned_to_the_end():
 
 
 def test_a_search_that_gains_nothing_ends():
-    search, field = search_of_agents(), Field(-1e-9)
+    search, field = search_of_agents(CONSTANT), Field(-1e-9)
     while not search.is_over:
         search.advance(field)
         assert search.rounds < 2000
