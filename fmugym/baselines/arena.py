@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
-from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -83,10 +82,10 @@ class Arena:
         make_env: Callable[[], Any],
         most_envs: int = MOST_ENVS,
         most_steps: int = MOST_STEPS,
-        limits: Mapping[str, float] = MappingProxyType({}),
+        limits: Mapping[str, float] | None = None,
     ) -> None:
         self._make_env, self._most_envs, self._most_steps = make_env, most_envs, most_steps
-        self._limits = limits
+        self._limits = limits or {}
         self._envs: FMUVectorEnv | None = None
         self.steps, self.seconds, self.ceiling = 0, 0.0, math.inf
 

@@ -61,7 +61,7 @@ class CMA:
         self._gains = np.sqrt(self._fades * (2 - self._fades) * mass)
         self._paths = np.zeros((2, n))
         speed = (n + 2) / 3 if self._is_separable else 1.0
-        self._rate_one = min(1.0, speed * 2 / ((n + 1.3) ** 2 + mass))
+        self._rate_one = speed * 2 / ((n + 1.3) ** 2 + mass)
         rate = speed * 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)
         self._rate_many = min(1 - self._rate_one, rate)
         self._usual_length = math.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))

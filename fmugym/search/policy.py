@@ -357,7 +357,7 @@ def require_task(
         ConfigError: With what differs.
     """
     (names, actions), (given, taken) = own, here
-    gone, more = ([n for n in a if n not in b] for a, b in ((names, given), (given, names)))
+    gone, more = sorted({*names} - {*given}), sorted({*given} - {*names})
     told = {
         f"it observes {', '.join(gone)}, which this task does not give": gone,
         f"this task also gives {', '.join(more)}": more,

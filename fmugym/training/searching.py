@@ -122,8 +122,18 @@ class Searching:
                 f"{self.steps} steps are too few: a look at the task takes {MOST_PROBED} at most"
             )
         probe = Probe.of(self.make_env, self.envs)
-        for line in _first_lines(probe):
-            self.tell(line)
+        if probe.only_return is not None:
+            self.tell(
+                f"warning: all episodes have reached {probe.only_return:g}, whatever the actions: "
+                "what is to be learned?"
+            )
+        if probe.length is None:
+            self.tell(
+                "warning: episodes have no length; they are stopped after "
+                f"{probe.most_steps} steps"
+            )
+        agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
+        self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
         self.folder.mkdir(parents=True, exist_ok=True)
         return Search(probe, self.seed)
 
@@ -242,9 +252,11 @@ class Searching:
     def _text(self) -> str:
         """The scores, for a line of progress."""
         found = self._found
-        best = f", best {found.merit[1]:.6g}" if found.best else ""
-        base = f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}" if found.baseline else ""
-        return f"round {found.rounds}{best}{base}"
+        text = f"round {found.rounds}"
+        if found.baseline:
+            base = f"{found.baseline.name} {found.merit_of_baseline[1]:.6g}"
+            text += f", best {found.merit[1]:.6g}, {base}"
+        return text
 
     def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
@@ -310,16 +322,3 @@ class Searching:
                         f"left out: {name}, whose test would take about {minutes:.0f} min; "
                         "'fmugym evaluate' compares it with the agent"
                     )
-
-
-def _first_lines(probe: Probe) -> Iterator[str]:
-    """What may be wrong with the task, and what is to be beaten."""
-    if probe.only_return is not None:
-        yield (
-            f"warning: all episodes have reached {probe.only_return:g}, whatever the actions: what "
-            "is to be learned?"
-        )
-    if probe.length is None:
-        yield f"warning: episodes have no length; they are stopped after {probe.most_steps} steps"
-    agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
-    yield f"to be beaten: {', '.join(dict.fromkeys(agents))}"
