@@ -269,11 +269,6 @@ class Policy(Controller):
         width = len(self.names)
         return np.full(width, np.nan), np.zeros(width), np.zeros(self.acting)
 
-    def constant(self, name: str, value: float) -> Agent:
-        """The agent that always gives all elements of the action one value."""
-        weights = self.told([value] * len(self.middle))
-        return Agent(name, acting=self.acting, weights=weights)
-
     def step(
         self, observed: Any, memory: Memory, base: Any, network: Callable[[Any], Any]
     ) -> tuple[list[Any], Memory]:

@@ -79,7 +79,7 @@ class Probe:
             length = env.config.max_episode_steps or limit
             limits = dict(getattr(env, "cost_limits", {}))
         agents = [
-            Agent(name, one) if isinstance(one, str) else policy.constant(name, one)
+            Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
             for name, one in task.get("controllers", {}).items()
             if not plans_ahead(one)
         ]

@@ -1135,7 +1135,7 @@ class TestSearch:
         told = []
         guessed = {"reward": "-abs(theta - 0.1)", "controllers": None, "told": told}
         facts = searched(tmp_path / "agent", rounds=32, **guessed)
-        assert "2 PI controllers" in told[0]
+        assert "PI (to be tuned)" in told[0]
         assert facts["baseline"] == "tuned PI"
 
     def test_without_any_constant_actions_are_tuned(self, tmp_path):
