@@ -148,7 +148,7 @@ class Arena:
             if not count:
                 break
             if self.steps + count > self.ceiling:
-                raise CeilingError(f"all {self.ceiling:g} steps are done")
+                raise CeilingError(f"{self.ceiling:g} steps are too few: give more")
             self.steps += count
             actions = controller.act(observations, infos)
             are_all = count == len(seeds)

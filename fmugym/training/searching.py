@@ -188,6 +188,7 @@ class Searching:
 
         Raises:
             ConfigError: If nothing was found.
+            CeilingError: If no round has had enough steps.
         """
         try:
             self._go_on()
@@ -196,10 +197,7 @@ class Searching:
                 self._save(self._found.best)
         self.tell(self._text())
         self._arena.ceiling = self.steps
-        try:
-            winner = self._found.winner(self._arena)
-        except CeilingError:  # no round has had enough steps
-            winner = None
+        winner = self._found.winner(self._arena)
         if winner is None:
             raise ConfigError(
                 f"{self._found.rounds} rounds are too few to find anything: give more --minutes, "
@@ -285,36 +283,35 @@ class Searching:
         if winner is found.baseline:
             self.tell(f"nothing was found that beats {winner.name}: the folder has that controller")
         baseline = found.baseline or winner
-        agents = {winner.name: winner}
-        for other in [baseline, *found.others()]:
-            agents.setdefault(other.name, other)
         arenas = {
             name: self._arena_of(make, probe.most_steps if make is self.make_env else _LONGEST)
             for name, make in self.scenarios.items()
         }
         usual = _EPISODES if len(arenas) < 2 else _OF_SCENARIO
         count = 1 if probe.is_same else self.episodes or usual
+        agents = {winner.name: winner}
+        planners = self._planners(baseline.text, count * len(arenas))
+        for other in [baseline, *found.others(), *planners]:
+            agents.setdefault(other.name, other)
         test = judge(agents, arenas, count)
-        steps = sum(one.steps for one in arenas.values()) / len(agents)
-        planners = {one.name: one for one in self._planners(baseline.text, steps)}
-        test |= judge(planners, arenas, count)
         return self._save(winner, test=test, verdict=verdict(test, probe.limits))
 
-    def _planners(self, baseline: str | None, steps: float) -> Iterator[Agent]:
+    def _planners(self, baseline: str | None, episodes: int) -> Iterator[Agent]:
         """The controllers that plan ahead and whose test takes no longer than the search.
 
         They begin with the plan of the baseline.
 
         Args:
             baseline: The text of a controller.
-            steps: Those of the test of an agent. The first ones tell how long a step takes.
+            episodes: Those of the test. Its first steps tell how long a step takes.
         """
         for name, text in self._probe.task.get("controllers", {}).items():
             if plans_ahead(text):
                 agent = Agent(name, warmed(text, baseline))
                 with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
                     agent.play(arena, range(1))
-                minutes = arena.seconds / arena.steps * steps / 60.0
+                pace = arena.seconds / arena.steps
+                minutes = pace * self._probe.most_steps * episodes / 60.0
                 if minutes <= (self.minutes or _MINUTES):
                     yield agent
                 else:
