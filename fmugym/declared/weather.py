@@ -80,7 +80,6 @@ _PERIODS: Final = re.compile(r"^DATA PERIODS\s*,\s*\d+\s*,\s*([1-9]\d?)\s*(?:,.*
 _TABLE: Final = re.compile(
     r"^\s*(?:double|float)\s+([^\s(]+)\s*\(\s*([1-9]\d{0,8})\s*,\s*([1-9]\d{0,8})\s*\).*$", re.M
 )
-_SEPARATORS: Final = str.maketrans(",;", "  ")
 
 
 class Table(NamedTuple):
@@ -123,7 +122,7 @@ def _records(text: str) -> tuple[int, FloatArray]:
     lines = text[head.end() :].splitlines() if head else []
     rows = [line.split(",")[:_WIDTH] for line in lines if line.strip()]
     widths = {len(row) for row in rows}
-    if head is None or len(widths) != 1 or min(widths) <= len(_DATES):
+    if head is None or len(widths) != 1:
         raise ValueError(
             f"expected rows of {_WIDTH} cells below a line such as 'DATA PERIODS,1,1,Data,Sunday,"
             "1/1,12/31'"
@@ -182,7 +181,7 @@ def read_modelica(name: str, lines: Sequence[str]) -> dict[str, Table]:
 
 def _modelica_table(what: str, shape: tuple[str, str], cells: str, is_weather: bool) -> Table:
     with reading(f"{what} is damaged"):
-        numbers = np.array(cells.translate(_SEPARATORS).split(), np.float64)
+        numbers = np.array(cells.translate(str.maketrans(",;", "  ")).split(), np.float64)
         numbers = numbers.reshape(*map(int, shape))
     times, width = numbers[:, 0], len(numbers.T)
     period = float(times[-1] - times[0])

@@ -14,8 +14,6 @@ __all__ = ["both_controllers", "guessed_controllers"]
 _DECADES: Final = 100.0
 """Gains are tried from this part of the ratio of the ranges to this multiple of it."""
 
-_NOT_MEASURED: Final = ("setpoints", "data", "memory")
-
 
 def guessed_controllers(document: Mapping[str, Any], env: Any) -> list[str]:
     """PI controllers for the differences in a task, each with both signs of the gain.
@@ -63,7 +61,8 @@ def both_controllers(
 def _pairs(document: Mapping[str, Any], env: Any) -> Iterator[tuple[Any, Any]]:
     """What is measured, and what it shall be: the two sides of a minus in an expression."""
     observed = {*env.observation_names}
-    given = {name for section in _NOT_MEASURED for name in document.get(section, {})}
+    sections = "setpoints", "data", "memory"
+    given = {name for section in sections for name in document.get(section, {})}
     measured = observed - given
     for expression in getattr(env, "expressions", ()):
         for node in ast.walk(expression.tree):

@@ -234,7 +234,7 @@ class Search:
 
         These are the baseline and the best two searches, each by its best numbers and by its
         present mean. That may be better, without having shown it in the fewer episodes of earlier
-        validations. If there is one only, it need not play.
+        validations.
         """
         if self.baseline is None:
             agents, searches = list(self._fixed), self._tuned
@@ -246,17 +246,13 @@ class Search:
                 agents.append(one.best)
             if one.rounds:
                 agents.append(one.make.with_numbers(one.cma.mean))
-        if len(agents) < 2:
-            return agents, range(0)
-        most = self.rounds * FEW * self.episodes // (_PART * len(agents))
+        most = self.rounds * FEW * self.episodes // (_PART * (len(agents) or 1))
         return agents, self._seeds(_FINAL, min(_LAST, max(self.episodes, most)))
 
     def winner(self, arena: Arena) -> Agent | None:
         """The best agent in the last validation; None if nobody can compete in it."""
         agents, seeds = self.last_validation()
-        if seeds:
-            return _best_of(arena, agents, seeds)[0]
-        return agents[0] if agents else None
+        return _best_of(arena, agents, seeds)[0] if agents else None
 
 
 def _best_of(arena: Arena, agents: Sequence[Agent], seeds: Sequence[int]) -> tuple[Agent, Merit]:

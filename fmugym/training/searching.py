@@ -151,8 +151,9 @@ class Searching:
             now = task_of(env)
         changed = [key for key in {**before, **now} if before.get(key) != now.get(key)]
         if changed:
-            differing = ", ".join(changed)
-            raise ConfigError(f"the search in {name} is of a task that differs in {differing}")
+            raise ConfigError(
+                f"the search in {name} is of a task that differs in {', '.join(changed)}"
+            )
         return found
 
     def _arena_of(self, make_env: Callable[[], Any], most_steps: int) -> Arena:
@@ -252,8 +253,8 @@ class Searching:
         found = self._found
         text = f"round {found.rounds}"
         if found.baseline:
-            base = f"{found.baseline.name} {found.merit_of_baseline[1]:.6g}"
-            text += f", best {found.merit[1]:.6g}, {base}"
+            text += f", best {found.merit[1]:.6g}"
+            text += f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}"
         return text
 
     def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
