@@ -129,8 +129,7 @@ class Searching:
             )
         if probe.length is None:
             self.tell(
-                "warning: episodes have no length; they are stopped after "
-                f"{probe.most_steps} steps"
+                f"warning: episodes have no length; they are stopped after {probe.most_steps} steps"
             )
         agents = (one.name + " (to be tuned)" * (not one.is_found) for one in probe.agents)
         self.tell(f"to be beaten: {', '.join(dict.fromkeys(agents))}")
