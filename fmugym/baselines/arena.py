@@ -54,7 +54,7 @@ class Outcome(NamedTuple):
         bounds = np.array([*self.limits.values()])
         sizes = np.where(bounds == 0.0, 1.0, np.abs(bounds))
         beyond = np.maximum(self.costs.mean(axis=1) - bounds, 0.0)
-        excess: FloatArray = (beyond / sizes).sum(axis=1)
+        excess = (beyond / sizes).sum(axis=1)
         return list(zip((-excess).tolist(), self.returns.mean(axis=1).tolist(), strict=True))
 
 
@@ -116,7 +116,7 @@ class Arena:
         for part in np.split(jobs, range(envs.num_envs, len(jobs), envs.num_envs)):
             who, which = np.divmod(np.resize(part, envs.num_envs), len(seeds))
             controller = make(numbers[who]).bind(envs)
-            own = [seeds[index] for index in which.tolist()]
+            own = np.array(seeds)[which].tolist()
             begin = perf_counter()
             totals = self._play(envs, controller, own, len(part), has_moments)
             self.seconds += perf_counter() - begin

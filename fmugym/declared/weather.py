@@ -22,10 +22,10 @@ from fmugym.errors import ConfigError, reading, shown
 
 __all__ = ["Cells", "FloatArray", "Table", "read_modelica", "read_weather"]
 
-Cells = Sequence[Any] | npt.NDArray[np.float64]
-"""The cells of a column: texts of a CSV file, values of a Parquet file, numbers."""
-
 FloatArray = npt.NDArray[np.float64]
+
+Cells = Sequence[Any] | FloatArray
+"""The cells of a column: texts of a CSV file, values of a Parquet file, numbers."""
 
 _HOUR: Final = 3600.0
 _DAY: Final = 86400.0

@@ -61,9 +61,8 @@ def both_controllers(
 def _pairs(document: Mapping[str, Any], env: Any) -> Iterator[tuple[Any, Any]]:
     """What is measured, and what it shall be: the two sides of a minus in an expression."""
     observed = {*env.observation_names}
-    sections = "setpoints", "data", "memory"
-    given = {name for section in sections for name in document.get(section, {})}
-    measured = observed - given
+    given = [document.get(section, {}) for section in ("setpoints", "data", "memory")]
+    measured = observed.difference(*given)
     for expression in getattr(env, "expressions", ()):
         for node in ast.walk(expression.tree):
             if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):

@@ -359,6 +359,6 @@ def require_task(
         "the order of the observations differs": not (gone or more) and [*names] != [*given],
         f"its actions are {actions}, here they are {taken}": actions != taken,
     }
-    if any(told.values()):
-        differences = "; ".join(text for text, differs in told.items() if differs)
-        raise ConfigError(f"{agent} is for another task: {differences}")
+    differences = [text for text, differs in told.items() if differs]
+    if differences:
+        raise ConfigError(f"{agent} is for another task: {'; '.join(differences)}")

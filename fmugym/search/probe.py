@@ -75,8 +75,7 @@ class Probe:
             require_numbers(env.observation_space, env.action_space)
             policy, task = Policy(None).bind(env), task_of(env)
             guesses = guessed_controllers(task, env)
-            limit = getattr(env.spec, "max_episode_steps", None)
-            length = env.config.max_episode_steps or limit
+            length = env.config.max_episode_steps or getattr(env.spec, "max_episode_steps", None)
             limits = dict(getattr(env, "cost_limits", {}))
         agents = [
             Agent(name, one if isinstance(one, str) else f"schedule 00:00={one}")
@@ -103,8 +102,8 @@ class Probe:
             agents or [Agent("PI", one) for one in guesses] or [constant],
             limits,
             length,
-            is_same=bool((seen == seen[:, :1]).all()),
-            only_return=float(returns[0, 0]) if (returns == returns[0, 0]).all() else None,
+            is_same=not np.ptp(seen, axis=1).any(),
+            only_return=float(returns[0, 0]) if np.ptp(returns) == 0 else None,
             seconds=seconds,
         )
 

@@ -99,21 +99,18 @@ class Search:
         self.merit = self.merit_of_baseline = NO_MERIT
 
     @property
-    def is_tuned(self) -> bool:
-        """Whether the numbers of all controllers are found, so that policies come next."""
-        return not self._tuning
-
-    @property
     def is_over(self) -> bool:
         """Whether nothing more is gained."""
         return self.baseline is not None and not self._active
 
     @property
-    def _tuning(self) -> list[Entrant]:
-        """The controllers whose numbers are sought now: at last those of the best one alone."""
-        new = [one for one in self._tuned if one.rounds < _TRIAL]
-        ranked = sorted(self._tuned, key=lambda one: one.merit)
-        return new or [one for one in ranked[-1:] if one.rounds < _TUNING]
+    def tuning(self) -> Entrant | None:
+        """The controller whose numbers are sought next, at last those of the best one alone."""
+        new = min(self._tuned, key=lambda one: one.rounds, default=None)
+        if new is None or new.rounds < _TRIAL:
+            return new
+        best = max(self._tuned, key=lambda one: one.merit)
+        return best if best.rounds < _TUNING else None
 
     @property
     def _active(self) -> list[Entrant]:
@@ -128,8 +125,8 @@ class Search:
 
     def advance(self, arena: Arena) -> None:
         """Go on by one round, or by the two that tell what observations are like."""
-        if not self.is_tuned:
-            self._play(min(self._tuning, key=lambda one: one.rounds), arena)
+        if self.tuning:
+            self._play(self.tuning, arena)
         elif self.baseline is None:
             self.best, self.merit = _best_of(arena, self.others(), self._seeds(VALIDATION))
             self.baseline, self.merit_of_baseline = self.best, self.merit

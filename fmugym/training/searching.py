@@ -241,7 +241,7 @@ class Searching:
         found = self._found
         if found.is_over or found.rounds >= self.rounds:
             return True
-        if not self._is_enough and found.is_tuned and found.baseline is None:
+        if not self._is_enough and not found.tuning and found.baseline is None:
             return True
         done, seconds = self._arena.steps - self._before, monotonic() - self._begin
         pace = seconds / done if done else self._probe.seconds
@@ -250,11 +250,9 @@ class Searching:
     def _text(self) -> str:
         """The scores, for a line of progress."""
         found = self._found
-        text = f"round {found.rounds}"
-        if found.baseline:
-            text += f", best {found.merit[1]:.6g}"
-            text += f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}"
-        return text
+        best = f", best {found.merit[1]:.6g}" if found.best else ""
+        base = f", {found.baseline.name} {found.merit_of_baseline[1]:.6g}" if found.baseline else ""
+        return f"round {found.rounds}{best}{base}"
 
     def _save(self, agent: Agent, **more: Any) -> dict[str, Any]:
         """Write an agent, its facts, and the state of the search."""
@@ -310,8 +308,7 @@ class Searching:
                 agent = Agent(name, warmed(text, baseline))
                 with closing(Arena(self.make_env, most_steps=_TRIED)) as arena:
                     agent.play(arena, range(1))
-                pace = arena.seconds / arena.steps
-                minutes = pace * self._probe.most_steps * episodes / 60.0
+                minutes = arena.seconds / arena.steps * self._probe.most_steps * episodes / 60.0
                 if minutes <= (self.minutes or _MINUTES):
                     yield agent
                 else:

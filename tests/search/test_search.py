@@ -763,7 +763,7 @@ def test_only_the_best_controller_is_tuned_to_the_end():
     text = "pid of=theta setpoint=0 kp=1..2"
     names = "one", "better", "another"
     search, field = search_of_agents(*(Agent(name, text) for name in names)), Uneven(1.0)
-    while not search.is_tuned:
+    while search.tuning:
         search.advance(field)
     assert [one.rounds for one in search._tuned] == [10, 30, 10]
 
