@@ -20,7 +20,7 @@ import numpy.typing as npt
 from fmugym.checks import check_integer, check_path, require_regular
 from fmugym.declared.entries import Entry
 from fmugym.declared.weather import Cells, FloatArray, Table, read_modelica, read_weather
-from fmugym.errors import ConfigError, reason, shown, unknown_name
+from fmugym.errors import ConfigError, reading, reason, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.signals import ordinary
 
@@ -273,7 +273,8 @@ def read_csv(path: Path, content: bytes) -> dict[str, tuple[str, ...]]:
         content: What it has.
 
     Raises:
-        ConfigError: If it has no rows, or they are not of one length, or it is no text in UTF-8.
+        ConfigError: If it has no rows, they are not of one length, a cell has more than 128 KiB,
+            or it is no text in UTF-8.
     """
     try:
         file = io.StringIO(content.decode("utf-8-sig"), newline="")
@@ -281,7 +282,8 @@ def read_csv(path: Path, content: bytes) -> dict[str, tuple[str, ...]]:
         raise ConfigError(f"{shown(str(path))} is not encoded in UTF-8") from None
     delimiter = ";" if ";" in file.readline() else ","
     file.seek(0)
-    header, *rows = [row for row in csv.reader(file, delimiter=delimiter) if row] or [[]]
+    with reading(f"{path.name} is no table"):
+        header, *rows = [row for row in csv.reader(file, delimiter=delimiter) if row] or [[]]
     for number_of_row, row in enumerate(rows, 2):
         if len(row) != len(header):
             raise ConfigError(

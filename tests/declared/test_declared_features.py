@@ -213,6 +213,7 @@ class TestFiles:
             (CSV.replace("20", "n/a"), {}, "row 3.*'n/a'"),
             (CSV.replace("7200", "60"), {}, "60 s"),
             (CSV.replace("3600;20;b", "3600;20"), {}, "row 3 .* 2 cells, expected 3"),
+            (CSV.replace("b", "b" * 200_000), {}, "is no table: field larger than"),
             (CSV.replace("time", "hour"), {}, "'hour'"),
             (CSV.replace("7200", "noon"), {}, "noon"),
             ("", {"file": None, "column": None, "values": [], "step": 1}, "at least one value"),
