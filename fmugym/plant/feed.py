@@ -15,7 +15,7 @@ from fmugym.fmi.status import Status
 from fmugym.plant.live import Live
 from fmugym.plant.polling import Poller
 from fmugym.plant.tags import Plant
-from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.pool.base import FloatArray
 
 __all__ = ["Feed", "local_time", "told"]
@@ -153,9 +153,7 @@ class Feed:
         self.time += self._plant.step
         self._sleep()
         off = self._seen_ahead() - self._ahead
-        tolerance = max(
-            min(_LEAST_JUMP, self._plant.step), _LATE * getattr(self.clock, "speed", 1.0)
-        )
+        tolerance = max(min(_LEAST_JUMP, self._plant.step), _LATE * speed_of(self.clock))
         self.jump = off if abs(off) > tolerance else 0.0
         if not self.jump:
             self._ahead += min(off, 0.0)  # an answer is late, and never early

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, Protocol
 from fmugym.errors import FMUGymError
 from fmugym.plant.background import Background
 from fmugym.plant.tags import Tag
-from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.backend.clocks import Clock, speed_of
 from fmugym.signals import ordinary
 
 __all__ = ["Answer", "Client", "LostError", "Poller", "RefusedError", "Round"]
@@ -91,7 +91,7 @@ class Poller:
 
     def __init__(self, client: Client, clock: Clock, interval: float, timeout: float) -> None:
         self._client, self._clock, self._timeout = client, clock, timeout
-        self._interval, self._speed = interval, getattr(clock, "speed", 1.0)
+        self._interval, self._speed = interval, speed_of(clock)
         self._rounds: deque[Round] = deque(maxlen=_MOST)
         self._trouble = "it has not answered yet"
         self.answers: dict[str, Answer] = {}

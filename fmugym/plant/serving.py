@@ -21,7 +21,7 @@ from fmugym.plant.background import Background
 from fmugym.plant.modbus import serve_modbus
 from fmugym.plant.opcua import serve_opcua
 from fmugym.plant.tags import DATA, Plant, in_fmu, read_plant
-from fmugym.pool.backend.clocks import Clock, RealClock
+from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 
 __all__ = ["Server", "endless", "environment"]
 
@@ -218,7 +218,7 @@ class Server:
             self.summary = twin.summary
             end = await _SERVERS[plant["protocol"]](plant, self._port, twin.values, self._bound)
             try:
-                pause = plant.step / 2 / getattr(self._clock, "speed", 1.0)
+                pause = plant.step / 2 / speed_of(self._clock)
                 is_over = False
                 while not is_over:
                     await asyncio.sleep(pause)

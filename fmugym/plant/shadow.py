@@ -25,7 +25,7 @@ from fmugym.plant.predicting import Predictions
 from fmugym.plant.serving import endless, environment
 from fmugym.plant.tags import DATA, Plant, read_plant, tagged
 from fmugym.plant.written import Written, lacking_tag
-from fmugym.pool.backend.clocks import Clock, RealClock
+from fmugym.pool.backend.clocks import Clock, RealClock, speed_of
 from fmugym.task.warm_up import WarmUp, WarmUps
 
 __all__ = ["Shadow", "connect"]
@@ -222,7 +222,7 @@ def connect(
 
 def _wall(clock: Clock) -> Callable[[], float]:
     """The time of this place; if a clock runs faster, it began with that."""
-    if getattr(clock, "speed", 1.0) == 1.0:
+    if speed_of(clock) == 1.0:
         return local_time
     start = local_time() - clock.time()
     return lambda: start + clock.time()

@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 
 from fmugym.checks import check_number
 
-__all__ = ["Clock", "ManualClock", "RealClock"]
+__all__ = ["Clock", "ManualClock", "RealClock", "speed_of"]
 
 
 _OVERSLEPT: Final = 1e-4
@@ -33,6 +33,12 @@ class Clock(Protocol):
     def sleep(self, seconds: float) -> None:
         """Wait for some time, in s; not at all if that is negative."""
         ...
+
+
+def speed_of(clock: Clock | None) -> float:
+    """How many times as fast as real time a clock goes: 1, unless it has an attribute ``speed``."""
+    speed: float = getattr(clock, "speed", 1.0)
+    return speed
 
 
 class RealClock:

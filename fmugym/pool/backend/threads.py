@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
-from fmugym.pool.backend.clocks import Clock
+from fmugym.pool.backend.clocks import Clock, speed_of
 
 __all__ = ["Here", "Idle", "Worker", "ask_all"]
 
@@ -108,7 +108,7 @@ def _nobody_waits(thread: threading.Thread) -> None:
 def _next(orders: _Orders, clock: Clock | None, idle: Idle | None) -> _Order | None:
     if idle is None or clock is None:
         return orders.get()
-    speed = getattr(clock, "speed", 1.0)
+    speed = speed_of(clock)
     since, rest = clock.time(), idle.hold_after
     while True:
         try:
