@@ -104,7 +104,8 @@ def _registered(
     try:
         made = gymnasium.make(env_id, **arguments, **more)
     except gymnasium.error.Error as error:
-        text = f"{shown(env_id)} is no task file, no class and no registered id: {error}"
+        why = str(error).partition(" Did you mean")[0]  # files are near, too
+        text = f"{shown(env_id)} is no task file, no class and no registered id: {why}"
         raise ConfigError(f"{text}{_nearest(env_id)}") from None
     env = made.unwrapped
     if not isinstance(env, FMUEnv):

@@ -420,6 +420,12 @@ class TestCommand:
         assert done.stderr.startswith("fmugym: error: there is no FMU at")
         assert done.stderr.count("\n") == 1
 
+    def test_an_id_that_does_not_exist_has_one_nearest_name(self, capsys):
+        assert main(["bench", "fmugym/CartPol-v0"]) == 1
+        said = capsys.readouterr().err
+        assert said.count("Did you mean") == 1
+        assert "'fmugym/CartPole-v0'" in said
+
     @pytest.mark.parametrize("arguments", [[], ["info"], ["inof", "x.fmu"], ["info", "x", "-y"]])
     def test_wrong_arguments_exit_with_2(self, arguments, capsys):
         with pytest.raises(SystemExit) as caught:
