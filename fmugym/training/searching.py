@@ -34,6 +34,9 @@ _MINUTES: Final = 1.0
 _FEWEST: Final = 20
 """Rounds for controllers that must fit the time, so that policies are searched, too."""
 
+_ENOUGH: Final = 100
+"""In the time of so many, policies come to gain, too."""
+
 _SLOW: Final = 3e-4
 _GROUP: Final = 8
 """If a step takes longer than this in seconds, so many environments step together: more would
@@ -163,12 +166,13 @@ class Searching:
         """Tell what will be done, and how long."""
         probe = self._probe
         took = probe.round_time(self._found.episodes)
-        self._is_enough = took * _FEWEST <= self.seconds - (monotonic() - self._begin)
-        if not self._is_enough:
-            needed = np.ceil(took * 2 * _FEWEST / 60)
+        left = self.seconds - (monotonic() - self._begin)
+        self._is_enough = took * _FEWEST <= left
+        if took * _ENOUGH > left:
+            who = "policies may hardly gain" if self._is_enough else "only the baseline is tuned"
             self.tell(
-                f"a round of {FEW} candidates takes about {took:.3g} s, so the time will do for "
-                f"the baseline only; for more, give --minutes {needed:.0f}"
+                f"a round of {FEW} candidates takes about {took:.3g} s, so that {who}; for more, "
+                f"give --minutes {np.ceil(took * _ENOUGH / 60):.0f}"
             )
         limits = {
             f"for {self.seconds:g} s": self.seconds,

@@ -182,7 +182,7 @@ class TestCourse:
         options = "--minutes", "0.2", "--output", tmp_path / "a"
         code, out, err = cli(*arguments, *options)
         assert code == 0, err
-        assert "baseline only; for more, give --minutes" in err
+        assert "only the baseline is tuned; for more, give --minutes" in err
         assert facts_of(tmp_path / "a")["agent"] == facts_of(tmp_path / "a")["baseline"]
         monkeypatch.undo()
         options = words_after(err, "agent;")

@@ -1245,7 +1245,7 @@ class TestBudget:
             facts = searched(tmp_path / "a", rounds=np.inf, **limits)
         assert facts["rounds"] == 30
         assert facts["agent"] == facts["baseline"] in {"lazy", "tuned pi"}
-        assert any("baseline only" in line and "--minutes 1" in line for line in told)
+        assert any("only the baseline" in line and "--minutes 2" in line for line in told)
         more = searched(tmp_path / "a", rounds=ROUNDS, resume=True)
         whole = searched(tmp_path / "c")
         assert more["test"] == whole["test"]
