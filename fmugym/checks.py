@@ -311,15 +311,21 @@ def check_path(what: str, value: Any) -> Path:
         raise ConfigError(f"{what} must be a path, got {shown(value)}") from None
 
 
-def flattened(value: Any) -> tuple[tuple[int, ...] | None, list[Any]]:
-    """The shape of nested lists, and their elements; no shape if the lists differ in length."""
-    if isinstance(value, np.ndarray) and value.ndim:
-        value = list(value)
-    if not isinstance(value, list | tuple):
+def flattened(value: Any, around: tuple[Any, ...] = ()) -> tuple[tuple[int, ...] | None, list[Any]]:
+    """The shape of nested lists, and their elements; no shape if the lists differ in length.
+
+    A list that contains itself counts as an element there.
+
+    Args:
+        value: The lists, or anything else.
+        around: The lists that this one is in.
+    """
+    is_list = isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim)
+    if not is_list or any(value is one for one in around):
         return (), [value]
-    if not value:
+    if not len(value):
         return (0,), []
-    parts = [flattened(one) for one in value]
+    parts = [flattened(one, (*around, value)) for one in value]
     shapes = {shape for shape, _ in parts}
     elements = [element for _, own in parts for element in own]
     inner = shapes.pop() if len(shapes) == 1 else None

@@ -261,10 +261,12 @@ class Declarations:
         self.steps, self.deviations = points.steps, dict(points.deviations)
         for name, deviation in points.deviations.items():
             of = self.root.child("setpoints").child(deviation.setpoint).child("of")
-            with of.noting():
-                self._find(of, "variable")
+            if name in self.derived:  # otherwise it is no name at all, which is known
+                with of.noting():
+                    self._find(of, "variable")
             if self.root.mistakes.explain(of.keys):
-                del self.derived[name], self.deviations[name]
+                self.derived.pop(name, None)
+                del self.deviations[name]
 
     def _controlled(self) -> list[tuple[str, str]]:
         """What is measured and its set point, in pairs, as far as the task tells.

@@ -110,7 +110,8 @@ class Naming:
         others = [name for name in others if self._is_first(name)]
         if not wanted and not others:
             text = "the task reads no variable of the FMU"
-            raise declared.agent("observations").lack(text)
+            is_known = declared.root.mistakes.explain(())  # by any mistake
+            raise ConsequenceError(text) if is_known else declared.agent("observations").error(text)
         return (list(wanted), others) if wanted else (others, [])
 
     def _find_places(self, names: list[str]) -> dict[str, int]:

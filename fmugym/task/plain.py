@@ -51,11 +51,13 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other) or (one != one and other != other)
 
 
-def _is_plain(value: Any) -> bool:
+def _is_plain(value: Any, around: tuple[Any, ...] = ()) -> bool:
+    """Whether a value, which is in others, is a number, text or array, or a container of them."""
     if isinstance(value, np.ndarray):
         return value.dtype.kind in "biufc" and value.nbytes <= _LARGEST
-    if type(value) in (list, tuple, deque, set):
-        return all(map(_is_plain, value))
-    if type(value) is dict:
-        return all(map(_is_plain, value)) and all(map(_is_plain, value.values()))
-    return isinstance(value, _ATOMS)
+    if type(value) not in (list, tuple, deque, set, dict):
+        return isinstance(value, _ATOMS)
+    if any(value is one for one in around):
+        return False
+    parts = [*value, *value.values()] if type(value) is dict else value
+    return all(_is_plain(one, (*around, value)) for one in parts)

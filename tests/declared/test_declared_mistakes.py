@@ -38,6 +38,7 @@ HOUSE = """
     [setpoints]
     T_set = { value = 21, of = "T_opp" }             #! 'T_op'
     goal = { steps = { low = 0, high = 1 } }         #! 'every'
+    hot = { value = 24, of = "T_air +" }             #! ends too early
     wave = { sine = { amplitude = 1, periodd = "1h" } }  #! 'period'
 
     [controllers]

@@ -32,6 +32,7 @@ from fmugym.archive import ArchiveLimits
 from fmugym.baselines import PID
 from fmugym.config import EnvConfig
 from fmugym.errors import ArgumentError
+from fmugym.task.plain import plain_attributes
 from fmugym.task.readings import READINGS
 
 
@@ -309,7 +310,7 @@ class TestActions:
             (["b", "a"], 0.0, "makes 1 values, expected 2"),
             ("a", [], "makes 0 values, expected 1"),
             ("a", "0.5", "action '0.5' does not make numbers"),
-            ("a", None, "action None .*expected a number"),
+            ("a", None, "returned None, expected a number"),
             ("a", {"a": 1.0}, r"action \{'a': 1\.0\}"),
             ("a", 1j, "does not make numbers"),
             ("a", 10**400, "number"),
@@ -501,3 +502,11 @@ def test_errors_survive_pickling():
         copy = pickle.loads(pickle.dumps(error))
         assert (type(copy), str(copy)) == (type(error), str(error))
         assert isinstance(copy, fmugym.FMUGymError)
+
+
+def test_lists_that_contain_themselves(make_env):
+    endless = [1.0]
+    endless.append(endless)
+    with pytest.raises(ConfigError, match="'target' must be an array of numbers"):
+        make_env(episode_variables={"target": (0.0, endless)})
+    assert plain_attributes({"own": [1.0], "endless": endless}, ()) == {"own": [1.0]}
