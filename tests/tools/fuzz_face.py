@@ -9,6 +9,7 @@ error of ``FMUGymError``. Then it works as before. See ``fuzz_driver.py``.
 """
 
 import contextlib
+import itertools
 import math
 import sys
 
@@ -85,9 +86,9 @@ OWN = (
 
 
 def odd(rng):
-    """Draw a value of which few calls can make use; a text can at least be looked up."""
+    """Draw a value of which few calls can make use; texts can be looked up, and none is endless."""
     value = odd_values.odd(rng) if rng.random() < 0.7 else rng.choice(OWN)()
-    return "text" if isinstance(value, odd_values.OddText) else value
+    return "text" if isinstance(value, (odd_values.OddText, itertools.repeat)) else value
 
 
 # Environments

@@ -16,7 +16,7 @@ from fmugym import ConfigError
 
 ODD = {
     fuzz: (400, 20),
-    fuzz_face: (700, 50),
+    fuzz_face: (700, 30),
     fuzz_identification: (400, 10),
     fuzz_lab: (300, 20),
     fuzz_rendering: (300, 5),

@@ -45,15 +45,15 @@ class TestInWine:
         test(feedthrough, version, {})
 
     @pytest.mark.parametrize("version", VERSIONS)
-    def test_an_fmu_reads_a_file_of_its_resources(self, wine, tmp_path, version):
+    def test_an_fmu_reads_a_file_of_its_resources(self, wine, tmp_path, version, make_envs):
         with building_for_windows():
-            types.test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, {})
+            types.test_an_fmu_reads_a_file_of_its_resources(tmp_path, version, {}, make_envs)
 
     @in_turn({"interface": ["co_simulation", "model_exchange"], "probe": [None, 60.0]})
-    def test_arrays(self, state_space, sized, interface, probe):
+    def test_arrays(self, state_space, sized, interface, probe, make_envs):
         options = {"interface": interface, "tolerance": 1e-9}
         arrays.test_arrays_follow_the_closed_form(state_space, options)
-        sizes.test_structural_parameters_give_arrays_their_sizes(sized, options, probe)
+        sizes.test_structural_parameters_give_arrays_their_sizes(sized, options, probe, make_envs)
 
     @pytest.mark.parametrize(
         "test",
@@ -69,11 +69,15 @@ class TestInWine:
     @pytest.mark.parametrize(
         "test",
         [
-            arrays.test_each_environment_has_its_own_array,
             arrays.test_hooks_on_arrays_of_environments,
             arrays.test_parameters_of_one_episode,
-            arrays.test_rollouts,
         ],
     )
     def test_faces(self, state_space, test):
         test(state_space)
+
+    @pytest.mark.parametrize(
+        "test", [arrays.test_each_environment_has_its_own_array, arrays.test_rollouts]
+    )
+    def test_vector_environments(self, state_space, test, make_envs):
+        test(state_space, make_envs)
