@@ -300,7 +300,7 @@ class TestDamagedAgents:
         code, out, err = cli("simulate", CART_POLE, "--agent", agent)
         assert (code, out) == (1, "")
         assert "another task" in err
-        for fact in ("observes q, q_dot", "also gives x, x_dot", "actions are tau, here"):
+        for fact in ("observes q, q_dot", "also gives phi, phi_dot, x", "actions are tau, here"):
             assert fact in err
         assert err.count("\n") == 1
 
