@@ -227,12 +227,10 @@ class MPC(Controller):
         with _single(self._env, index) as env:
             future = env.inside.future
             now = 0.0 if future is None else float(future.clock(env))
-            episode = self._episodes[index]
-            if episode is None:
-                episode = self._episodes[index] = self._begun(env)
-                episode.is_measured = self._measured(env)
-            else:
-                episode.is_measured = self._measured(env)
+            known = self._episodes[index]
+            episode = self._episodes[index] = known or self._begun(env)
+            episode.is_measured = self._measured(env)
+            if known is not None:
                 self._follow(episode, env.action, row, now)
         self._foresight.note(episode.told, row, episode.steps)
         start, data, assumed = self._start_of(index, episode, row, now)
