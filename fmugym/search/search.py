@@ -56,6 +56,9 @@ when that was so in each of these starts."""
 _BEST_PART: Final = 4
 """This part of the candidates tells what observations are like."""
 
+_FINEST: Final = 1e-3
+"""The smallest constants with which they look around, as a part of the largest ones."""
+
 _LARGEST: Final = 30.0
 """The largest root mean square of the weights."""
 
@@ -212,11 +215,12 @@ class Search:
         """What observations are like while candidates add constants to what agents decide.
 
         Only the best candidates count: policies that are worth something see the like, while others
-        may drive the process far away.
+        may drive the process far away. In an unstable process, only small constants do not.
         """
+        sizes = np.geomspace(1.0, _FINEST, _MANY)[:, None]
         seen: list[tuple[Merit, Any]] = []
         for text in (controller, None):
-            rows = history.extended(self._rng.uniform(-1, 1, (_MANY, history.acting)))
+            rows = history.extended(sizes * self._rng.uniform(-1, 1, (_MANY, history.acting)))
             seeds = self._training(self.episodes)
             outcome = arena.play(replace(history, text=text), rows, seeds, has_moments=True)
             seen += zip(outcome.merits, outcome.moments.sum(axis=1), strict=True)

@@ -9,7 +9,9 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+import values_tools
 from gymnasium import spaces
+from scipy import linalg
 
 import fmugym
 from fmugym import ConfigError
@@ -627,6 +629,49 @@ def recording(network, seen):
         return network(features)
 
     return call
+
+
+class Chain(fmugym.FMUEnv):
+    """Four integrators in a row: what a constant action adds up to grows without an end."""
+
+    A, B = np.eye(4, k=1), np.eye(4)[:, 3:]
+
+    def __init__(self, path):
+        sizes = {"n": 4, "m": 1, "r": 1, "C": [[1.0, 0.0, 0.0, 0.0]]}
+        start = {"A": self.A.tolist(), "B": self.B.tolist(), "x_0": [1.0, 0.0, 0.0, 0.0]}
+        config = {"time_step": 0.1, "max_episode_steps": 100, "model_parameters": sizes | start}
+        names = {"model_input_names": "u", "model_output_names": "x"}
+        super().__init__(path, config | names)
+
+    def _get_action_space(self):
+        return spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def _is_done(self):
+        return False
+
+    def _reward_policy(self):
+        return -(self.out["x"][0] ** 2)
+
+
+def test_a_process_that_constants_drive_away_can_be_controlled(tmp_path):
+    """Beside the feedback of states that is best but for the limits of the action.
+
+    If large constants alone told the scales, these would be 30 times too large, and the search
+    would lose more than twice as much as the feedback of states.
+    """
+    make = partial(Chain, values_tools.state_space_fmu(tmp_path / "S.fmu"))
+    blocks = np.block([[Chain.A, Chain.B], [np.zeros((1, 5))]])
+    a, b = np.split(linalg.expm(0.1 * blocks)[:4], [4], axis=1)
+    costs = linalg.solve_discrete_are(a, b, np.diag([1.0, 0.0, 0.0, 0.0]), [[0.1]])
+    gains = np.linalg.solve(b.T @ costs @ b + 0.1, b.T @ costs @ a)
+    with closing(make()) as env:
+        feedback = SimpleNamespace(act=lambda x, _: np.clip(-gains @ x, -1, 1))
+        by_feedback, _, _ = episode(env, feedback, 0)
+    search = Search(Probe.of(make, 256), 0)
+    with closing(Arena(make)) as arena:
+        while search.rounds < 60:
+            search.advance(arena)
+    assert search.merit[1] > 1.7 * by_feedback
 
 
 def test_a_scale_is_that_of_all_features():
