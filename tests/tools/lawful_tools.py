@@ -6,6 +6,7 @@ from pathlib import Path
 
 import building
 import fmu_tools
+import model_tools
 
 CALLS = (
     *("instantiate", "setup", "enter", "exit", "set", "step", "get", "reset"),
@@ -53,50 +54,21 @@ def library(version):
     return building.library(_SOURCE, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
 
 
-_PARAMETER = 'causality="parameter" variability="fixed"'
-_VARIABLES = {
-    "u": ('causality="input" variability="continuous"', 'start="0"'),
-    "y": ('causality="output" variability="continuous"', ""),
-    "k": (_PARAMETER, 'start="1"'),
-    "longest": (_PARAMETER, 'start="0"'),
-    "leak": (_PARAMETER, 'start="0"'),
-    "step_leak": (_PARAMETER, 'start="0"'),
-}
-_FLAGS = 'canHandleVariableCommunicationStepSize="true"'
-_CO_SIMULATION = f'<CoSimulation modelIdentifier="Lawful" {_FLAGS} '
-_BEFORE = {
-    1: 'guid="{lawful}" modelIdentifier="Lawful" numberOfContinuousStates="0" '
-    'numberOfEventIndicators="0">',
-    2: f'guid="{{lawful}}">{_CO_SIMULATION} canGetAndSetFMUstate="true"/>',
-    3: f'instantiationToken="{{lawful}}">{_CO_SIMULATION} canGetAndSetFMUState="true"/>',
-}
-_BEHIND = {
-    1: "<Implementation><CoSimulation_StandAlone><Capabilities "
-    f"{_FLAGS}/></CoSimulation_StandAlone></Implementation>",
-    2: "<ModelStructure/>",
-    3: "<ModelStructure/>",
-}
-
-
-def _variable(version, reference, name):
-    kind, start = _VARIABLES[name]
-    common = f'name="{name}" valueReference="{reference}" {kind}'
-    if version == 3:
-        return f"<Float64 {common} {start}/>"
-    if version == 1:
-        common = common.replace("parameter", "internal", 1).replace("fixed", "parameter")
-    return f"<ScalarVariable {common}><Real {start}/></ScalarVariable>"
+_VARIABLES = (
+    ("u", "input", 'start="0"'),
+    ("y", "output", ""),
+    ("k", "parameter", 'start="1"'),
+    *((name, "parameter", 'start="0"') for name in ("longest", "leak", "step_leak")),
+)
 
 
 def lawful_fmu(folder, version):
     """Write the FMU, whose variables are all real: an input u, an output y, and parameters."""
-    variables = "".join(_variable(version, i, name) for i, name in enumerate(_VARIABLES))
-    xml = (
-        f'<fmiModelDescription fmiVersion="{version}.0" modelName="Lawful" {_BEFORE[version]}'
-        f"<ModelVariables>{variables}</ModelVariables>{_BEHIND[version]}</fmiModelDescription>"
-    )
+    flags = f'canHandleVariableCommunicationStepSize="true" {model_tools.STATES[version]}'
     files = {
-        "modelDescription.xml": xml,
+        "modelDescription.xml": model_tools.describe(
+            version, "{lawful}", _VARIABLES, flags, name="Lawful"
+        ),
         fmu_tools.library_name(version, "Lawful"): library(version),
     }
     return fmu_tools.write_fmu(Path(folder) / "Lawful.fmu", files)

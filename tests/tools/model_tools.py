@@ -47,7 +47,7 @@ def library(version, model, *definitions):
     return building.library(f"zoo/{model}.c", "zoo/usual.c", shim, flags=flags, stubs=stubs)
 
 
-def describe(version, token, variables, flags=None, categories=()):
+def describe(version, token, variables, flags=None, categories=(), name="Zoo"):
     """A model description.
 
     Args:
@@ -56,18 +56,20 @@ def describe(version, token, variables, flags=None, categories=()):
         variables: Names, causalities and further attributes, in the order of value references.
         flags: Attributes of the interface; by default it can save and restore its state.
         categories: The names of those in which the FMU logs.
+        name: Of the model, and of its library.
     """
-    head = f'fmiVersion="{version}.0" modelName="Zoo"'
+    head = f'fmiVersion="{version}.0" modelName="{name}"'
     head += f' {"instantiationToken" if version == 3 else "guid"}="{token}"'
     flags = STATES[version] if flags is None else flags
     elements = (_element(version, index, *row) for index, row in enumerate(variables))
     inside = f"<ModelVariables>{''.join(elements)}</ModelVariables>"
     if version == 1:
-        head += ' modelIdentifier="Zoo" numberOfContinuousStates="0" numberOfEventIndicators="0"'
+        head += f' modelIdentifier="{name}"'
+        head += ' numberOfContinuousStates="0" numberOfEventIndicators="0"'
         inside += f"<Implementation><CoSimulation_StandAlone><Capabilities {flags}/>"
         inside += "</CoSimulation_StandAlone></Implementation>"
     else:
-        interface = f'<CoSimulation modelIdentifier="Zoo" {flags}/>'
+        interface = f'<CoSimulation modelIdentifier="{name}" {flags}/>'
         inside = f"{interface}{_categories(categories)}{inside}<ModelStructure/>"
     return f"<fmiModelDescription {head}>{inside}</fmiModelDescription>"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import building
 import fmu_tools
+import model_tools
 import pytest
 
 import fmugym
@@ -25,13 +26,11 @@ FAULTS = {
 }
 STAGES = {"nowhere": 0, "step": 1, "reset": 2, "terminate": 3, "free": 4, "initialize": 5}
 
-VARIABLES = {
-    "u": 'causality="input"><Real start="0"/>',
-    "y": 'causality="output"><Real/>',
-    "fault": 'causality="parameter" variability="fixed"><Real start="0"/>',
-    "stage": 'causality="parameter" variability="fixed"><Real start="0"/>',
-    "at": 'causality="parameter" variability="fixed"><Real start="0"/>',
-}
+VARIABLES = (
+    ("u", "input", 'start="0"'),
+    ("y", "output", ""),
+    *((name, "parameter", 'start="0"') for name in ("fault", "stage", "at")),
+)
 
 
 INTERRUPTIBLE = """
@@ -57,16 +56,9 @@ def run_python(*command, timeout=100):
 
 def faulty_fmu(folder, token="{faulty-0}", capabilities=""):
     """Write the FMU; the token ``{faulty-F}`` lets it fail in its instantiation."""
-    variables = "".join(
-        f'<ScalarVariable name="{name}" valueReference="{index}" {rest}</ScalarVariable>'
-        for index, (name, rest) in enumerate(VARIABLES.items())
-    )
-    xml = (
-        f'<fmiModelDescription fmiVersion="2.0" modelName="Faulty" guid="{token}"><CoSimulation '
-        f'modelIdentifier="Faulty" canHandleVariableCommunicationStepSize="true" '
-        f'canGetAndSetFMUstate="true" {capabilities}/>'
-        f"<ModelVariables>{variables}</ModelVariables><ModelStructure/></fmiModelDescription>"
-    )
+    flags = 'canHandleVariableCommunicationStepSize="true" '
+    flags += f"{model_tools.STATES[2]} {capabilities}"
+    xml = model_tools.describe(2, token, VARIABLES, flags, name="Faulty")
     files = {
         "modelDescription.xml": xml,
         fmu_tools.library_name(2, "Faulty"): building.library("sources/faulty.c"),

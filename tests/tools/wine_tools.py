@@ -16,7 +16,6 @@ from fmugym import FMU
 from fmugym.wine.installation import can_run_windows, obstacle_to_wine
 
 FOLDERS = {1: "win64", 2: "win64", 3: "x86_64-windows"}
-PREFIXES = {1: "Model_fmi", 2: "fmi2", 3: "fmi3"}
 
 
 def why_not():
@@ -83,12 +82,5 @@ def building_for_windows():
 
 def exchange_fmu(path, model, version, interfaces=("ModelExchange",), flags=""):
     """Write an FMU as ``exchange_tools`` does, with a library for Windows only."""
-    shim = f"exchange/fmi{version}.c"
-    stubs = fmu_tools.stubs(version, PREFIXES[version], building.HERE / shim)
-    sources = [*(f"exchange/{name}.c" for name in ("core", "usual", model)), shim]
-    data = windows_library(*sources, flags=(f"-DFMI_VERSION={version}",), stubs=stubs)
-    files = {
-        "modelDescription.xml": exchange_tools.describe(model, version, interfaces, flags),
-        f"binaries/{FOLDERS[version]}/Model.dll": data,
-    }
-    return fmu_tools.write_fmu(Path(path), files)
+    with building_for_windows():
+        return exchange_tools.exchange_fmu(path, model, version, interfaces, flags)
