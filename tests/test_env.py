@@ -163,10 +163,6 @@ def test_episode_variables():
     env.reset()
     assert env.variables["integral"] == 0.0
     assert env.variables["target"] != target
-    with pytest.raises(ConfigError, match="episode variable 'targe'; did you mean 'target'"):
-        env.variables["targe"] = 1
-    with pytest.raises(ConfigError, match="episode variable 'goal'"):
-        env.variables["goal"]
     env.close()
 
 
@@ -181,15 +177,6 @@ def test_drawn_parameters_are_set_and_told():
         seen.append(info["drawn"])
     assert seen[0] == seen[2] != seen[1]
     assert env.reset()[1]["drawn"] != seen[0]  # no seed: the stream goes on
-    env.close()
-
-
-def test_scipy_distributions_are_taken():
-    stats = pytest.importorskip("scipy.stats")
-    env = Swing(model_parameters={"q_0": stats.truncnorm(-1, 1, loc=1.0, scale=0.1)})
-    first = env.reset(seed=5)[1]["drawn"]["q_0"]
-    assert 0.9 <= first <= 1.1
-    assert env.reset(seed=5)[1]["drawn"]["q_0"] == first
     env.close()
 
 

@@ -56,14 +56,6 @@ print(*(name for name in sys.modules if name.startswith("fmugym.envs")))
     assert "fmugym.envs" in run(program)
 
 
-def test_the_environments_are_registered():
-    program = """
-import gymnasium, fmugym
-print(*(name for name in gymnasium.registry if name.startswith("fmugym/")))
-"""
-    assert "fmugym/CartPole-v0" in run(program)
-
-
 def test_every_public_name_is_there():
     assert dir(fmugym) == sorted(dir(fmugym))
     for name in fmugym.__all__:

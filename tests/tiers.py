@@ -217,7 +217,6 @@ SLOW_TESTS = (
     "test_series.py::test_a_recorder_",
     "test_slow_models.py::TestTime::test_of_a_trial",
     "test_snapshots.py::TestForeign",
-    "test_snapshots.py::TestSingle::test_goes_on_in_another_process",
     "test_specs.py::test_a_class_of_a_script",
     "test_trajectories.py::TestDifferences::test_of_fmi",
     "test_trajectories.py::TestDirectional::test_error",

@@ -12,11 +12,10 @@ import fmu_tools
 import numpy as np
 import pytest
 from plants import ONCE
-from zoo_tools import resident_bytes
 
 import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
-from fmugym.archive.bundled import BUNDLED, FMI_VERSIONS
+from fmugym.archive.bundled import BUNDLED
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
 from fmugym.pool.native import NativePool
@@ -434,31 +433,6 @@ pool.step()
 print((t.resident_bytes() - before) / 20000)
 """
     assert printed_number(script) < 8000
-
-
-@on_linux
-@pytest.mark.parametrize("version", FMI_VERSIONS)
-def test_memory_does_not_grow(native, version):
-    """Over a million steps and a hundred thousand resets, half of which are restored states."""
-    pool = native(bundled_fmu("CartPole", version), ["f"], ["x", "theta"], 1000)
-    names = ("theta_0", "solver", "max_step")
-    variables = tuple(map(pool.variable, names))
-    values = np.array([[1.5] * 1000, [1.0] * 1000, [0.05] * 1000])
-
-    def work(rounds):
-        for index in range(rounds):
-            for _ in range(10):
-                pool.step_own()
-            values[0, :500] = 1.5 + index / 1000
-            pool.reset(variables, values)
-            if version != "1.0" and index % 10 == 0:
-                pool.restore(pool.save())
-
-    work(10)
-    gc.collect()
-    before = resident_bytes()
-    work(100)
-    assert resident_bytes() - before < 2**20
 
 
 def test_pools_live_and_die_apart(temp_root):

@@ -50,44 +50,12 @@ def env(tank_fmu):
     env.close()
 
 
-def directly(area):
-    """The same model without FMI."""
-    tank = foreign_tank.Tank(instance_name="direct")
-    tank.area, tank.leaks = area, True
-    return tank
-
-
-def outputs_of(tank):
-    return tuple(float(getattr(tank, name)) for name in OUTPUTS)
-
-
 def test_the_need_of_a_tool_is_told_once(tank_fmu, caplog, monkeypatch):
     """A search opens an FMU many times."""
     monkeypatch.setattr(errors, "_warned", set())
     for _ in range(2):
         TankEnv(tank_fmu).close()
     assert caplog.text.count("Tank.fmu needs the tool that exported it to run") == 1
-
-
-def test_random_episodes_equal_the_class_itself(env):
-    env.action_space.seed(1)
-    lengths = []
-    for episode in range(6):
-        _, info = env.reset(seed=1 if episode == 0 else None)
-        tank = directly(info["drawn"]["area"])
-        assert env.state == outputs_of(tank)
-        ended = False
-        while not ended:
-            action = env.action_space.sample()
-            *_, terminated, truncated, _ = env.step(action)
-            tank.inflow, tank.pump_stage = float(action[0]), round(float(action[2]))
-            tank.valve_open = bool(action[1] >= 0.5)
-            tank.do_step(env.time - 0.5, 0.5)
-            assert env.state == outputs_of(tank)
-            assert terminated == (tank.level < 0.2)
-            ended = terminated or truncated
-        lengths.append(env.step_count)
-    assert max(lengths) <= 40
 
 
 def test_what_is_invalid_in_it_does_not_stop(env):

@@ -9,7 +9,7 @@ import lawful_tools
 import numpy as np
 import pytest
 from combinations import in_turn
-from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped, probe_config
+from fmu_tools import MAJOR_VERSIONS, PlainEnv, grouped
 from gymnasium import spaces
 from pool_tools import KINDS, open_pool, reset
 
@@ -201,26 +201,6 @@ class TestHealth:
         env.reset()
         env.step([1.0])
         assert env.step([1.0])[4]["fault_rate"] == 0.75
-
-    @pytest.mark.parametrize("hooks", ["array", "per_env"])
-    def test_of_vector_environments(self, probe, opened, hooks):
-        parameters = {"fault": 3, "fault_step": 2}
-        envs = opened(
-            FMUVectorEnv(
-                lambda: PlainEnv(probe(2), probe_config(model_parameters=parameters)),
-                3,
-                hooks=hooks,
-            )
-        )
-        envs.set_attr("fault_step", [2, 9, 9])
-        envs.reset(seed=0)
-        envs.step(np.ones((3, 1)))
-        infos = envs.step(np.ones((3, 1)))[4]
-        assert infos["_fault_rate"].tolist() == [True, False, False]
-        assert infos["fault_rate"][0] == 1.0
-        assert envs.health["errors"].tolist() == [1, 0, 0]
-        assert envs.health["resets"].tolist() == [1, 1, 1]
-        assert envs.health["steps"].tolist() == [2, 2, 2]
 
     def test_of_a_closed_environment(self, make_env):
         env = make_env()

@@ -2,12 +2,8 @@
 
 import copy
 import hashlib
-import os
 import pickle
-import subprocess
-import sys
 
-import building
 import foreign_tank
 import gymnasium
 import numpy as np
@@ -178,20 +174,6 @@ class TestSingle:
         env.close()
         twin.close()
 
-    def test_goes_on_in_another_process(self, halfway, tmp_path):
-        env = halfway()
-        (tmp_path / "snapshot").write_bytes(pickle.dumps(env.save_state()))
-        program = (
-            "import pickle, sys, test_snapshots as t\n"
-            "env = t.Track()\n"
-            "env.restore_state(pickle.load(open(sys.argv[1], 'rb')))\n"
-            "print(repr(t.play(env)))"
-        )
-        command = [sys.executable, "-c", program, str(tmp_path / "snapshot")]
-        path = os.environ | {"PYTHONPATH": building.PATH}
-        done = subprocess.run(command, env=path, capture_output=True, text=True, check=True)
-        assert eval(done.stdout) == play(env)
-
     def test_has_what_hooks_assign_to_attributes(self):
         class Counting(CartPoleEnv):
             def _update(self):
@@ -223,30 +205,8 @@ class TestSingle:
             other.step(action)
         other.reset()
 
-    def test_random_streams_differ_afterwards_only_if_seeded_anew(self, halfway):
-        env = halfway()
-        snapshot = env.save_state()
-        first = env.reset()[1]["drawn"]
-        env.restore_state(snapshot)
-        assert env.reset()[1]["drawn"] == first
-        env.restore_state(snapshot)
-        assert env.reset(seed=1)[1]["drawn"] != first
-
 
 class TestVector:
-    @in_turn({"hooks": ["auto", "array", "per_env"], "version": VERSIONS})
-    def test_goes_on_from_a_single_environment(self, halfway, hooks, version):
-        env = halfway(fmi_version=version)
-        envs = vector_of(lambda: Track(fmi_version=version), hooks=hooks)
-        observations = envs.restore_state(env.save_state())
-        assert observations.tolist() == [np.array(env.state, np.float32).tolist()] * 3
-        back = envs.save_state([2])
-        expected = play(env)
-        assert play_vector(envs, 1) == expected
-        env.restore_state(back)
-        assert play(env) == expected
-        envs.close()
-
     def test_ended_episodes_stay_ended(self, make_envs):
         envs = make_envs(Track, 2, max_episode_steps=2)
         envs.reset(seed=0)

@@ -142,18 +142,6 @@ class TestActions:
         for _ in range(100):
             env.step(env.action_space.sample())
 
-    @pytest.mark.parametrize("name", ["Int8", "UInt16", "Int64", "Float32"])
-    def test_types_of_fmi_3(self, make_env, name):
-        env = make_env(
-            3,
-            model_input_names=["a", f"{name}_in"],
-            model_output_names=["a", f"{name}_out"],
-            bounds={f"{name}_in": (-100, 100)},
-        )
-        env.reset()
-        observation, *_ = env.step([0.5, 100])
-        assert observation.tolist() == [0.5, 100.0]
-
 
 class TestObservations:
     @pytest.mark.parametrize("version", MAJOR_VERSIONS)

@@ -66,34 +66,6 @@ def test_threads_change_nothing(mode):
     assert run_side_by_side(ours, theirs, 25) > 2000
 
 
-class OwnUniform(Uniform):
-    """A distribution of the user's, which only Python can draw."""
-
-    def sample(self, rng):
-        return float(rng.uniform(self.low, self.high)) ** 2
-
-
-class Sorting(Drawing):
-    """Hooks that are compiled; the draws are not."""
-
-    def __init__(self):
-        super().__init__(model_parameters={"q_0": OwnUniform(0.1, 0.9), "m": Uniform(0.05, 0.07)})
-
-    def _get_action_space(self):
-        return gym.spaces.Discrete(2)
-
-    def _get_inputs(self):
-        return (self.action - 0.5) * 0.01
-
-    def _is_done(self):
-        return abs(self.state[0]) > 0.7
-
-
-@each_mode
-def test_draws_of_python_in_every_mode(mode):
-    assert require_pair_equal(Sorting, 60, mode, num_envs=5, hooks="compiled") > 5
-
-
 class Limited(PushedCart):
     """Some environments fail in a step in which others end, or end as they fail."""
 

@@ -64,30 +64,6 @@ def test_options_take_the_streams_back(kind, hooks):
     theirs.close()
 
 
-def test_drawn_values_are_told_and_used(make_envs):
-    vector = make_envs(lambda: Drawing(model_parameters=UNIFORM, episode_variables=VARIABLES), 6)
-    observations, infos = vector.reset(seed=0)
-    drawn = infos["drawn"]
-    assert set(drawn) == {"q_0", "_q_0", "m", "_m", "target", "_target"}
-    np.testing.assert_allclose(observations[:, 0], drawn["q_0"], rtol=1e-6)
-    assert len(set(drawn["target"].tolist())) == 6
-    assert [p["m"] for p in vector.get_attr("parameters")] == drawn["m"].tolist()
-    assert [v["target"] for v in vector.get_attr("variables")] == drawn["target"].tolist()
-
-
-@each_way
-def test_seeds(hooks, make_envs):
-    vector = make_envs(Drawing, 3, hooks=hooks)
-    first = vector.reset(seed=10)[0]
-    following = vector.reset()[0]
-    assert first.tolist() != following.tolist()
-    assert vector.reset(seed=[10, 11, 12])[0].tolist() == first.tolist()
-    assert vector.reset(seed=np.int64(10))[0].tolist() == first.tolist()
-    mixed = vector.reset(seed=[None, 99, 12])[0]
-    assert mixed[0].tolist() == following[0].tolist()
-    assert mixed[2].tolist() == first[2].tolist()
-
-
 @each_way
 def test_an_unseeded_reset_draws_from_somewhere(hooks):
     starts = []

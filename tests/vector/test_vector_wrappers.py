@@ -10,27 +10,6 @@ from vector_tools import Drawing, each_way, sampled_actions
 from fmugym import SimulationError, Uniform
 
 
-def test_wrappers_for_statistics_and_normalization():
-    vector = gym.make_vec("fmugym/CartPole-v0", num_envs=4)
-    wrapped = gym.wrappers.vector.RecordEpisodeStatistics(vector)
-    wrapped = gym.wrappers.vector.NormalizeObservation(wrapped)
-    wrapped = gym.wrappers.vector.ClipReward(wrapped, 0.0, 0.5)
-    wrapped = gym.wrappers.vector.NormalizeReward(wrapped)
-    wrapped.reset(seed=0)
-    lengths = []
-    for actions in sampled_actions(vector, 300):
-        observations, rewards, _, _, infos = wrapped.step(actions)
-        assert np.isfinite(observations).all()
-        assert np.isfinite(rewards).all()
-        if "episode" in infos:
-            mask = infos["_episode"]
-            assert infos["episode"]["r"][mask].tolist() == infos["episode"]["l"][mask].tolist()
-            lengths += infos["episode"]["l"][mask].tolist()
-    assert len(lengths) > 20
-    assert 8 < np.mean(lengths) < 60
-    wrapped.close()
-
-
 def test_statistics_of_partial_resets():
     vector = gym.make_vec("fmugym/CartPole-v0", num_envs=2, autoreset_mode="disabled")
     wrapped = gym.wrappers.vector.RecordEpisodeStatistics(vector)
@@ -39,17 +18,6 @@ def test_statistics_of_partial_resets():
         wrapped.step(np.array([0, 1]))
     wrapped.reset(options={"reset_mask": np.array([True, False])})
     assert wrapped.episode_lengths.tolist() == list(vector.get_attr("step_count")) == [0, 5]
-    wrapped.close()
-
-
-def test_array_wrappers_over_single_transforms():
-    vector = gym.make_vec("fmugym/Pendulum-v0", num_envs=3)
-    wrapped = gym.wrappers.vector.RescaleAction(vector, np.float32(-1), np.float32(1))
-    wrapped = gym.wrappers.vector.FlattenObservation(wrapped)
-    wrapped.reset(seed=0)
-    observations, *_ = wrapped.step(np.ones((3, 1), np.float32))
-    assert observations.shape == (3, 3)
-    assert vector.unwrapped.get_attr("inputs") == ((2.0,),) * 3
     wrapped.close()
 
 

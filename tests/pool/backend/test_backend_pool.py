@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from combinations import in_turn
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import RecordVideo
 from vector_tools import run_side_by_side
 
 import fmugym
@@ -372,19 +371,6 @@ def test_a_stop_that_takes_too_long_is_not_waited_for(make, monkeypatch, caplog)
     env.close()
     gate.set()
     assert "a backend has not come to its stop within 0.01 s" in caplog.text
-
-
-@pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
-def test_a_rig_is_recorded(tmp_path):
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy, of the extra test")
-    rig = RigEnv(Paced(Held(), ManualClock()), render_mode="rgb_array", max_episode_steps=5)
-    env = RecordVideo(rig, str(tmp_path))
-    env.reset()
-    for _ in range(5):
-        env.step(push(0.0))
-    env.close()
-    (video,) = tmp_path.glob("*.mp4")
-    assert video.stat().st_size > 1000
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from fmu_tools import MAJOR_VERSIONS, PlainEnv, edited_fmu, grouped
 from plants import PLANTS
 
 import fmugym
-from fmugym import ConfigError, FMULoadError, FMUVectorEnv, bundled_fmu
+from fmugym import ConfigError, FMULoadError, bundled_fmu
 from fmugym.archive.bundled import BUNDLED
 from fmugym.pool import PoolSpec
 from fmugym.systems.system_fmu import SystemFMU
@@ -68,15 +68,6 @@ class TestEqualToTheEngine:
             play(PlainEnv(path, config_of(model), backend=way)) for way in ("native", "fmpy")
         )
         assert np.array_equal(ours, theirs)
-
-    @bundled
-    def test_vector(self, model, version):
-        path = bundled_fmu(model, version)
-
-        def rows(way):
-            return play(FMUVectorEnv(lambda: PlainEnv(path, config_of(model)), 3, backend=way))
-
-        assert np.array_equal(rows("native"), rows("fmpy"))
 
     @all_versions
     def test_types_and_times(self, probe, version):
@@ -210,13 +201,6 @@ class TestRefusals:
         path = edited_fmu(probe(1), tmp_path, edits, add=renamed)
         with pytest.raises(FMULoadError, match=r"cannot be loaded: .*Other_fmi"):
             PlainEnv(path, fmu_tools.probe_config(), backend="fmpy")
-
-    @all_versions
-    def test_of_an_fmu_that_refuses_to_be_instantiated(self, probe, tmp_path, temp_root, version):
-        path = edited_fmu(probe(version), tmp_path, {"{probe-": "{other-"})
-        with pytest.raises(FMULoadError, match=r"refused to be instantiated; the FMU said: step 0"):
-            PlainEnv(path, fmu_tools.probe_config(), backend="fmpy")
-        assert list(temp_root.iterdir()) == []
 
 
 def test_python_means_fmpy_now():

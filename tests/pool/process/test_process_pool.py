@@ -29,7 +29,6 @@ from process_tools import (
     wait_until,
 )
 
-import fmugym
 from fmugym import FMU, FMULoadError, SimulationError, _native, bundled_fmu
 from fmugym.fmi import Status
 from fmugym.pool import PoolSpec
@@ -57,15 +56,6 @@ def fixture_make_env(faulty, opened):
     def make(*args, **config):
         call_timeout = 0.7 if "hang" in args else 20.0
         return opened(FaultyEnv(faulty, *args, call_timeout=call_timeout, **config))
-
-    return make
-
-
-@pytest.fixture(name="make_vector_env")
-def fixture_make_vector_env(faulty, opened):
-    def make(num_envs, *args, **options):
-        options = {"workers": 2, "call_timeout": 20.0} | options
-        return opened(fmugym.FMUVectorEnv(lambda: FaultyEnv(faulty, *args), num_envs, **options))
 
     return make
 
@@ -202,38 +192,8 @@ class TestSingle:
             assert one.step([1.0])[0] == [0.5]
             assert one.step([1.0])[3]
 
-    @pytest.mark.parametrize("name", ["CartPole", "Pendulum", "ModelicaCartPole", "CloudPendulum"])
-    def test_bundled_environments_take_it_as_an_argument(self, name, opened):
-        here, apart = (
-            opened(gymnasium.make(f"fmugym/{name}-v0", isolation=isolation))
-            for isolation in (None, "process")
-        )
-        assert isinstance(apart.unwrapped.inside.pool, ProcessPool)
-        assert not isinstance(here.unwrapped.inside.pool, ProcessPool)
-        both = [env.reset(seed=1)[0].tolist() for env in (here, apart)]
-        assert both[0] == both[1]
-
 
 class TestVector:
-    @pytest.mark.parametrize(("fault", "cause"), [("crash", "SIGSEGV"), ("hang", "call_timeout")])
-    def test_only_the_episodes_of_one_worker_are_truncated(self, make_vector_env, fault, cause):
-        env = make_vector_env(4, call_timeout=0.7 if fault == "hang" else 20.0)
-        env.set_attr("fault", [start_values(fault)["fault"], 0, 0, 0])
-        env.reset()
-        actions = np.ones((4, 1))
-        env.step(actions)
-        observations, _, terminated, truncated, infos = env.step(actions)
-        assert truncated.tolist() == [True, True, False, False]
-        assert not terminated.any()
-        assert observations.ravel().tolist() == [0.5, 0.5, 1.0, 1.0]
-        assert all(cause in reason for reason in infos["fault"][:2])
-        assert infos["fault"][2:].tolist() == [None, None]
-        observations = env.step(actions)[0]  # the autoreset
-        assert observations.ravel().tolist() == [0.0, 0.0, 1.5, 1.5]
-        observations, _, _, truncated, _ = env.step(actions)
-        assert observations.ravel().tolist() == [0.5, 0.5, 2.0, 2.0]
-        assert not truncated.any()
-
     @linux_only
     def test_from_make_vec(self, opened, temp_root):
         options = {"isolation": "process", "workers": 3}
