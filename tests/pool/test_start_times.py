@@ -206,9 +206,9 @@ def test_compiled_single_environments(sun):
     plain.close()
 
 
-@in_turn({"way": WAYS, "version": [2, 3, 1]})
-def test_snapshots_and_rollouts_keep_it(sun, way, version):
-    make = partial(Sun, sun("ModelExchange", version), max_episode_steps=20)
+@in_turn({"way": WAYS, "interface,version": SUNS})
+def test_snapshots_and_rollouts_keep_it(sun, way, interface, version):
+    make = partial(Sun, sun(interface, version), max_episode_steps=20)
     env, envs = make(), vector(make, 2, **way)
     env.reset(seed=11)
     env.step(ACTION)
