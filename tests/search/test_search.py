@@ -1197,17 +1197,6 @@ class TestSearch:
         assert facts["rounds"] == 3
         assert Agent.load(tmp_path / "agent").text.startswith("pid of=theta")
 
-    def test_a_search_that_finds_nothing_leaves_no_folder(self, tmp_path):
-        one = {"pi": CONTROLLERS["pi"]}
-        limits = {"rounds": np.inf, "steps": MOST_PROBED + 20}
-        with pytest.raises(ConfigError, match="0 rounds are too few"):
-            searched(tmp_path / "agent", controllers=one, terminated=None, **limits)
-        assert not (tmp_path / "agent").exists()
-        facts = searched(tmp_path / "agent", rounds=3, controllers=one)
-        assert facts["rounds"] == 3
-        with pytest.raises(FileExistsError):
-            searched(tmp_path / "agent", rounds=3, controllers=one)
-
     def test_few_rounds_find_no_less_than_what_is_there(self, tmp_path):
         """A controller that is ready takes part from the beginning."""
         good = {"best": "schedule 00:00=0.05", "pi": CONTROLLERS["pi"]}
