@@ -12,8 +12,6 @@ from fmugym.baselines import LQR, PID, Constant, Hysteresis, Random, Schedule, c
 from fmugym.linearization import linearize
 from fmugym.vector import FMUVectorEnv
 
-KELVIN = 273.15
-
 
 class Pendulum(fmugym.FMI2CSEnv):
     """Starts near the top; the default observation."""

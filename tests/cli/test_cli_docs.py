@@ -28,7 +28,6 @@ NEEDS = {
     "--algorithm": "stable_baselines3",
     ".html": "matplotlib",
 }
-EXAMPLES = "examples/cart_pole.toml"
 
 
 def commands(block):

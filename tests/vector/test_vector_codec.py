@@ -11,7 +11,6 @@ from fmugym import ConfigError
 from fmugym.vector.codec import gathered, handed_out
 
 COUNT = 4
-NUMBERS = st.integers(-100, 100) | st.floats(-1e6, 1e6) | st.booleans()
 KINDS = {
     "integer": st.integers(-100, 100),
     "number": st.floats(-1e6, 1e6),
