@@ -91,7 +91,7 @@ class ResolvedTask:
         self, task: Task, root: Entry, description: ModelDescription, needs_reward: bool = True
     ) -> None:
         self._task, self._root, self._time_step, self._warm_steps = task, root, math.nan, 0
-        self._declared = declared = Declarations.read(root, description, task.is_physical)
+        self._declared = declared = Declarations(root, description, task.is_physical)
         with root.child("reward").noting():
             if needs_reward and not declared.rewards:
                 text = 'the task has no reward; say one, for example: reward = "1"'
