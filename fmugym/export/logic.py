@@ -235,14 +235,15 @@ class _ControllerTracer(Tracer):
         return self._nodes(elements, shape, space.dtype), kept
 
     def _asked(self, features: Any) -> Any:
-        """What the network gives for some features, which are noted."""
+        """The last values of the network for some features; what its first layer takes is noted."""
         network, space = self._decision.network, self._env.action_space
-        self._features = tuple(self._nodes(features, None, None).tolist())
+        count, dtype = math.prod(space.shape or ()), np.dtype(space.dtype)
         if network is not None:
-            network.require_fitting(len(self._features), space)
-        names = element_names((math.prod(space.shape or ()),), _GIVEN)
-        dtype = np.dtype(space.dtype) if network is None else network.gives
-        return loaded(self._graph, "row", names, dtype)
+            network.require_fitting(len(features), space)
+            features = network.scaled(features)
+            count, dtype = sum(network.parts), network.dtype
+        self._features = tuple(self._nodes(features, None, None).tolist())
+        return loaded(self._graph, "row", element_names((count,), _GIVEN), dtype)
 
     def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
         """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
