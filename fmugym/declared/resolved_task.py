@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import Any, Final
 
@@ -41,7 +41,7 @@ from fmugym.declared.observing import (
     scaled,
 )
 from fmugym.declared.parts import Term
-from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
+from fmugym.declared.piloting import DeclaredWarmUp
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
@@ -195,15 +195,19 @@ class ResolvedTask:
         return steps_in(table.entry, table.period, self._time_step) if moves and table.period else 0
 
     def _make_warm_up(self) -> DeclaredWarmUp:
-        maker = WarmUpMaker(self._declared, self._naming, self._time_step)
-        return maker.make(
+        written: dict[str, Sequence[Value]] = {
+            one.variable: (one.now, one.fill) for one in (*self._kept, *self._sensors)
+        }
+        written |= {name: [value] for name, value in self._switched().items()}
+        return DeclaredWarmUp(
+            self._declared,
+            self._naming,
+            self._time_step,
             self._warm_steps,
             self._input_values(self._declared.warm_up.controllers),
-            [*self._updates_of_histories(), *self._updates_of_switches()],
-            [*self._kept, *self._sensors],
-            self._switched(),
-            self.config["episode_variables"],
-            self.config.get("start_time"),
+            [*self._updates_of_histories(), *_assignments(self._switched())],
+            written,
+            self.config,
         )
 
     # The config.
@@ -227,22 +231,20 @@ class ResolvedTask:
         }
 
     def _variables(self) -> dict[str, Any]:
-        remembered = {name: memory.start for name, memory in self._declared.memory.items()}
-        kept = [*self._kept, *self._sensors]
-        histories = {one.variable: np.zeros(one.length) for one in kept}
+        """All episode variables, and what they are at the beginning of an episode."""
+        memory = {name: one.start for name, one in self._declared.memory.items()}
+        kept = {one.variable: np.zeros(one.length) for one in (*self._kept, *self._sensors)}
         switches: dict[str, float] = {}
         for variable in self._switched_actions:
-            state, since = switch_names(variable)
-            switches |= {state: self._is_on_at_start(variable), since: _LONG_AGO}
-        worst = {WORST: 0.0} if self._has_worst else {}
-        kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
+            starts = self._is_on_at_start(variable), _LONG_AGO
+            switches |= zip(switch_names(variable), starts, strict=True)
+        zeros = dict.fromkeys([*self._worst, *self._updated_kpis], 0.0)
         variables = (
-            remembered
+            memory
             | clock_of(self._declared, self._time_step, self._warm_steps)
-            | histories
+            | kept
             | switches
-            | worst
-            | kpis
+            | zeros
         )
         return variables | self._noise(variables)
 
@@ -383,11 +385,11 @@ class ResolvedTask:
     def _hooks_of_steps(self) -> dict[str, Hook]:
         declared, hooks = self._declared, {}
         updates = [
-            *self._updates_of_memory(),
+            *_assignments(self._updated_memory()),
             *self._updates_of_histories(),
-            *self._updates_of_switches(),
-            *self._updates_of_worst(),
-            *self._updates_of_kpis(),
+            *_assignments(self._switched()),
+            *_assignments(self._worst),
+            *_assignments(self._updated_kpis),
         ]
         if updates:
             hooks["_update"] = _in_turn(updates)
@@ -413,9 +415,6 @@ class ResolvedTask:
         fills = function_of([history.fill for history in kept])
         return remember(kept, values, fills, self._naming.first_step)
 
-    def _updates_of_switches(self) -> list[Hook]:
-        return self._assignments(self._switched())
-
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""
         values: dict[str, Value] = {}
@@ -423,21 +422,21 @@ class ResolvedTask:
             values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
         return values
 
-    def _updates_of_worst(self) -> list[Hook]:
+    @cached_property
+    def _worst(self) -> dict[str, Value]:
         if not self._has_worst:
-            return []
+            return {}
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
-        worst = self._naming.read("variables", WORST)
-        return self._assignments({WORST: minimum(worst, reward)})
+        return {WORST: minimum(self._naming.read("variables", WORST), reward)}
 
-    def _updates_of_kpis(self) -> list[Hook]:
+    @cached_property
+    def _updated_kpis(self) -> dict[str, Value]:
         step_count, kpis = self._naming.step_count, self._declared.kpis.items()
-        updated = {
+        return {
             kpi_name(name): kpi.updated(self._kpi_value(kpi), step_count)
             for name, kpi in kpis
             if kpi.how is not None
         }
-        return self._assignments(updated)
 
     def _kpi_value(self, kpi: Kpi) -> Value:
         """What a figure is made of in a step."""
@@ -469,26 +468,13 @@ class ResolvedTask:
                 values |= self._terms({name: term}, moment) if name else {}
         return values
 
-    def _updates_of_memory(self) -> list[Hook]:
+    def _updated_memory(self) -> dict[str, Value]:
         """All values of the memory are computed before one of them is written."""
-        values = {
+        return {
             name: self._naming.value(memory.entry, memory.update, Moment.AFTER).number
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
-        return self._assignments(values)
-
-    def _assignments(self, values: Mapping[str, Value]) -> list[Hook]:
-        """A function that writes variables; none if there are no variables."""
-        if not values:
-            return []
-        names, function = list(values), function_of(list(values.values()))
-
-        def update(env: Any) -> None:
-            for name, value in zip(names, function(env), strict=True):
-                env.variables[name] = value
-
-        return [update]
 
     def _fault_reward(self) -> Hook:
         """A failed step gives the reward that the file says, or no more than any step before."""
@@ -535,6 +521,19 @@ class ResolvedTask:
         """Zeros before the first step, which has no rewards and costs yet."""
         has_stepped = self._naming.step_count > 0
         return {name: where(has_stepped, value, 0.0) for name, value in values.items()}
+
+
+def _assignments(values: Mapping[str, Value]) -> list[Hook]:
+    """A function that writes variables; none if there are no variables."""
+    if not values:
+        return []
+    names, function = list(values), function_of(list(values.values()))
+
+    def update(env: Any) -> None:
+        for name, value in zip(names, function(env), strict=True):
+            env.variables[name] = value
+
+    return [update]
 
 
 def _in_turn(updates: list[Hook]) -> Hook:

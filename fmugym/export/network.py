@@ -179,7 +179,7 @@ class Network:
 
     def values(self, observation: FloatArray) -> FloatArray:
         """The last values for an observation of shape (k,)."""
-        values = self.scaled(observation)
+        values: FloatArray = self.scaled(observation)
         for layer in self.layers:
             values = layer.weights @ values + layer.bias
             for activation in layer.activations:
