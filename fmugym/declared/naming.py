@@ -478,10 +478,9 @@ class Naming:
 
     def _rescaled(self, variable: TaskVariable, element: Value) -> Value:
         """Turn an action from -1 to 1 into one from the lowest to the highest value."""
-        if variable.delta:
-            return variable.delta * element
-        middle, half = (variable.low + variable.high) / 2, (variable.high - variable.low) / 2
-        return middle + half * element
+        low, high = variable.chosen
+        value = (high - low) / 2 * element
+        return value if variable.delta else (low + high) / 2 + value
 
     def _nearest_level(self, variable: TaskVariable, element: Value) -> Value:
         """The level that is nearest to a value, the lower one of two."""

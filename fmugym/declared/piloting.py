@@ -93,7 +93,9 @@ class Pilot:
             return order[distances.argmin(axis=0)]
         if self._present is not None:
             value = np.clip(value - self._present(env), -self.variable.delta, self.variable.delta)
-        return self._rescaled(value)
+        low, high = self.variable.chosen
+        is_rescaled = self._declared.rescales
+        return (value - (low + high) / 2) / ((high - low) / 2) if is_rescaled else value
 
     def _decided(self, env: Any) -> Any:
         """The value in the unit of the task; controllers work with numbers of float32."""
@@ -106,15 +108,6 @@ class Pilot:
         for place, signal in enumerate(self._signals(env)):
             rows[:, place] = signal
         return one.act(rows)[:, 0].astype(np.float64)
-
-    def _rescaled(self, value: Any) -> Any:
-        variable = self.variable
-        if not self._declared.rescales:
-            return value
-        low, high = (
-            (-variable.delta, variable.delta) if variable.delta else (variable.low, variable.high)
-        )
-        return (value - (low + high) / 2) / ((high - low) / 2)
 
 
 class _Many:

@@ -305,8 +305,7 @@ class ResolvedTask:
         if self._declared.is_physical:
             return _box([variable.range for variable in variables])
         if not variables[0].levels:
-            limits = [(-r.delta, r.delta) if r.delta else r.range for r in variables]
-            return _box([(-1.0, 1.0)] * len(variables) if rescales else limits)
+            return _box([(-1.0, 1.0) if rescales else one.chosen for one in variables])
         counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 

@@ -89,6 +89,11 @@ class TaskVariable:
         return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
 
     @property
+    def chosen(self) -> tuple[float, float]:
+        """The lowest and the highest value, or change of it, that an agent chooses."""
+        return (-self.delta, self.delta) if self.delta else self.range
+
+    @property
     def fmu_variable(self) -> Variable:
         """The FMU's variable.
 
