@@ -220,22 +220,18 @@ class Declarations:
         return size if 0 < size < np.inf else None
 
     def _read_setpoints(self) -> None:
-        points, section = SetPoints(), self.root.child("setpoints").items()
-        for entry in section.values():
+        section = self.root.child("setpoints")
+        points = SetPoints(self.memory, self.series, self.derived)
+        taken = {*self.memory, *self.derived, *self.series}
+        for entry in section.items().values():
             with entry.noting():
                 points.add(entry)
-        own = section.keys()
-        for name in {*points.memory, *points.derived} - own:
-            if name in {*self.memory, *self.derived, *self.series}:
-                entry = self.root.child("setpoints")
-                text = f"{name!r} is a name that a set point brings with it; rename the other one"
-                entry.note(entry.error(text))
-        self.memory |= points.memory
-        self.series |= points.series
-        self.derived |= points.derived
-        self.steps, self.deviations = points.steps, dict(points.deviations)
-        for name, deviation in points.deviations.items():
-            of = self.root.child("setpoints").child(deviation.setpoint).child("of")
+        for name in points.brought & taken - section.items().keys():
+            text = f"{name!r} is a name that a set point brings with it; rename the other one"
+            section.note(section.error(text))
+        self.steps, self.deviations = points.steps, points.deviations
+        for name, deviation in list(points.deviations.items()):
+            of = section.child(deviation.setpoint).child("of")
             if name in self.derived:  # otherwise it is no name at all, which is known
                 with of.noting():
                     self._find(of, "variable")
