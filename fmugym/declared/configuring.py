@@ -79,15 +79,16 @@ def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[
     return {CLOCK: read_begin(clock, scenarios, length, warm_steps * time_step)}
 
 
-def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
+def samplings_of(naming: Naming) -> dict[str, str]:
     """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
     names = (*naming.outputs, *naming.monitors)
-    found = [declared.variables[name].fmu_variable for name in names]
+    found = [naming.declared.variables[name].fmu_variable for name in names]
     return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
-def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
+def bounds_of(naming: Naming) -> dict[str, tuple[float, float]]:
     """The limits that the task gives of what it writes, observes and lets episodes start with."""
+    declared = naming.declared
     names = (*declared.written, *naming.outputs, *declared.parameters)
     found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.bounds for one in found if one.bounds is not None}

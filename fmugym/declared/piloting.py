@@ -52,23 +52,16 @@ class Pilot:
     """A controller and its action.
 
     Args:
-        declared: The task.
         naming: Gives names their values.
         variable: The variable that the controller writes.
         controller: Chooses the value, in the unit of the task.
     """
 
-    def __init__(
-        self,
-        declared: Declarations,
-        naming: Naming,
-        variable: TaskVariable,
-        controller: Controller,
-    ) -> None:
-        self.variable, self.controller, self._declared = variable, controller, declared
-        self.place = declared.actions.index(variable)
+    def __init__(self, naming: Naming, variable: TaskVariable, controller: Controller) -> None:
+        self.variable, self.controller, self._declared = variable, controller, naming.declared
+        self.place = naming.declared.actions.index(variable)
         self._names = tuple(signals_of(controller))
-        self.values = [_signal(declared, naming, name) for name in self._names]
+        self.values = [_signal(naming, name) for name in self._names]
         self._signals, self._clock = function_of(self.values), function_of(naming.clock)
         self._present = function_of(naming.present(variable)) if variable.delta else None
 
@@ -129,10 +122,7 @@ class DeclaredWarmUp(WarmUp):
     """The warm-up of a declared task.
 
     Args:
-        declared: The task.
         naming: Gives names their values.
-        time_step: Length of a step in seconds.
-        steps: Its steps.
         inputs: The FMU's inputs.
         updates: Functions that write episode variables when the FMU has stepped.
         written: These variables by name, and what is written.
@@ -144,21 +134,19 @@ class DeclaredWarmUp(WarmUp):
 
     def __init__(
         self,
-        declared: Declarations,
         naming: Naming,
-        time_step: float,
-        steps: int,
         inputs: Sequence[Value],
         updates: Sequence[Hook],
         written: Mapping[str, Sequence[Value]],
         config: Mapping[str, Any],
     ) -> None:
-        table = declared.warm_up
-        self.steps, self._time_step, self.caches = steps, time_step, table.caches
+        declared, table = naming.declared, naming.declared.warm_up
+        self.steps, self._time_step = naming.warm_steps, naming.time_step
+        self.caches = table.caches
         self._inputs, self._updates = function_of(tuple(inputs)), updates
         self.writes = tuple(written)
         self._pilots = [
-            Pilot(declared, naming, variable, table.controllers[variable.alias])
+            Pilot(naming, variable, table.controllers[variable.alias])
             for variable in declared.actions
             if variable.alias in table.controllers
         ]
@@ -170,7 +158,7 @@ class DeclaredWarmUp(WarmUp):
             repr((one.variable.alias, type(one.controller), vars(one.controller)))
             for one in self._pilots
         ]
-        content = repr((steps, time_step, told, _described(naming.graph, roots)))
+        content = repr((self.steps, self._time_step, told, _described(naming.graph, roots)))
         self.digest = sha256(content.encode()).hexdigest()
         with table.entry.placing():
             self.begin(1)  # which finds mistakes
@@ -208,6 +196,6 @@ class DeclaredWarmUp(WarmUp):
                 )
 
 
-def _signal(declared: Declarations, naming: Naming, name: str) -> Value:
-    entry = declared.warm_up.entry.child("controller")
+def _signal(naming: Naming, name: str) -> Value:
+    entry = naming.declared.warm_up.entry.child("controller")
     return naming.value(entry, Expression.parse(name), Moment.SEEN).number

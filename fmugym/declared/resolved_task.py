@@ -139,15 +139,13 @@ class ResolvedTask:
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
-        found = named_values(self._declared, self._naming)
+        found = named_values(self._naming)
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
     def _read_observations(self) -> None:
-        self._kept = histories(self._declared, self._naming, self._time_step)
-        self._seen, self._sensors = observed_values(
-            self._declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
-        )
+        self._kept = histories(self._naming)
+        self._seen, self._sensors = observed_values(self._naming, self._kept)
 
     def _find_mistakes(self) -> None:
         """Evaluate everything once, so that one error tells all mistakes."""
@@ -200,10 +198,7 @@ class ResolvedTask:
         }
         written |= {name: [value] for name, value in self._switched().items()}
         return DeclaredWarmUp(
-            self._declared,
             self._naming,
-            self._time_step,
-            self._warm_steps,
             self._input_values(self._declared.warm_up.controllers),
             [*self._updates_of_histories(), *_assignments(self._switched())],
             written,
@@ -226,8 +221,8 @@ class ResolvedTask:
                 for variable, value in declared.parameters.values()
             },
             "episode_variables": self._variables(),
-            "bounds": bounds_of(declared, self._naming),
-            "samplings": samplings_of(declared, self._naming),
+            "bounds": bounds_of(self._naming),
+            "samplings": samplings_of(self._naming),
         }
 
     def _variables(self) -> dict[str, Any]:
