@@ -29,8 +29,9 @@ def time_step_of(root: Entry, description: ModelDescription) -> float:
     return step
 
 
-def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
+def times_of(naming: Naming) -> dict[str, Any]:
     """The lengths and times of a config. If one is no multiple of the time step, it is noted."""
+    declared, time_step = naming.declared, naming.time_step
     root, times = declared.root, dict[str, Any](time_step=time_step)
     start, substeps, length = map(root.child, ("start_time", "substeps", "episode_length"))
     if declared.warm_up.period:
@@ -60,23 +61,18 @@ def _start_time(declared: Declarations, length: float) -> Any:
     return found
 
 
-def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[str, Any]:
+def clock_of(naming: Naming) -> dict[str, Any]:
     """The episode variable that tells when an episode begins, if the task has a clock of its own.
-
-    Args:
-        declared: The task.
-        time_step: Length of a step in seconds.
-        warm_steps: The steps of a warm-up with moving inputs, which come before.
 
     Raises:
         ConfigError: If there is no time for an episode.
     """
-    clock = declared.root.child("clock")
-    scenarios = read_scenarios(declared.root.child("scenarios"))
+    root, step = naming.declared.root, naming.time_step
+    clock, scenarios = root.child("clock"), read_scenarios(root.child("scenarios"))
     if clock.value is None:
         return {}
-    length = times_of(declared, time_step).get("max_episode_steps", 0) * time_step
-    return {CLOCK: read_begin(clock, scenarios, length, warm_steps * time_step)}
+    length = times_of(naming).get("max_episode_steps", 0) * step
+    return {CLOCK: read_begin(clock, scenarios, length, naming.warm_steps * step)}
 
 
 def samplings_of(naming: Naming) -> dict[str, str]:

@@ -90,18 +90,18 @@ class ResolvedTask:
     def __init__(
         self, task: Task, root: Entry, description: ModelDescription, needs_reward: bool = True
     ) -> None:
-        self._task, self._root, self._time_step, self._warm_steps = task, root, math.nan, 0
+        self._task, self._root, time_step, warm_steps = task, root, math.nan, 0
         self._declared = declared = Declarations(root, description, task.is_physical)
         with root.child("reward").noting():
             if needs_reward and not declared.rewards:
                 text = 'the task has no reward; say one, for example: reward = "1"'
                 raise root.lack(text, "reward")
         with root.child("time_step").noting():
-            self._time_step = time_step_of(root, description)
+            time_step = time_step_of(root, description)
         with declared.warm_up.entry.noting():
-            self._warm_steps = self._steps_of_warm_up()
+            warm_steps = self._steps_of_warm_up(time_step)
         with root.noting():
-            self._naming = Naming(declared, self._time_step, self._warm_steps)
+            self._naming = Naming(declared, time_step, warm_steps)
             self._read_observations()
             self._find_mistakes()
         root.mistakes.require_none()
@@ -115,7 +115,7 @@ class ResolvedTask:
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
-        self.warm_up = self._make_warm_up() if self._warm_steps else None
+        self.warm_up = self._make_warm_up() if self._naming.warm_steps else None
         self.action_masks = self._action_masks()
         self.unphysical_keys, self.expressions = declared.unphysical_keys, declared.expressions
         limits = {name: term.limit for name, term in declared.costs.items()}
@@ -165,11 +165,8 @@ class ResolvedTask:
             yield self._root.child(name), partial(self._condition, name)
         for kpi in declared.kpis.values():
             yield kpi.entry, partial(self._kpi_value, kpi)
-        yield self._root, partial(times_of, declared, self._time_step)
-        yield (
-            self._root.child("clock"),
-            partial(clock_of, declared, self._time_step, self._warm_steps),
-        )
+        yield self._root, partial(times_of, self._naming)
+        yield self._root.child("clock"), partial(clock_of, self._naming)
         for seen in self._seen:
             yield seen.entry, partial(self._in_form, seen)
 
@@ -186,11 +183,11 @@ class ResolvedTask:
 
     # The warm-up.
 
-    def _steps_of_warm_up(self) -> int:
+    def _steps_of_warm_up(self, time_step: float) -> int:
         """The steps of a warm-up with moving inputs; 0 if there is none."""
         table = self._declared.warm_up
         moves = table.controllers or table.caches or self._declared.inputs
-        return steps_in(table.entry, table.period, self._time_step) if moves and table.period else 0
+        return steps_in(table.entry, table.period, time_step) if moves and table.period else 0
 
     def _make_warm_up(self) -> DeclaredWarmUp:
         written: dict[str, Sequence[Value]] = {
@@ -212,7 +209,7 @@ class ResolvedTask:
         return {
             **(self._root.child("config").value or {}),
             "foreign": self._root.child("foreign").value or {},
-            **times_of(declared, self._time_step),
+            **times_of(self._naming),
             "model_input_names": variables.names_in_fmu(declared.written),
             "model_output_names": variables.names_in_fmu(self._naming.outputs),
             "monitor_names": variables.names_in_fmu(self._naming.monitors),
@@ -234,13 +231,7 @@ class ResolvedTask:
             starts = self._is_on_at_start(variable), _LONG_AGO
             switches |= zip(switch_names(variable), starts, strict=True)
         zeros = dict.fromkeys([*self._worst, *self._updated_kpis], 0.0)
-        variables = (
-            memory
-            | clock_of(self._declared, self._time_step, self._warm_steps)
-            | kept
-            | switches
-            | zeros
-        )
+        variables = memory | clock_of(self._naming) | kept | switches | zeros
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
@@ -250,7 +241,7 @@ class ResolvedTask:
         if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
-        start = times_of(self._declared, self._time_step).get("start_time")
+        start = times_of(self._naming).get("start_time")
         draws = any(map(is_distribution, [*parameters, start, *variables.values()]))
         return {NOISE: NoiseKey(draws=not draws)}
 
