@@ -29,8 +29,9 @@ def time_step_of(root: Entry, description: ModelDescription) -> float:
     return step
 
 
-def times_of(declared: Declarations, time_step: float) -> dict[str, Any]:
+def times_of(naming: Naming) -> dict[str, Any]:
     """The lengths and times of a config. If one is no multiple of the time step, it is noted."""
+    declared, time_step = naming.declared, naming.time_step
     root, times = declared.root, dict[str, Any](time_step=time_step)
     start, substeps, length = map(root.child, ("start_time", "substeps", "episode_length"))
     if declared.warm_up.period:
@@ -60,34 +61,30 @@ def _start_time(declared: Declarations, length: float) -> Any:
     return found
 
 
-def clock_of(declared: Declarations, time_step: float, warm_steps: int) -> dict[str, Any]:
+def clock_of(naming: Naming) -> dict[str, Any]:
     """The episode variable that tells when an episode begins, if the task has a clock of its own.
-
-    Args:
-        declared: The task.
-        time_step: Length of a step in seconds.
-        warm_steps: The steps of a warm-up with moving inputs, which come before.
 
     Raises:
         ConfigError: If there is no time for an episode.
     """
-    clock = declared.root.child("clock")
-    scenarios = read_scenarios(declared.root.child("scenarios"))
+    root, step = naming.declared.root, naming.time_step
+    clock, scenarios = root.child("clock"), read_scenarios(root.child("scenarios"))
     if clock.value is None:
         return {}
-    length = times_of(declared, time_step).get("max_episode_steps", 0) * time_step
-    return {CLOCK: read_begin(clock, scenarios, length, warm_steps * time_step)}
+    length = times_of(naming).get("max_episode_steps", 0) * step
+    return {CLOCK: read_begin(clock, scenarios, length, naming.warm_steps * step)}
 
 
-def samplings_of(declared: Declarations, naming: Naming) -> dict[str, str]:
+def samplings_of(naming: Naming) -> dict[str, str]:
     """How outputs are sampled, by their names in the FMU, where that is not ``"last"``."""
     names = (*naming.outputs, *naming.monitors)
-    found = [declared.variables[name].fmu_variable for name in names]
+    found = [naming.declared.variables[name].fmu_variable for name in names]
     return {one.name: one.sampling for one in found if one.sampling != "last"}
 
 
-def bounds_of(declared: Declarations, naming: Naming) -> dict[str, tuple[float, float]]:
+def bounds_of(naming: Naming) -> dict[str, tuple[float, float]]:
     """The limits that the task gives of what it writes, observes and lets episodes start with."""
+    declared = naming.declared
     names = (*declared.written, *naming.outputs, *declared.parameters)
     found = [declared.variables[name].fmu_variable for name in names]
     return {one.name: one.bounds for one in found if one.bounds is not None}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import keyword
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final, TypeVar
 
@@ -15,21 +14,19 @@ from fmugym.declared.entries import Entry
 from fmugym.declared.expressions import CONSTANTS, Expression
 from fmugym.declared.fitted import read_fitted
 from fmugym.declared.format import DEVICE
-from fmugym.declared.kpis import Kpi, read_kpi
+from fmugym.declared.kpis import read_kpi
 from fmugym.declared.mathematics import FUNCTIONS
 from fmugym.declared.parts import (
-    Derived,
     Limits,
-    Memory,
     Term,
     read_derived,
     read_memory,
     read_term,
 )
-from fmugym.declared.series import Series, read_data
-from fmugym.declared.setpoints import Deviation, SetPoints, Steps
+from fmugym.declared.series import read_data
+from fmugym.declared.setpoints import SetPoints
 from fmugym.declared.variables import NAMING, TaskVariable, TaskVariables, fitted_value, start_value
-from fmugym.declared.warming import WarmUpTable, read_warm_up
+from fmugym.declared.warming import read_warm_up
 
 __all__ = ["BUILT_IN", "Declarations", "is_reserved"]
 
@@ -46,7 +43,6 @@ def is_reserved(name: str) -> bool:
     return name in _RESERVED or keyword.iskeyword(name)
 
 
-@dataclass
 class Declarations:
     """What a task declares.
 
@@ -71,58 +67,37 @@ class Declarations:
         warm_up: What happens before an episode begins.
     """
 
-    root: Entry
-    variables: TaskVariables
-    is_physical: bool = False
-    parameters: dict[str, tuple[TaskVariable, Any]] = field(init=False)
-    memory: dict[str, Memory] = field(init=False)
-    derived: dict[str, Derived] = field(init=False)
-    series: dict[str, Series] = field(init=False)
-    steps: dict[str, Steps] = field(init=False)
-    actions: list[TaskVariable] = field(init=False)
-    inputs: dict[str, tuple[TaskVariable, Expression]] = field(init=False)
-    observed: list[tuple[Entry, str]] = field(init=False)
-    remembered: list[str] = field(init=False)
-    rewards: dict[str, Term] = field(init=False)
-    costs: dict[str, Term] = field(init=False)
-    flags: dict[str, Expression] = field(init=False)
-    deviations: dict[str, Deviation] = field(init=False)
-    kpis: dict[str, Kpi] = field(init=False)
-    warm_up: WarmUpTable = field(init=False)
-    _declared: list[str] = field(init=False)
-
-    @classmethod
-    def read(
-        cls, root: Entry, description: ModelDescription, is_physical: bool = False
-    ) -> Declarations:
+    def __init__(
+        self, root: Entry, description: ModelDescription, is_physical: bool = False
+    ) -> None:
         """Read all sections, and note their mistakes, and what does not fit the FMU."""
-        declared = cls(root, TaskVariables(root, description), is_physical)
-        declared._declared = [name for section in NAMING[1:] for name in _names(root, section)]
+        self.root, self.is_physical = root, is_physical
+        self.variables = TaskVariables(root, description)
+        self._declared = [name for section in NAMING[1:] for name in _names(root, section)]
         _check_names(root)
-        declared.memory = _read(root, "memory", read_memory)
-        declared.derived = _read(root, "expressions", read_derived)
-        declared.series = _read(root, "data", read_data)
-        declared._read_setpoints()
-        declared.parameters = declared._with_fitted(_read(root, "parameters", declared._parameter))
-        declared.actions = declared._read_actions()
-        declared.inputs = declared._read_inputs()
-        declared.observed = []
-        for entry in declared._listed("observations"):
+        self.memory = _read(root, "memory", read_memory)
+        self.derived = _read(root, "expressions", read_derived)
+        self.series = _read(root, "data", read_data)
+        self._read_setpoints()
+        self.parameters = self._with_fitted(_read(root, "parameters", self._parameter))
+        self.actions = self._read_actions()
+        self.inputs = self._read_inputs()
+        self.observed: list[tuple[Entry, str]] = []
+        for entry in self._listed("observations"):
             with entry.noting():
-                declared._check_observed(entry)
-                declared.observed.append((entry, entry.value))
-        declared.remembered = declared._read_remembered()
-        declared.warm_up = read_warm_up(root, declared.actions, declared._controlled())
+                self._check_observed(entry)
+                self.observed.append((entry, entry.value))
+        self.remembered = self._read_remembered()
+        self.warm_up = read_warm_up(root, self.actions, self._controlled())
         reward = root.child("reward")
         if isinstance(reward.value, Expression):
-            declared.rewards = {"": Term(reward, reward.value)}
+            self.rewards = {"": Term(reward, reward.value)}
         else:
-            declared.rewards = _read(root, "reward", read_term)
-        declared.costs = _read(root, "costs", read_term)
-        declared.kpis = _read(root, "kpis", read_kpi)
+            self.rewards = _read(root, "reward", read_term)
+        self.costs = _read(root, "costs", read_term)
+        self.kpis = _read(root, "kpis", read_kpi)
         conditions = [root.child(name) for name in ("terminated", "truncated")]
-        declared.flags = {e.name: e.value for e in conditions if e.value is not None}
-        return declared
+        self.flags = {e.name: e.value for e in conditions if e.value is not None}
 
     @property
     def own_names(self) -> list[str]:
@@ -245,22 +220,18 @@ class Declarations:
         return size if 0 < size < np.inf else None
 
     def _read_setpoints(self) -> None:
-        points, section = SetPoints(), self.root.child("setpoints").items()
-        for entry in section.values():
+        section = self.root.child("setpoints")
+        points = SetPoints(self.memory, self.series, self.derived)
+        taken = {*self.memory, *self.derived, *self.series}
+        for entry in section.items().values():
             with entry.noting():
                 points.add(entry)
-        own = section.keys()
-        for name in {*points.memory, *points.derived} - own:
-            if name in {*self.memory, *self.derived, *self.series}:
-                entry = self.root.child("setpoints")
-                text = f"{name!r} is a name that a set point brings with it; rename the other one"
-                entry.note(entry.error(text))
-        self.memory |= points.memory
-        self.series |= points.series
-        self.derived |= points.derived
-        self.steps, self.deviations = points.steps, dict(points.deviations)
-        for name, deviation in points.deviations.items():
-            of = self.root.child("setpoints").child(deviation.setpoint).child("of")
+        for name in points.brought & taken - section.items().keys():
+            text = f"{name!r} is a name that a set point brings with it; rename the other one"
+            section.note(section.error(text))
+        self.steps, self.deviations = points.steps, points.deviations
+        for name, deviation in list(points.deviations.items()):
+            of = section.child(deviation.setpoint).child("of")
             if name in self.derived:  # otherwise it is no name at all, which is known
                 with of.noting():
                     self._find(of, "variable")

@@ -14,25 +14,25 @@ from fmugym.task.quantity import Quantity
 __all__ = ["named_values"]
 
 
-def named_values(declared: Declarations, naming: Naming) -> dict[str, tuple[Quantity, Value]]:
+def named_values(naming: Naming) -> dict[str, tuple[Quantity, Value]]:
     """Find the quantities of a task, in its units.
 
     Args:
-        declared: The task.
         naming: Gives names their values.
 
     Returns:
         By name, the quantity and its value between two steps.
     """
     found: dict[str, tuple[Quantity, Value]] = {}
-    for quantity in _quantities(declared, naming):
+    for quantity in _quantities(naming):
         value = _value(naming, quantity.name)
         if value is not None:
             found.setdefault(quantity.name, (quantity, value))
     return found
 
 
-def _quantities(declared: Declarations, naming: Naming) -> Iterator[Quantity]:
+def _quantities(naming: Naming) -> Iterator[Quantity]:
+    declared = naming.declared
     actions = [variable.alias for variable in declared.actions]
     for alias in [*actions, *naming.read_names]:
         yield _of_variable(declared, alias, "action" if alias in actions else "output")

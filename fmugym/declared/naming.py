@@ -88,7 +88,7 @@ class Naming:
     """
 
     def __init__(self, declared: Declarations, time_step: float, warm_steps: int = 0) -> None:
-        self._declared, self._time_step, self._warm_steps = declared, time_step, warm_steps
+        self.declared, self.time_step, self.warm_steps = declared, time_step, warm_steps
         self.first_step = 1 - warm_steps
         self._open: list[str] = []
         self._ahead = 0.0
@@ -99,7 +99,7 @@ class Naming:
 
     def _read_names(self) -> tuple[list[str], list[str]]:
         """Observed variables come first, and next those whose previous values are needed."""
-        declared, expressions = self._declared, self._declared.expressions
+        declared, expressions = self.declared, self.declared.expressions
         observed = declared.measured
         previous = sorted(set().union(*(e.previous_names for e in expressions)))
         used = sorted(set().union(*(e.names for e in expressions)))
@@ -119,11 +119,11 @@ class Naming:
 
         They must be sampled in one way: a step gives one value of each.
         """
-        variables, first = self._declared.variables, dict[str, str]()
+        variables, first = self.declared.variables, dict[str, str]()
         originals: dict[str, Variable] = {}
         for name in names:
             with variables[name].entry.noting():
-                if variables[name].in_fmu is None and not self._declared.knows_actions:
+                if variables[name].in_fmu is None and not self.declared.knows_actions:
                     raise ConsequenceError(f"{name!r} may be an action")
                 originals[name] = variables[name].fmu_variable
         for name, original in originals.items():
@@ -195,7 +195,7 @@ class Naming:
                 return others[name]
             value = self.value_of(name, moment)
             if value is None:
-                self._declared.variables.require_unhidden(name)
+                self.declared.variables.require_unhidden(name)
             return value
 
         return Names(
@@ -206,13 +206,13 @@ class Naming:
         )
 
     def _known(self) -> list[str]:
-        declared = self._declared
+        declared = self.declared
         own = [*declared.own_names, *declared.parameters, *BUILT_IN]
         return list(dict.fromkeys([*own, *declared.variables.names()]))
 
     def value_of(self, name: str, moment: Moment) -> Value | None:
         """The value of a name; None if there is no such name, or it has none at this moment."""
-        declared = self._declared
+        declared = self.declared
         if name in BUILT_IN:
             return self._built_in(name, moment)
         if name in declared.memory:
@@ -246,23 +246,23 @@ class Naming:
             self._ahead = 0.0
         if value is None or value.constant is not None:
             if value is None:
-                self._declared.variables.require_unhidden(name)
+                self.declared.variables.require_unhidden(name)
             if name not in (known := self._known()):
                 raise entry.error(unknown_name("name to forecast", name, known))
             raise entry.error(_no_forecast(name))
         return value.number
 
     def _value_of_memory(self, name: str, moment: Moment) -> Value:
-        memory = self._declared.memory[name]
+        memory = self.declared.memory[name]
         if moment is Moment.FORECAST and memory.update is not None:
             raise memory.entry.error(_no_forecast(name))
         return self.read("variables", name)
 
     def _value_of_series(self, name: str, moment: Moment) -> Value:
         """The value now. One that holds for a while is, after a step, that of the step."""
-        series, shift = self._declared.series[name], self._ahead
+        series, shift = self.declared.series[name], self._ahead
         if series.is_stepped:
-            shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self._time_step
+            shift += (_JUST - 1.0 if moment in _OVER else _JUST) * self.time_step
         table, tables = f"series {name}", self.graph.tables
         if name not in self.lookups:
             numbered = [float(len(self.lookups)), series.values[-1]]  # for nobody looks to the left
@@ -275,9 +275,9 @@ class Naming:
 
     def _value_of_steps(self, name: str, moment: Moment) -> Value:
         """The random value now; after a step, that of the step."""
-        steps = self._declared.steps[name]
-        count = steps_in(steps.entry, steps.every, self._time_step)
-        shift = nearest_steps(self._ahead, self._time_step) - (moment in _OVER)
+        steps = self.declared.steps[name]
+        count = steps_in(steps.entry, steps.every, self.time_step)
+        shift = nearest_steps(self._ahead, self.time_step) - (moment in _OVER)
         passed = maximum(self.step_count + float(shift), 0.0)
         low, high = steps.limits
         return low + (high - low) * chance_in(np.floor(passed / float(count)), steps.channel)
@@ -289,34 +289,34 @@ class Naming:
             case "clock":
                 return self.clock + self._ahead
             case "elapsed":
-                return self.step_count * self._time_step + self._ahead
+                return self.step_count * self.time_step + self._ahead
             case "step":
-                return self.step_count + self._ahead / self._time_step
+                return self.step_count + self._ahead / self.time_step
             case "done":
                 return self._done(moment)
             case "dt":
-                return self.constant(self._time_step)
-        return self.constant(self._time_step / _SECONDS_PER_HOUR)
+                return self.constant(self.time_step)
+        return self.constant(self.time_step / _SECONDS_PER_HOUR)
 
     @property
     def clock(self) -> Value:
         """The time of data now; that of the FMU if the task sets no other clock."""
-        if self._declared.root.child("clock").value is None:
+        if self.declared.root.child("clock").value is None:
             return self.read("time")
-        return self.read("variables", CLOCK) + self.step_count * self._time_step
+        return self.read("variables", CLOCK) + self.step_count * self.time_step
 
     def _done(self, moment: Moment) -> Value | None:
         if moment is Moment.JUDGED:
             return self.read("done", dtype=np.bool_)
         if moment is not Moment.UPDATED:
             return None
-        flags, entry = self._declared.flags, self._declared.root.child("terminated")
+        flags, entry = self.declared.flags, self.declared.root.child("terminated")
         if "terminated" not in flags:
             return self.constant(False)
         return self.value(entry, flags["terminated"], Moment.AFTER)
 
     def _value_of_derived(self, name: str, moment: Moment) -> Value:
-        derived, key = self._declared.derived[name], (name, moment, self._ahead)
+        derived, key = self.declared.derived[name], (name, moment, self._ahead)
         if name in self._open:
             raise derived.entry.error(f"{name!r} depends on itself")
         if key not in self._derived:  # many may read it
@@ -337,7 +337,7 @@ class Naming:
             self._open.pop()
 
     def _value_of_variable(self, name: str, variable: TaskVariable, moment: Moment) -> Value:
-        declared = self._declared
+        declared = self.declared
         if moment is Moment.FORECAST:
             raise variable.entry.error(_no_forecast(name))
         if variable in declared.actions and variable.in_fmu is None:
@@ -358,7 +358,7 @@ class Naming:
         return converted(variable.conversion, value)
 
     def _previous_value_of(self, name: str) -> Value | None:
-        declared, variable = self._declared, self._declared.variables.get(name)
+        declared, variable = self.declared, self.declared.variables.get(name)
         if variable is not None and variable in declared.actions:
             return self.action(variable, "previous_action") if variable.is_direct else None
         if variable is None or not self._is_output(name):
@@ -374,7 +374,7 @@ class Naming:
             variable: The variable that the agent writes.
             attribute: ``"action"`` or ``"previous_action"``.
         """
-        declared, place = self._declared, self._place_of(variable)
+        declared, place = self.declared, self._place_of(variable)
         if declared.is_physical or not variable.levels:
             element = self.read(attribute, place, dtype=np.float32).cast(np.float64)
             if variable.levels:
@@ -401,7 +401,7 @@ class Naming:
             chosen = self._changed(variable, chosen, now)
         device, channel = variable.device, _CHANNELS_OF_ACTUATORS + self._place_of(variable)
         chosen = device.distorted(chosen, self.step_count, channel)
-        chosen = device.following(chosen, now, self.step_count, channel, self._time_step)
+        chosen = device.following(chosen, now, self.step_count, channel, self.time_step)
         if variable.is_switched:
             chosen = where(self.blocked(variable, chosen), now, chosen)
         return chosen
@@ -409,13 +409,13 @@ class Naming:
     def _changed(self, variable: TaskVariable, chosen: Value, now: Value) -> Value:
         """An input after a change; in the physical form, towards the chosen value."""
         value = now + chosen
-        if self._declared.is_physical:
+        if self.declared.is_physical:
             value = clip(chosen, now - variable.delta, now + variable.delta)
         limited: Value = clip(value, variable.low, variable.high)
         return limited
 
     def _place_of(self, variable: TaskVariable) -> int:
-        return self._declared.actions.index(variable)
+        return self.declared.actions.index(variable)
 
     def delay_of(self, variable: TaskVariable) -> int:
         """By how many steps a sensor or an actuator is late.
@@ -424,25 +424,25 @@ class Naming:
             ConfigError: If the delay is no multiple of the time step.
         """
         delay, entry = variable.device.delay, variable.entry.child("delay")
-        return steps_in(entry, delay, self._time_step, _LONGEST_DELAY) if delay else 0
+        return steps_in(entry, delay, self.time_step, _LONGEST_DELAY) if delay else 0
 
     def _late(self, variable: TaskVariable) -> Value:
         """What the agent chose some steps ago."""
         count = self.delay_of(variable)
         queued = self.read("variables", queue_name(variable), count - 1)
-        is_first = self.step_count < float(count - self._warm_steps)
+        is_first = self.step_count < float(count - self.warm_steps)
         return where(is_first, self.start(variable), queued)
 
     def start(self, variable: TaskVariable) -> Value:
         """What counts as chosen before the first action; no change for changes."""
-        if variable.delta and not self._declared.is_physical:
+        if variable.delta and not self.declared.is_physical:
             return self.step_count * 0.0
         return self._start_of_input(variable)
 
     def _start_of_input(self, variable: TaskVariable) -> Value:
         if variable.in_fmu is None:
             return self.step_count * 0.0
-        if variable.alias in self._declared.parameters:
+        if variable.alias in self.declared.parameters:
             start = self.read("parameters", variable.fmu_variable.name)
         else:
             start = self.step_count * 0.0 + variable.in_fmu.start_number
@@ -453,7 +453,7 @@ class Naming:
         return converted(variable.conversion, self._written(variable))
 
     def _written(self, variable: TaskVariable) -> Value:
-        return self.read("inputs", self._declared.written.index(variable.alias))
+        return self.read("inputs", self.declared.written.index(variable.alias))
 
     def blocked(self, variable: TaskVariable, chosen: Value) -> Value:
         """Whether it is too early to switch to a value.
@@ -463,9 +463,7 @@ class Naming:
             chosen: The value.
         """
         state, since = (self.read("variables", name) for name in switch_names(variable))
-        on, off = (
-            np.ceil(t / self._time_step - _JUST) for t in (variable.min_on, variable.min_off)
-        )
+        on, off = (np.ceil(t / self.time_step - _JUST) for t in (variable.min_on, variable.min_off))
         stays_on = (state > 0.5) & (chosen == 0.0) & (since < float(on))
         stays_off = (state < 0.5) & (chosen != 0.0) & (since < float(off))
         return stays_on | stays_off
@@ -478,10 +476,9 @@ class Naming:
 
     def _rescaled(self, variable: TaskVariable, element: Value) -> Value:
         """Turn an action from -1 to 1 into one from the lowest to the highest value."""
-        if variable.delta:
-            return variable.delta * element
-        middle, half = (variable.low + variable.high) / 2, (variable.high - variable.low) / 2
-        return middle + half * element
+        low, high = variable.chosen
+        value = (high - low) / 2 * element
+        return value if variable.delta else (low + high) / 2 + value
 
     def _nearest_level(self, variable: TaskVariable, element: Value) -> Value:
         """The level that is nearest to a value, the lower one of two."""
@@ -497,7 +494,7 @@ class Naming:
             The value to add, and the older values in the first step; None if there is no history of
             this name.
         """
-        declared, variable = self._declared, self._declared.variables.get(name)
+        declared, variable = self.declared, self.declared.variables.get(name)
         if variable is None or not (variable in declared.actions or self._is_output(name)):
             return None
         if variable not in declared.actions:

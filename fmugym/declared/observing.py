@@ -99,15 +99,16 @@ class History(NamedTuple):
     first: Value
 
 
-def histories(declared: Declarations, naming: Naming, time_step: float) -> list[History]:
+def histories(naming: Naming) -> list[History]:
     """The histories that the agent sees, of values that no function of time gives.
 
     The history of a variable holds its values before the present one. That of an action begins with
     the action of the step that has just ended. A name without a value before the step is noted as a
     mistake.
     """
+    declared = naming.declared
     entry = declared.root.child("agent").child("history")
-    lengths = dict.fromkeys(declared.remembered, _kept_steps(declared, time_step))
+    lengths = dict.fromkeys(declared.remembered, _kept_steps(naming))
     for name in declared.measured:
         variable = _sensor_of(declared, name)
         if variable is None:
@@ -128,12 +129,12 @@ def histories(declared: Declarations, naming: Naming, time_step: float) -> list[
     return kept
 
 
-def _kept_steps(declared: Declarations, time_step: float) -> int:
+def _kept_steps(naming: Naming) -> int:
     """How many values of a name the agent sees that are of the past."""
-    entry, steps = declared.root.child("agent").child("history").child("length"), 0
+    entry, steps = naming.declared.root.child("agent").child("history").child("length"), 0
     with entry.noting():
         if entry.value is not None:
-            steps = steps_in(entry, entry.value, time_step, _MOST_VALUES)
+            steps = steps_in(entry, entry.value, naming.time_step, _MOST_VALUES)
     return steps
 
 
@@ -159,31 +160,18 @@ def _sensor_of(declared: Declarations, name: str) -> TaskVariable | None:
     return declared.variables.get(name) if declared.is_output(name) else None
 
 
-def observed_values(
-    declared: Declarations,
-    naming: Naming,
-    kept: list[History],
-    time_step: float,
-    are_filled: bool = False,
-) -> tuple[list[Seen], list[History]]:
+def observed_values(naming: Naming, kept: list[History]) -> tuple[list[Seen], list[History]]:
     """The numbers that the agent observes, in their order, and what sensors remember.
 
     Args:
-        declared: The task.
         naming: Gives names their values.
         kept: The histories.
-        time_step: Length of a step in seconds.
-        are_filled: Whether a warm-up has filled the histories when an episode begins.
 
     Constants, and names without a forecast or history, are noted as mistakes.
     """
-    _check_sensors(declared)
-    past = _Past(declared, naming, kept, time_step, are_filled)
-    seen = [
-        *_present(declared, past),
-        *_forecasts(declared, naming, time_step),
-        *_remembered(declared, past, time_step),
-    ]
+    _check_sensors(naming.declared)
+    past = _Past(naming, kept)
+    seen = [*_present(naming, past), *_forecasts(naming), *_remembered(naming, past)]
     return seen, past.memories
 
 
@@ -205,16 +193,8 @@ def _check_sensors(declared: Declarations) -> None:
 class _Past:
     """Gives values now and some steps ago, as the agent measures them."""
 
-    def __init__(
-        self,
-        declared: Declarations,
-        naming: Naming,
-        kept: list[History],
-        time_step: float,
-        are_filled: bool,
-    ) -> None:
-        self._declared, self._naming, self._time_step = declared, naming, time_step
-        self._are_filled = are_filled
+    def __init__(self, naming: Naming, kept: list[History]) -> None:
+        self._naming, self._declared = naming, naming.declared
         self._measured: dict[str, History] = {}
         self._histories = {history.name: history for history in kept}
 
@@ -235,16 +215,14 @@ class _Past:
 
     def _unless_first(self, first: Value, past: Value) -> Value:
         """A value of the past; another one at the beginning of an episode, which has no past."""
-        return past if self._are_filled else where(self._naming.step_count == 0, first, past)
+        is_filled = self._naming.warm_steps > 0  # histories, by a warm-up
+        return past if is_filled else where(self._naming.step_count == 0, first, past)
 
     def _fresh(self, entry: Entry, variable: TaskVariable, ago: int) -> Value:
         """A measurement, whatever was measured before."""
         name, device = variable.alias, variable.device
         value = self._true(entry, name, ago + self._naming.delay_of(variable))
-        return device.distorted(value, self._naming.step_count - ago, self._channel(name))
-
-    def _channel(self, name: str) -> int:
-        return self._naming.channel_of(name)
+        return device.distorted(value, self._naming.step_count - ago, self._naming.channel_of(name))
 
     def _kept(self, entry: Entry, variable: TaskVariable, ago: int) -> str:
         """The variable with what a sensor with a memory has given, the latest first."""
@@ -254,8 +232,8 @@ class _Past:
         first = self._fresh(entry, variable, 0)
         is_first = naming.step_count == naming.first_step
         before = where(is_first, fill, naming.read("variables", kept, 0))
-        channel = self._channel(name)
-        now = variable.device.following(first, before, naming.step_count, channel, self._time_step)
+        past = first, before, naming.step_count, naming.channel_of(name), naming.time_step
+        now = variable.device.following(*past)
         self._measured[name] = History(name, kept, length, now, fill, first)
         return kept
 
@@ -274,16 +252,18 @@ class _Past:
             history = self._histories[name]
             past = self._naming.read("variables", history.variable, ago - 1)
             return self._unless_first(history.first, past)
-        return self._naming.forecast(entry, name, -ago * self._time_step)
+        return self._naming.forecast(entry, name, -ago * self._naming.time_step)
 
 
-def _present(declared: Declarations, past: _Past) -> Iterator[Seen]:
+def _present(naming: Naming, past: _Past) -> Iterator[Seen]:
+    declared = naming.declared
     for entry, name in declared.observed:
         with entry.noting():
             yield Seen(entry, name, past.measured(entry, name, 0), *declared.limits_of(name))
 
 
-def _forecasts(declared: Declarations, naming: Naming, time_step: float) -> Iterator[Seen]:
+def _forecasts(naming: Naming) -> Iterator[Seen]:
+    declared, time_step = naming.declared, naming.time_step
     for entry in _forecasts_in(declared):
         step, count = entry.value.get("step", time_step), 1
         with entry.child("horizon").noting():
@@ -355,13 +335,14 @@ def _forecasts_in(declared: Declarations) -> list[Entry]:
     return [] if section.value is None else section.elements()
 
 
-def _remembered(declared: Declarations, past: _Past, time_step: float) -> Iterator[Seen]:
+def _remembered(naming: Naming, past: _Past) -> Iterator[Seen]:
+    declared = naming.declared
     entry = declared.root.child("agent").child("history")
     for name in declared.remembered:
         limits = declared.limits_of(name)
-        for ago in range(1, 1 + _kept_steps(declared, time_step)):
+        for ago in range(1, 1 + _kept_steps(naming)):
             value = past.measured(entry, name, ago)
-            yield Seen(entry, name, value, *limits, f"[-{ago * time_step:g} s]")
+            yield Seen(entry, name, value, *limits, f"[-{ago * naming.time_step:g} s]")
 
 
 def normalized(seen: Seen, nominal: float | None) -> Seen:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cached_property, partial, reduce
 from typing import Any, Final
 
@@ -41,7 +41,7 @@ from fmugym.declared.observing import (
     scaled,
 )
 from fmugym.declared.parts import Term
-from fmugym.declared.piloting import DeclaredWarmUp, WarmUpMaker
+from fmugym.declared.piloting import DeclaredWarmUp
 from fmugym.declared.quantities import steps_in
 from fmugym.declared.seasons import held_out_times
 from fmugym.declared.task import Task
@@ -90,18 +90,18 @@ class ResolvedTask:
     def __init__(
         self, task: Task, root: Entry, description: ModelDescription, needs_reward: bool = True
     ) -> None:
-        self._task, self._root, self._time_step, self._warm_steps = task, root, math.nan, 0
-        self._declared = declared = Declarations.read(root, description, task.is_physical)
+        self._task, self._root, time_step, warm_steps = task, root, math.nan, 0
+        self._declared = declared = Declarations(root, description, task.is_physical)
         with root.child("reward").noting():
             if needs_reward and not declared.rewards:
                 text = 'the task has no reward; say one, for example: reward = "1"'
                 raise root.lack(text, "reward")
         with root.child("time_step").noting():
-            self._time_step = time_step_of(root, description)
+            time_step = time_step_of(root, description)
         with declared.warm_up.entry.noting():
-            self._warm_steps = self._steps_of_warm_up()
+            warm_steps = self._steps_of_warm_up(time_step)
         with root.noting():
-            self._naming = Naming(declared, self._time_step, self._warm_steps)
+            self._naming = Naming(declared, time_step, warm_steps)
             self._read_observations()
             self._find_mistakes()
         root.mistakes.require_none()
@@ -115,7 +115,7 @@ class ResolvedTask:
         self.config = self._make_config()
         self.hooks = self._hooks_of_spaces() | self._hooks_of_steps()
         self.observation_names = tuple(seen.name + seen.place for seen in self._seen)
-        self.warm_up = self._make_warm_up() if self._warm_steps else None
+        self.warm_up = self._make_warm_up() if self._naming.warm_steps else None
         self.action_masks = self._action_masks()
         self.unphysical_keys, self.expressions = declared.unphysical_keys, declared.expressions
         limits = {name: term.limit for name, term in declared.costs.items()}
@@ -139,15 +139,13 @@ class ResolvedTask:
 
     def quantities(self) -> Quantities:
         """Everything in the task that has a name and a value, and a function that reads it."""
-        found = named_values(self._declared, self._naming)
+        found = named_values(self._naming)
         read = function_of(tuple(value for _, value in found.values()))
         return Quantities([quantity for quantity, _ in found.values()], read)
 
     def _read_observations(self) -> None:
-        self._kept = histories(self._declared, self._naming, self._time_step)
-        self._seen, self._sensors = observed_values(
-            self._declared, self._naming, self._kept, self._time_step, self._warm_steps > 0
-        )
+        self._kept = histories(self._naming)
+        self._seen, self._sensors = observed_values(self._naming, self._kept)
 
     def _find_mistakes(self) -> None:
         """Evaluate everything once, so that one error tells all mistakes."""
@@ -167,11 +165,8 @@ class ResolvedTask:
             yield self._root.child(name), partial(self._condition, name)
         for kpi in declared.kpis.values():
             yield kpi.entry, partial(self._kpi_value, kpi)
-        yield self._root, partial(times_of, declared, self._time_step)
-        yield (
-            self._root.child("clock"),
-            partial(clock_of, declared, self._time_step, self._warm_steps),
-        )
+        yield self._root, partial(times_of, self._naming)
+        yield self._root.child("clock"), partial(clock_of, self._naming)
         for seen in self._seen:
             yield seen.entry, partial(self._in_form, seen)
 
@@ -188,22 +183,23 @@ class ResolvedTask:
 
     # The warm-up.
 
-    def _steps_of_warm_up(self) -> int:
+    def _steps_of_warm_up(self, time_step: float) -> int:
         """The steps of a warm-up with moving inputs; 0 if there is none."""
         table = self._declared.warm_up
         moves = table.controllers or table.caches or self._declared.inputs
-        return steps_in(table.entry, table.period, self._time_step) if moves and table.period else 0
+        return steps_in(table.entry, table.period, time_step) if moves and table.period else 0
 
     def _make_warm_up(self) -> DeclaredWarmUp:
-        maker = WarmUpMaker(self._declared, self._naming, self._time_step)
-        return maker.make(
-            self._warm_steps,
+        written: dict[str, Sequence[Value]] = {
+            one.variable: (one.now, one.fill) for one in (*self._kept, *self._sensors)
+        }
+        written |= {name: [value] for name, value in self._switched().items()}
+        return DeclaredWarmUp(
+            self._naming,
             self._input_values(self._declared.warm_up.controllers),
-            [*self._updates_of_histories(), *self._updates_of_switches()],
-            [*self._kept, *self._sensors],
-            self._switched(),
-            self.config["episode_variables"],
-            self.config.get("start_time"),
+            [*self._updates_of_histories(), *_assignments(self._switched())],
+            written,
+            self.config,
         )
 
     # The config.
@@ -213,7 +209,7 @@ class ResolvedTask:
         return {
             **(self._root.child("config").value or {}),
             "foreign": self._root.child("foreign").value or {},
-            **times_of(declared, self._time_step),
+            **times_of(self._naming),
             "model_input_names": variables.names_in_fmu(declared.written),
             "model_output_names": variables.names_in_fmu(self._naming.outputs),
             "monitor_names": variables.names_in_fmu(self._naming.monitors),
@@ -222,28 +218,20 @@ class ResolvedTask:
                 for variable, value in declared.parameters.values()
             },
             "episode_variables": self._variables(),
-            "bounds": bounds_of(declared, self._naming),
-            "samplings": samplings_of(declared, self._naming),
+            "bounds": bounds_of(self._naming),
+            "samplings": samplings_of(self._naming),
         }
 
     def _variables(self) -> dict[str, Any]:
-        remembered = {name: memory.start for name, memory in self._declared.memory.items()}
-        kept = [*self._kept, *self._sensors]
-        histories = {one.variable: np.zeros(one.length) for one in kept}
+        """All episode variables, and what they are at the beginning of an episode."""
+        memory = {name: one.start for name, one in self._declared.memory.items()}
+        kept = {one.variable: np.zeros(one.length) for one in (*self._kept, *self._sensors)}
         switches: dict[str, float] = {}
         for variable in self._switched_actions:
-            state, since = switch_names(variable)
-            switches |= {state: self._is_on_at_start(variable), since: _LONG_AGO}
-        worst = {WORST: 0.0} if self._has_worst else {}
-        kpis = {kpi_name(n): 0.0 for n, kpi in self._declared.kpis.items() if kpi.how is not None}
-        variables = (
-            remembered
-            | clock_of(self._declared, self._time_step, self._warm_steps)
-            | histories
-            | switches
-            | worst
-            | kpis
-        )
+            starts = self._is_on_at_start(variable), _LONG_AGO
+            switches |= zip(switch_names(variable), starts, strict=True)
+        zeros = dict.fromkeys([*self._worst, *self._updated_kpis], 0.0)
+        variables = memory | clock_of(self._naming) | kept | switches | zeros
         return variables | self._noise(variables)
 
     def _noise(self, variables: Mapping[str, Any]) -> dict[str, NoiseKey]:
@@ -253,7 +241,7 @@ class ResolvedTask:
         if not is_noisy and not self._declared.steps:
             return {}
         parameters = [value for _, value in self._declared.parameters.values()]
-        start = times_of(self._declared, self._time_step).get("start_time")
+        start = times_of(self._naming).get("start_time")
         draws = any(map(is_distribution, [*parameters, start, *variables.values()]))
         return {NOISE: NoiseKey(draws=not draws)}
 
@@ -303,8 +291,7 @@ class ResolvedTask:
         if self._declared.is_physical:
             return _box([variable.range for variable in variables])
         if not variables[0].levels:
-            limits = [(-r.delta, r.delta) if r.delta else r.range for r in variables]
-            return _box([(-1.0, 1.0)] * len(variables) if rescales else limits)
+            return _box([(-1.0, 1.0) if rescales else one.chosen for one in variables])
         counts = [len(variable.levels) for variable in variables]
         return spaces.Discrete(counts[0]) if len(counts) == 1 else spaces.MultiDiscrete(counts)
 
@@ -383,11 +370,11 @@ class ResolvedTask:
     def _hooks_of_steps(self) -> dict[str, Hook]:
         declared, hooks = self._declared, {}
         updates = [
-            *self._updates_of_memory(),
+            *_assignments(self._updated_memory()),
             *self._updates_of_histories(),
-            *self._updates_of_switches(),
-            *self._updates_of_worst(),
-            *self._updates_of_kpis(),
+            *_assignments(self._switched()),
+            *_assignments(self._worst),
+            *_assignments(self._updated_kpis),
         ]
         if updates:
             hooks["_update"] = _in_turn(updates)
@@ -413,9 +400,6 @@ class ResolvedTask:
         fills = function_of([history.fill for history in kept])
         return remember(kept, values, fills, self._naming.first_step)
 
-    def _updates_of_switches(self) -> list[Hook]:
-        return self._assignments(self._switched())
-
     def _switched(self) -> dict[str, Value]:
         """What the task remembers of actions with a least time on or off, by variables."""
         values: dict[str, Value] = {}
@@ -423,21 +407,21 @@ class ResolvedTask:
             values |= zip(switch_names(variable), self._naming.switched(variable), strict=True)
         return values
 
-    def _updates_of_worst(self) -> list[Hook]:
+    @cached_property
+    def _worst(self) -> dict[str, Value]:
         if not self._has_worst:
-            return []
+            return {}
         reward = _sum(self._terms(self._declared.rewards, Moment.UPDATED))
-        worst = self._naming.read("variables", WORST)
-        return self._assignments({WORST: minimum(worst, reward)})
+        return {WORST: minimum(self._naming.read("variables", WORST), reward)}
 
-    def _updates_of_kpis(self) -> list[Hook]:
+    @cached_property
+    def _updated_kpis(self) -> dict[str, Value]:
         step_count, kpis = self._naming.step_count, self._declared.kpis.items()
-        updated = {
+        return {
             kpi_name(name): kpi.updated(self._kpi_value(kpi), step_count)
             for name, kpi in kpis
             if kpi.how is not None
         }
-        return self._assignments(updated)
 
     def _kpi_value(self, kpi: Kpi) -> Value:
         """What a figure is made of in a step."""
@@ -469,26 +453,13 @@ class ResolvedTask:
                 values |= self._terms({name: term}, moment) if name else {}
         return values
 
-    def _updates_of_memory(self) -> list[Hook]:
+    def _updated_memory(self) -> dict[str, Value]:
         """All values of the memory are computed before one of them is written."""
-        values = {
+        return {
             name: self._naming.value(memory.entry, memory.update, Moment.AFTER).number
             for name, memory in self._declared.memory.items()
             if memory.update is not None
         }
-        return self._assignments(values)
-
-    def _assignments(self, values: Mapping[str, Value]) -> list[Hook]:
-        """A function that writes variables; none if there are no variables."""
-        if not values:
-            return []
-        names, function = list(values), function_of(list(values.values()))
-
-        def update(env: Any) -> None:
-            for name, value in zip(names, function(env), strict=True):
-                env.variables[name] = value
-
-        return [update]
 
     def _fault_reward(self) -> Hook:
         """A failed step gives the reward that the file says, or no more than any step before."""
@@ -535,6 +506,19 @@ class ResolvedTask:
         """Zeros before the first step, which has no rewards and costs yet."""
         has_stepped = self._naming.step_count > 0
         return {name: where(has_stepped, value, 0.0) for name, value in values.items()}
+
+
+def _assignments(values: Mapping[str, Value]) -> list[Hook]:
+    """A function that writes variables; none if there are no variables."""
+    if not values:
+        return []
+    names, function = list(values), function_of(list(values.values()))
+
+    def update(env: Any) -> None:
+        for name, value in zip(names, function(env), strict=True):
+            env.variables[name] = value
+
+    return [update]
 
 
 def _in_turn(updates: list[Hook]) -> Hook:

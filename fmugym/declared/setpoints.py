@@ -60,18 +60,20 @@ class SetPoints:
     """The set points of a task, in the forms that the rest of it knows, by name.
 
     Attributes:
-        memory: Those that are constant or drawn, and the numbers of curves.
-        series: Those that depend on the time of day.
+        memory: Gets those that are constant or drawn, and the numbers of curves.
+        series: Gets those that depend on the time of day.
+        derived: Gets those that follow a curve or data, and the deviations.
         steps: Those that jump.
-        derived: Those that follow a curve or data, and the deviations.
         deviations: What the names of deviations stand for.
+        brought: The names that curves and deviations bring with them.
     """
 
-    memory: dict[str, Memory] = field(default_factory=dict)
-    series: dict[str, Series] = field(default_factory=dict)
+    memory: dict[str, Memory]
+    series: dict[str, Series]
+    derived: dict[str, Derived]
     steps: dict[str, Steps] = field(default_factory=dict)
-    derived: dict[str, Derived] = field(default_factory=dict)
     deviations: dict[str, Deviation] = field(default_factory=dict)
+    brought: set[str] = field(default_factory=set)
 
     def add(self, entry: Entry) -> None:
         """Add a set point."""
@@ -82,6 +84,7 @@ class SetPoints:
         if of.value is not None:
             name, deviation = f"{entry.name}_error", Deviation(entry.name, of.value)
             self.deviations[name] = deviation
+            self.brought.add(name)
             with of.placing():
                 expression = Expression.parse(f"{deviation.setpoint} - {deviation.of}")
             self.derived[name] = Derived(of, expression, _UNLIMITED)
@@ -107,6 +110,7 @@ class SetPoints:
         curve, (table, formula) = entry.child(kind), _CURVES[kind]
         numbers = {key: curve.required(key) for key in table.keys}
         names = {key: f"{entry.name}_{key}" for key in numbers}
+        self.brought |= set(names.values())
         for key, one in numbers.items():
             self.memory[names[key]] = Memory(entry, one.value, None, _UNLIMITED)
         expression = Expression.parse(formula.format(**names))

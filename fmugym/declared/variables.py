@@ -19,7 +19,7 @@ from fmugym.declared.quantities import number_or_distribution
 from fmugym.distributions import Choice, Normal, Uniform, is_distribution
 from fmugym.errors import ConfigError, shown, unknown_name
 from fmugym.task.ranges import within
-from fmugym.task.roles import input_variable, output_variable
+from fmugym.task.roles import check_input, check_output
 from fmugym.task.starting import checked, spread
 
 __all__ = [
@@ -87,6 +87,11 @@ class TaskVariable:
     def range(self) -> tuple[float, float]:
         """The lowest and the highest value of an action."""
         return (min(self.levels), max(self.levels)) if self.levels else (self.low, self.high)
+
+    @property
+    def chosen(self) -> tuple[float, float]:
+        """The lowest and the highest value, or change of it, that an agent chooses."""
+        return (-self.delta, self.delta) if self.delta else self.range
 
     @property
     def fmu_variable(self) -> Variable:
@@ -230,7 +235,9 @@ class TaskVariables:
             raise variable.entry.error("'sample' is for variables that are read from the FMU")
         if variable.in_fmu is not None:
             with entry.placing():
-                input_variable(self._description, variable.fmu_variable.name)
+                check_input(
+                    self._description, self._description.variable(variable.fmu_variable.name)
+                )
 
     def check_output(self, entry: Entry, name: str) -> None:
         """Check that a variable can be read after each step.
@@ -241,7 +248,9 @@ class TaskVariables:
         if self[name].delta or self[name].is_switched or self[name].levels:
             raise self[name].entry.error(f"{name!r} is observed, not an action: it has no such key")
         with entry.placing():
-            output_variable(self._description, self[name].fmu_variable.name)
+            check_output(
+                self._description, self._description.variable(self[name].fmu_variable.name)
+            )
 
     def _declared(self, entry: Entry) -> TaskVariable:
         name = entry.child("name")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
@@ -206,9 +207,9 @@ def table(scores: Sequence[Score]) -> str:
     return "\n".join(aligned([[*compress(row, has)] for row in [("", *names), *rows]]))
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """The lines of a table whose cells stand below each other."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+def aligned(rows: Sequence[Sequence[str]], widest: int = sys.maxsize) -> list[str]:
+    """The lines of a table whose cells stand below each other, up to a width of a column."""
+    widths = [min(widest, max(map(len, column))) for column in zip(*rows, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 

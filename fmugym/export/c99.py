@@ -312,7 +312,7 @@ class _Source:
         if network is not None:
             yield from self._evaluated(features)
             yield f"    {c_type(network.dtype)} features[{len(features)}];"
-            yield f"    {c_type(network.gives)} given[{len(network.parts)}];"
+            yield f"    {c_type(network.dtype)} given[{sum(network.parts)}];"
             yield from self._stored("features", features, c_type(network.dtype))
             yield f"    {self._name}_network(features, given);"
 

@@ -67,9 +67,7 @@ def decision_of(env: FMUEnv, model: Any, normalization: Any = None) -> Decision:
     network = model if isinstance(model, Network) else network_of_model(model, normalization)
     if are_scaled(network.space, env.action_space):
         network = network.unscaled(env.action_space)
-    if isinstance(network.space, spaces.Box):
-        return Decision(network, lambda seen, memory, ask: (network.limited(ask(seen)), ()))
-    return Decision(network)
+    return Decision(network, lambda seen, memory, ask: (network.chosen(ask(seen)), ()))
 
 
 def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
@@ -85,14 +83,17 @@ def _of_policy(policy: Policy, observed: spaces.Space[Any]) -> Decision:
     def constants(features: Any) -> Any:
         return policy._network(np.empty(features.shape))
 
+    def chosen(values: Any) -> Any:
+        return network.chosen(values) if network and policy.choices else values
+
     def decide(seen: Any, memory: Sequence[Any], ask: _Ask) -> tuple[Any, Sequence[Any]]:
         rows = seen.cast(np.float64).T
         base, state = _of_controller(policy, rows, memory[len(past) :])
-        given = (lambda features: ask(features.T)) if network else constants
+        given = constants if network is None else lambda features: chosen(ask(features.T))
         before = tuple(one.T for one in memory[: len(past)])
         action, past_now = policy.step(rows, before, base, given)
-        chosen = policy._as_actions(np.stack(action, axis=-1))
-        return np.moveaxis(chosen, 0, -1), [*(one.T for one in past_now), *state]
+        elements = policy._as_actions(np.stack(action, axis=-1))
+        return np.moveaxis(elements, 0, -1), [*(one.T for one in past_now), *state]
 
     return Decision(network, decide, starts)
 

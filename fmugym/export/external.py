@@ -51,7 +51,7 @@ def found_in(
     seen = env.observation_names if isinstance(env, TaskEnv) else None
     if not isinstance(env, TaskEnv) or seen is None:
         raise ConfigError("only what a task file observes can be given to the agent from outside")
-    series = Declarations.read(env.task.root, env.fmu.description).series
+    series = Declarations(env.task.root, env.fmu.description).series
     found = []
     for name in names:
         if name not in series:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 
 from fmugym.errors import ConfigError
 from fmugym.export.network import Activation, Network
@@ -94,44 +93,25 @@ def network_lines(name: str, network: Network) -> Iterator[str]:
     yield "    }"
     yield "}"
     yield ""
-    yield from _scaling_arrays(name, network)
-    yield f"static void {name}_network(const {kind} *features, {c_type(network.gives)} *given) {{"
+    yield f"static void {name}_network(const {kind} *features, {kind} *given) {{"
     yield from _network_body(name, network, letter)
     yield "}"
     yield ""
 
 
-def _scaling_arrays(name: str, network: Network) -> Iterator[str]:
-    if network.scaling is not None:
-        for what in ("mean", "divisor", "limit"):
-            yield from array(f"{name}_{what}", getattr(network.scaling, what).astype(np.float64))
-        yield ""
-
-
 def _network_body(name: str, network: Network, letter: str) -> Iterator[str]:
     kind = TYPES[letter]
+    arrays = ["features", *(f"values_{i}" for i in range(len(network.layers) - 1)), "given"]
     widths = [network.width, *(len(layer.bias) for layer in network.layers)]
-    before = "features"
-    if network.scaling is not None:
-        yield f"    {kind} scaled[{network.width}];"
-    for index, width in enumerate(widths[1:]):
-        yield f"    {kind} values_{index}[{width}];"
+    for array, width in zip(arrays[1:-1], widths[1:-1], strict=True):
+        yield f"    {kind} {array}[{width}];"
     yield ""
-    if network.scaling is not None:
-        before = "scaled"
-        yield f"    for (int i = 0; i < {network.width}; i++) {{"
-        yield f"        const double shifted = (double)features[i] - {name}_mean[i];"
-        yield f"        const double x = shifted / {name}_divisor[i];"
-        yield f"        const double limit = {name}_limit[i];"
-        yield f"        scaled[i] = ({kind})(x > limit ? limit : x < -limit ? -limit : x);"
-        yield "    }"
     for index, layer in enumerate(network.layers):
-        counts = f"{before}, {widths[index]}, values_{index}, {widths[index + 1]}"
+        to, width = arrays[index + 1], widths[index + 1]
+        counts = f"{arrays[index]}, {widths[index]}, {to}, {width}"
         yield f"    {name}_layer({name}_weights_{index}, {name}_bias_{index}, {counts});"
-        before = f"values_{index}"
         for activation in layer.activations:
-            yield from _activation_lines(activation, before, widths[index + 1], letter)
-    yield from _result(network, before)
+            yield from _activation_lines(activation, to, width, letter)
 
 
 def _activation_lines(activation: Activation, array: str, width: int, letter: str) -> Iterator[str]:
@@ -142,23 +122,3 @@ def _activation_lines(activation: Activation, array: str, width: int, letter: st
     yield f"        const {TYPES[letter]} x = {array}[i];"
     yield f"        {array}[i] = {text};"
     yield "    }"
-
-
-def _result(network: Network, values: str) -> Iterator[str]:
-    """The last values themselves, or the elements that the largest ones choose."""
-    if isinstance(network.space, spaces.Box):
-        yield f"    for (int i = 0; i < {len(network.parts)}; i++) {{"
-        yield f"        given[i] = {values}[i];"
-        yield "    }"
-        return
-    begin = 0
-    for index, (count, start) in enumerate(zip(network.parts, network.starts, strict=True)):
-        yield f"    given[{index}] = 0;"
-        yield f"    for (int i = 1; i < {count}; i++) {{"
-        yield f"        if ({values}[{begin} + i] > {values}[{begin} + given[{index}]]) {{"
-        yield f"            given[{index}] = ({c_type(network.gives)})i;"
-        yield "        }"
-        yield "    }"
-        if start:
-            yield f"    given[{index}] += {start};"
-        begin += count

@@ -156,64 +156,53 @@ def _logic_of_ideal(
         )
     try:
         with exclusive(), borrowed(env), tables_in(env), reading(env, Readings.of(env)):
-            traced = _ControllerTracer(env, decision).traced()
-        return _Assembly(env, traced, all_inputs, external).logic()
+            traced = _ControllerTracer(env, decision)
+        return _Assembly(env, traced, decision, all_inputs, external).logic()
     except UntraceableError as error:
         raise ConfigError(f"{type(env).__name__} cannot be exported: {error}") from None
 
 
-@dataclass(frozen=True)
-class _Traced:
-    graph: Graph
-    observation: tuple[int, ...]
-    features: tuple[int, ...]
-    action: tuple[int, ...]
-    inputs: tuple[int, ...]
-    are_chosen: tuple[bool, ...]
-    updates: Mapping[str, tuple[int, ...]]
-    types: Mapping[str, np.dtype[Any]]
-    starts: Mapping[str, npt.NDArray[Any]]
-
-
 class _ControllerTracer(Tracer):
-    """Traces one sample of a controller in a single graph."""
+    """Traces one sample of a controller in a single graph.
+
+    Attributes:
+        observation, features, action: The nodes of each; features are what a network takes.
+        inputs: The nodes of the FMU's inputs.
+        are_chosen: Which of the inputs any action changes.
+        updates: The nodes of what is remembered then, by name.
+        types: Their types, by name.
+    """
+
+    features: tuple[int, ...] = ()
 
     def __init__(self, env: FMUEnv, decision: Decision) -> None:
         super().__init__(env, {})
-        self._decision, self._features = decision, ()
+        self._decision = decision
+        self._trace()
 
-    _features: tuple[int, ...]
-
-    def traced(self) -> _Traced:
+    def _trace(self) -> None:
         """Trace the hooks, again if ``_update`` gives variables other types."""
         for _ in range(3):
             before = dict(self._variables)
             self._begin(judging=True)
             stores, updated = self._trace_update()
             if self._variables == before:
-                return self._rest(stores, updated)
+                self._trace_rest(stores, updated)
+                return
         raise UntraceableError("_update gives a variable another type in each step")
 
-    def _rest(self, stores: list[Store], updated: tuple[str, ...]) -> _Traced:
+    def _trace_rest(self, stores: list[Store], updated: tuple[str, ...]) -> None:
         nodes: dict[str, list[int]] = {name: [] for name in updated}
         for store in stores:
             row: Any = store.row
             nodes[row[1]].append(store.node)
-        observation = self._observed()
-        action, memory = self._decided(observation)
-        are_chosen, inputs = self._followed(action)
+        self.graph, self.observation = self._graph, self._observed()
+        action, memory = self._decided(self.observation)
+        self.action: list[int] = action.reshape(-1).tolist()
+        self.are_chosen, self.inputs = self._followed(action)
         remembered = dict(zip(self._decision.starts, memory, strict=True))
-        return _Traced(
-            self._graph,
-            observation,
-            self._features,
-            tuple(action.reshape(-1).tolist()),
-            inputs,
-            are_chosen,
-            {name: tuple(numbers) for name, numbers in (nodes | remembered).items()},
-            self._variables | dict.fromkeys(remembered, np.dtype(np.float64)),
-            self._decision.starts,
-        )
+        self.updates = nodes | remembered
+        self.types = self._variables | dict.fromkeys(remembered, np.dtype(np.float64))
 
     def _observed(self) -> tuple[int, ...]:
         self._contents = Contents(self._env)
@@ -235,14 +224,15 @@ class _ControllerTracer(Tracer):
         return self._nodes(elements, shape, space.dtype), kept
 
     def _asked(self, features: Any) -> Any:
-        """What the network gives for some features, which are noted."""
+        """The last values of the network for some features; what its first layer takes is noted."""
         network, space = self._decision.network, self._env.action_space
-        self._features = tuple(self._nodes(features, None, None).tolist())
+        count, dtype = math.prod(space.shape or ()), np.dtype(space.dtype)
         if network is not None:
-            network.require_fitting(len(self._features), space)
-        names = element_names((math.prod(space.shape or ()),), _GIVEN)
-        dtype = np.dtype(space.dtype) if network is None else network.gives
-        return loaded(self._graph, "row", names, dtype)
+            network.require_fitting(len(features), space)
+            features = network.scaled(features)
+            count, dtype = sum(network.parts), network.dtype
+        self.features = tuple(self._nodes(features, None, None).tolist())
+        return loaded(self._graph, "row", element_names((count,), _GIVEN), dtype)
 
     def _followed(self, action: npt.NDArray[Any]) -> tuple[tuple[bool, ...], tuple[int, ...]]:
         """Which inputs any action changes, and the nodes of the inputs after the chosen one."""
@@ -265,12 +255,17 @@ class _Assembly:
     """Makes a ``Logic`` of what was traced: only what the actions depend on is kept."""
 
     def __init__(
-        self, env: FMUEnv, traced: _Traced, all_inputs: bool, external: Collection[str]
+        self,
+        env: FMUEnv,
+        traced: _ControllerTracer,
+        decision: Decision,
+        all_inputs: bool,
+        external: Collection[str],
     ) -> None:
         self._env, self._traced, self._graph = env, traced, traced.graph
         rng = np.random.default_rng(_SEED)
         self._episode = env.inside.draws.draw(rng)
-        self._starts = {**self._episode.variables, **traced.starts}
+        self._starts = {**self._episode.variables, **decision.starts}
         self._drawn = set(env.inside.draws.drawn_names)
         self._external = self._given(external)
         rows = zip(env.inside.interface.inputs, traced.inputs, traced.are_chosen, strict=True)
@@ -309,10 +304,8 @@ class _Assembly:
         updates = (node for kept in self._kept for node in kept.updates)
         numbers = sorted(needed.union(updates))
         loads = {n: load for n in numbers if (load := self._load(n, places)) is not None}
-        env, outputs = (
-            self._env,
-            self._env.inside.interface.outputs + self._env.inside.interface.monitors,
-        )
+        interface = self._env.inside.interface
+        outputs = interface.outputs + interface.monitors
         return Logic(
             self._graph,
             loads,
@@ -322,7 +315,7 @@ class _Assembly:
             self._traced.features,
             tuple(self._kept),
             tuple(self._parameters),
-            env.inside.interface.time_step,
+            interface.time_step,
         )
 
     def _nodes(self, needed: Iterable[int]) -> Iterator[Node]:

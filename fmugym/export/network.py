@@ -96,10 +96,15 @@ class Scaling:
     divisor: FloatArray
     limit: FloatArray
 
-    def __call__(self, observation: FloatArray) -> FloatArray:
-        """Normalize an observation; it is computed with float64."""
-        scaled = (observation.astype(np.float64) - self.mean) / self.divisor
-        return np.clip(scaled, -self.limit, self.limit)
+    def __call__(self, observation: Any) -> Any:
+        """Normalize an observation of shape (k, ...), an array or symbols, with float64."""
+        rows = zip(observation, self.mean, self.divisor, self.limit, strict=True)
+        return np.stack(
+            [
+                np.clip((row.astype(np.float64) - mean) / divisor, -limit, limit)
+                for row, mean, divisor, limit in rows
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -146,19 +151,6 @@ class Network:
             return tuple(int(n) for n in space.nvec.ravel())
         return (1,) * int(np.prod(space.shape))
 
-    @property
-    def gives(self) -> np.dtype[Any]:
-        """The type of what it gives: the last values, or the chosen elements."""
-        return self.dtype if isinstance(self.space, spaces.Box) else np.dtype(self.space.dtype)
-
-    @property
-    def starts(self) -> tuple[int, ...]:
-        """The lowest value of each discrete element; empty if actions are continuous."""
-        space: Any = self.space
-        if isinstance(space, spaces.Box):
-            return ()
-        return tuple(int(start) for start in np.ravel(space.start))
-
     def require_fitting(self, count: int, space: spaces.Space[Any]) -> None:
         """Refuse a task that gives another number of values, or has other actions."""
         if self.width != count:
@@ -180,10 +172,14 @@ class Network:
         half, middle = (((high + sign * low) / 2).astype(self.dtype) for sign in (-1, 1))
         return replace(self, layers=(*self.layers, Layer(np.diag(half), middle)), space=space)
 
+    def scaled(self, observation: Any) -> Any:
+        """What the first layer takes, of an observation of shape (k, ...), an array or symbols."""
+        values = observation if self.scaling is None else self.scaling(observation)
+        return values.astype(self.dtype)
+
     def values(self, observation: FloatArray) -> FloatArray:
         """The last values for an observation of shape (k,)."""
-        values = observation if self.scaling is None else self.scaling(observation)
-        values = values.astype(self.dtype)
+        values: FloatArray = self.scaled(observation)
         for layer in self.layers:
             values = layer.weights @ values + layer.bias
             for activation in layer.activations:
@@ -192,21 +188,24 @@ class Network:
 
     def action(self, observation: FloatArray) -> FloatArray:
         """The action for an observation of shape (k,), flat."""
-        values = self.values(observation)
-        if isinstance(self.space, spaces.Box):
-            limited: FloatArray = self.limited(values).astype(self.space.dtype)
-            return limited
-        ends = np.cumsum(self.parts)[:-1]
-        best = [int(np.argmax(part)) for part in np.split(values, ends)]
-        return np.array(best, np.int64) + np.array(self.starts, np.int64)
+        action: FloatArray = self.chosen(self.values(observation)).astype(self.space.dtype)
+        return action
 
-    def limited(self, values: Any) -> Any:
-        """Bring the last values into the range of the actions; all may be arrays or symbols.
+    def chosen(self, values: Any) -> Any:
+        """The elements of the action that the last values mean; all may be arrays or symbols.
+
+        They are brought into the range of a ``Box``. Otherwise the largest one of each part
+        chooses.
 
         Args:
-            values: Shape (m, ...).
+            values: Shape (n, ...).
         """
         space: Any = self.space
+        if not isinstance(space, spaces.Box):
+            pairs = zip(
+                np.split(values, np.cumsum(self.parts)[:-1]), np.ravel(space.start), strict=True
+            )
+            return np.stack([np.argmax(part, axis=0) + start for part, start in pairs])
         limits = zip(values, space.low.flat, space.high.flat, strict=True)
         if self.squashed:
             return np.stack([low + 0.5 * (x + 1) * (high - low) for x, low, high in limits])

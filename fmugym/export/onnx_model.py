@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from gymnasium import spaces
 
 from fmugym.errors import ConfigError
 from fmugym.export.c99 import field_names
 from fmugym.export.exportable import Agent
 from fmugym.export.names import new_file
-from fmugym.export.network import Activation, Network, Scaling
+from fmugym.export.network import Activation, Network
 from fmugym.export.onnx_nodes import Nodes
 from fmugym.export.onnx_operations import computed, interpolated
 from fmugym.extras import imported
@@ -205,37 +204,14 @@ class _Model:
     # The network.
 
     def _network(self, network: Network) -> list[str]:
-        """What the network gives, each element of shape (N,)."""
+        """The last values of the network, each element of shape (N,)."""
         nodes, values = self._nodes, self._rows(self._logic.features, network.dtype)
-        if network.scaling is not None:
-            values = self._scaled(values, network.scaling, network.dtype)
         for layer in network.layers:
             weights, bias = nodes.tensor(layer.weights), nodes.tensor(layer.bias)
             values = nodes.add("Gemm", values, weights, bias, transB=1)
             for activation in layer.activations:
                 values = _activated(nodes, values, activation, network.dtype)
-        if isinstance(network.space, spaces.Box):
-            return [self._column(values, index) for index in range(len(network.parts))]
-        return self._chosen(network, values)
-
-    def _scaled(self, values: str, scaling: Scaling, dtype: np.dtype[Any]) -> str:
-        nodes = self._nodes
-        parts = [getattr(scaling, name).astype(_DOUBLE) for name in ("mean", "divisor", "limit")]
-        mean, divisor, limit = map(nodes.tensor, parts)
-        shifted = nodes.add("Sub", nodes.cast(values, _DOUBLE), mean)
-        scaled = nodes.add("Min", nodes.add("Div", shifted, divisor), limit)
-        return nodes.cast(nodes.add("Max", scaled, nodes.tensor(-parts[2])), dtype)
-
-    def _chosen(self, network: Network, values: str) -> list[str]:
-        nodes, begin, chosen = self._nodes, 0, []
-        dtype, axis = network.gives, nodes.tensor(np.array([1]))
-        for count, start in zip(network.parts, network.starts, strict=True):
-            ends = [nodes.tensor(np.array([place])) for place in (begin, begin + count)]
-            part = nodes.add("Slice", values, *ends, axis)
-            best = nodes.cast(nodes.add("ArgMax", part, axis=1, keepdims=0), dtype)
-            chosen.append(nodes.add("Add", best, nodes.constant(start, dtype)) if start else best)
-            begin += count
-        return chosen
+        return [self._column(values, index) for index in range(sum(network.parts))]
 
 
 def _activated(nodes: Nodes, values: str, activation: Activation, dtype: np.dtype[Any]) -> str:

@@ -17,7 +17,7 @@ from fmugym.errors import ConfigError, SimulationError, shown
 from fmugym.pool.base import FloatArray, MaskArray, Pool
 from fmugym.pool.spec import whole_number_of_steps
 from fmugym.series.choice import choose
-from fmugym.series.rows import Episodes, Infos, Outcome, Rows, present
+from fmugym.series.rows import Episodes, Infos, Outcome, Rows, batched, present
 from fmugym.series.store import Block, Memory, Store, open_store
 from fmugym.series.timeseries import TimeSeries
 from fmugym.vector import FMUVectorEnv
@@ -197,7 +197,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, and write its first row; see ``FMUEnv.reset``."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._recorder.begin(np.array([True]), Infos([info], 1), _batch(observation))
+        self._recorder.begin(np.array([True]), Infos(batched(info), 1), _batch(observation))
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -205,7 +205,7 @@ class RecordSeries(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         no = np.array([False])
         flags = np.array([terminated]), np.array([truncated])
-        infos, seen = Infos([info], 1), _batch(observation)
+        infos, seen = Infos(batched(info), 1), _batch(observation)
         if not self._recorder.has_begun:
             self._recorder.go_on(self._recorder.episodes.prototype.step_count - 1)
         self._recorder.add(Outcome(np.array([float(reward)]), *flags, infos, seen, no), no)

@@ -16,7 +16,7 @@ from fmugym.series.store import Block
 from fmugym.task.quantity import TEXT_KINDS, Quantity
 from fmugym.task.starting import start_time_of
 
-__all__ = ["Episodes", "Infos", "Outcome", "Rows", "present"]
+__all__ = ["Episodes", "Infos", "Outcome", "Rows", "batched", "present"]
 
 _GROUPS: Final = {"reward_terms": "reward term", "costs": "cost term"}
 _TOLD: Final = {"kpis": "kpi", "proposed": "proposal", "predicted": "prediction"}
@@ -46,27 +46,24 @@ class Infos(NamedTuple):
     """The infos of N environments.
 
     Attributes:
-        of_envs: As a vector environment gives them, or a list with that of a single one.
+        of_envs: As a vector environment gives them.
         num_envs: N.
         last: The infos with which episodes have ended, where those of the next ones are in
             ``of_envs``.
         ended: The environments that these are of, shape (N,).
     """
 
-    of_envs: Mapping[str, Any] | list[dict[str, Any]]
+    of_envs: Mapping[str, Any]
     num_envs: int
     last: Mapping[str, Any] | None = None
     ended: Any = False
 
     def names(self, group: str) -> list[str]:
         """The names in a dict of the infos."""
-        infos = self.of_envs[0] if isinstance(self.of_envs, list) else self.of_envs
-        return [name for name in infos.get(group, ()) if not name.startswith("_")]
+        return [name for name in self.of_envs.get(group, ()) if not name.startswith("_")]
 
     def numbers(self, *path: str) -> FloatArray:
         """The numbers at a place in the infos, shape (N,); 0 where there are none."""
-        if isinstance(self.of_envs, list):
-            return np.array([float(_at(self.of_envs[0], path, 0.0))])
         numbers = _numbers(self.of_envs, path, self.num_envs)
         if self.last is None:
             return numbers
@@ -74,12 +71,16 @@ class Infos(NamedTuple):
 
     def each(self, name: str) -> dict[int, Any]:
         """The values of those environments that have one."""
-        if isinstance(self.of_envs, list):
-            return {0: self.of_envs[0][name]} if name in self.of_envs[0] else {}
         if self.last is None:
             return _each(self.of_envs, name)
         now = {i: one for i, one in _each(self.of_envs, name).items() if not self.ended[i]}
         return now | _each(self.last, name)
+
+
+def batched(info: Mapping[str, Any]) -> dict[str, Any]:
+    """The info of a single environment, as a vector environment of one gives it."""
+    values = {n: batched(one) if isinstance(one, Mapping) else [one] for n, one in info.items()}
+    return values | {f"_{name}": [True] for name in info}
 
 
 def _numbers(infos: Mapping[str, Any], path: Sequence[str], count: int) -> FloatArray:
@@ -97,7 +98,7 @@ def _each(infos: Mapping[str, Any], name: str) -> dict[int, Any]:
     return {index: _one(infos[name], index) for index in np.flatnonzero(has).tolist()}
 
 
-def _at(infos: Mapping[str, Any], path: Sequence[str], default: Any) -> Any:
+def _at(infos: Mapping[str, Any], path: Sequence[str], default: bool | None) -> Any:
     for name in path:
         if name not in infos:
             return default

@@ -12,8 +12,6 @@ __all__ = [
     "check_input",
     "check_output",
     "check_readable",
-    "input_variable",
-    "output_variable",
     "require_not_driven",
     "require_numeric",
 ]
@@ -25,17 +23,6 @@ _CURES: Final = {
     "Binary": ". Nobody but the FMU knows what its bytes mean: let it tell what you need by "
     "numbers",
 }
-
-
-def input_variable(description: ModelDescription, name: str) -> Variable:
-    """Find a variable that can be written before every step.
-
-    Raises:
-        ConfigError: If no variable has this name, or it must not be written before a step.
-    """
-    variable = description.variable(name)
-    check_input(description, variable)
-    return variable
 
 
 def check_input(description: ModelDescription, variable: Variable) -> None:
@@ -71,17 +58,6 @@ def require_not_driven(description: ModelDescription, variable: Variable, what: 
             f"{variable.name!r} cannot {what}: the system connects it with {source!r}, which gives "
             "it its value"
         )
-
-
-def output_variable(description: ModelDescription, name: str) -> Variable:
-    """Find a variable that can be read after every step.
-
-    Raises:
-        ConfigError: If no variable has this name, or a float cannot hold its value.
-    """
-    variable = description.variable(name)
-    check_output(description, variable)
-    return variable
 
 
 def check_output(description: ModelDescription, variable: Variable) -> None:

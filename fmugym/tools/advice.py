@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from itertools import groupby
-from typing import Any, Final
+from collections.abc import Iterator
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from fmugym.archive.fmu import FMU
-from fmugym.errors import FMUGymError, plain
+from fmugym.errors import FMUGymError
 from fmugym.linearization import linearize
 from fmugym.pool.spec import FIXED_STEP_SOLVERS
 from fmugym.tools.accuracy import TOLERANCE, Course, Replay, error_of, substeps_of
+from fmugym.tools.findings import Advice, Finding
+from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 
-__all__ = ["Advice", "Doubt", "advise", "lines_of", "rounded_down"]
+__all__ = ["advise"]
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -45,54 +44,7 @@ _EXACT: Final = 0.1 * TOLERANCE
 """The error that is recommended of solvers, whose tolerances cost little."""
 
 
-@dataclass(frozen=True)
-class Advice:
-    """A line for a task file.
-
-    Attributes:
-        table: The table it stands in; ``""`` for the top of the file.
-        key, value: What it says.
-        why: What was measured.
-    """
-
-    table: str
-    key: str
-    value: Any
-    why: str
-
-    @property
-    def line(self) -> str:
-        """The line, in TOML."""
-        return f"{self.key} = {json.dumps(self.value)}"
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """Something that no setting was found for.
-
-    Attributes:
-        text: What it is.
-        cure: What to do about it.
-        check: What was checked.
-    """
-
-    text: str
-    cure: str
-    check: str = "accuracy"
-
-
-def lines_of(advices: Iterable[Advice]) -> list[str]:
-    """The lines of a task file, with the reasons as comments: printable ASCII."""
-    ordered = sorted(advices, key=lambda one: one.table)
-    width = max((len(one.line) for one in ordered), default=0)
-    lines = []
-    for table, group in groupby(ordered, key=lambda one: one.table):
-        lines += [f"[{table}]"] if table else []
-        lines += [f"{one.line.ljust(width)}  # {plain(one.why)}" for one in group]
-    return lines
-
-
-def advise(replay: Replay) -> Iterator[Advice | Doubt]:
+def advise(replay: Replay) -> Iterator[Advice | Finding]:
     """Find settings of the time step, of substeps and of the solver.
 
     Args:
@@ -110,12 +62,14 @@ def advise(replay: Replay) -> Iterator[Advice | Doubt]:
         yield from _of_substeps(replay)
 
 
-def _of_substeps(replay: Replay) -> Iterator[Advice | Doubt]:
+def _of_substeps(replay: Replay) -> Iterator[Advice | Finding]:
     found, own = substeps_of(replay), replay.spec.substeps
     if found is None:
         return
     if found.needed is None:
-        yield Doubt(
+        yield Finding(
+            "warning",
+            "accuracy",
             f"with {found.finest} substeps the outputs still differ by {found.least:.2g} of their "
             "variation from those with half as many",
             "the FMU may be chaotic, or switch often: compare episodes with shorter time steps",
@@ -150,14 +104,16 @@ def _cost(seconds: float, before: float | None) -> str:
     return "" if before is None else f"; a step takes {seconds / before:.2g} times as long"
 
 
-def _of_solvers(replay: Replay) -> Iterator[Advice | Doubt]:
+def _of_solvers(replay: Replay) -> Iterator[Advice | Finding]:
     """Compare the solvers of model exchange, each with some tolerances."""
     own = replay.run()
     finest = [replay.run(solver=name, tolerance=_FINEST, max_step=None) for name in _SOLVERS]
     known = [one for one in finest if one is not None and one.is_whole]
     least = error_of(known[0], known[1]) if len(known) == len(_SOLVERS) else 0.0
     if least > TOLERANCE:
-        yield Doubt(
+        yield Finding(
+            "warning",
+            "accuracy",
             f"the most exact solvers differ by {_share(least)} of the outputs' variation",
             "the FMU may be chaotic, or switch often: give max_step under [config]",
         )
@@ -246,9 +202,3 @@ def _longest(eigenvalues: ComplexArray) -> Iterator[tuple[float, str]]:
         text = f"its slowest time constant is {constant:.3g} s"
         yield constant / _STEPS_OF_A_TIME_CONSTANT, text
     yield math.inf, ""
-
-
-def rounded_down(value: float) -> float:
-    """The largest number of the form 1, 2 or 5 times a power of ten that is not greater."""
-    power = 10.0 ** math.floor(math.log10(value))
-    return float(f"{max(n * power for n in (1, 2, 5) if n * power <= value * (1 + 1e-12)):.3g}")

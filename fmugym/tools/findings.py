@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from typing import Any
 
 from fmugym.errors import plain
-from fmugym.tools.advice import Advice, lines_of
 
-__all__ = ["Finding", "Report"]
+__all__ = ["Advice", "Finding", "Report", "lines_of"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,27 @@ class Finding:
     check: str
     text: str
     cure: str = ""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """A line for a task file.
+
+    Attributes:
+        table: The table it stands in; ``""`` for the top of the file.
+        key, value: What it says.
+        why: What was measured.
+    """
+
+    table: str
+    key: str
+    value: Any
+    why: str
+
+    @property
+    def line(self) -> str:
+        """The line, in TOML."""
+        return f"{self.key} = {json.dumps(self.value)}"
 
 
 @dataclass(frozen=True)
@@ -85,6 +107,17 @@ class Report:
         if self.advices:
             lines += ["recommended for the task file:", *lines_of(self.advices)]
         return "\n".join(lines)
+
+
+def lines_of(advices: Iterable[Advice]) -> list[str]:
+    """The lines of a task file, with the reasons as comments: printable ASCII."""
+    ordered = sorted(advices, key=lambda one: one.table)
+    width = max((len(one.line) for one in ordered), default=0)
+    lines = []
+    for table, group in groupby(ordered, key=lambda one: one.table):
+        lines += [f"[{table}]"] if table else []
+        lines += [f"{one.line.ljust(width)}  # {plain(one.why)}" for one in group]
+    return lines
 
 
 def _duration(seconds: float | None) -> str:

@@ -6,16 +6,17 @@ They come from the archive and the XML. Nothing of the FMU is executed.
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from typing import Any, Final
 
 from fmugym.archive.dependencies import missing_tool, note_on
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
+from fmugym.episodes.evaluation import aligned
 from fmugym.errors import FMULoadError, first_of, plain
+from fmugym.series.choice import matches
 from fmugym.trial.known import known_verdict
 
 __all__ = ["as_text", "overview", "start_value", "tables"]
@@ -125,8 +126,7 @@ _TIMES: Final = ("start_time", "stop_time", "step_size", "tolerance")
 def _is_wanted(variable: Variable, everything: bool, pattern: str | None) -> bool:
     if pattern is None:
         return everything or variable.causality in SHOWN
-    expression = re.escape(pattern).replace(r"\*", ".*").replace(r"\?", ".")
-    return re.fullmatch(expression, variable.name, re.DOTALL) is not None
+    return matches(pattern, variable.name)
 
 
 def _row(variable: Variable) -> dict[str, Any]:
@@ -292,7 +292,8 @@ def _tables(facts: Mapping[str, Any]) -> Iterator[str]:
         rows = [v for v in facts["variables"] if v["causality"] == causality]
         if rows:
             yield f"\n{_HEADINGS.get(causality, plain(causality))} ({len(rows)})"
-            yield from _table([_COLUMNS, *map(_cells, rows)])
+            table = aligned([_COLUMNS, *map(_cells, rows)], _WIDEST)
+            yield from (f"  {line}" for line in table)
 
 
 def _not_listed(facts: Mapping[str, Any]) -> Iterator[str]:
@@ -325,11 +326,3 @@ def _range(row: Mapping[str, Any]) -> str:
     if low is None and high is None:
         return "-"
     return f"{-math.inf if low is None else low:g} .. {math.inf if high is None else high:g}"
-
-
-def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Align the columns; a cell wider than ``_WIDEST`` pushes the rest of its line."""
-    widths = [min(_WIDEST, max(map(len, column))) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
-        yield ("  " + "  ".join(cells)).rstrip()

@@ -12,7 +12,8 @@ import numpy as np
 from fmugym.archive.variable import Variable
 from fmugym.pool.base import FloatArray
 from fmugym.tools.accuracy import Replay
-from fmugym.tools.advice import Advice, Doubt, rounded_down
+from fmugym.tools.findings import Advice, Finding
+from fmugym.tools.skeleton import rounded_down
 
 __all__ = ["advise_episodes"]
 
@@ -41,7 +42,7 @@ _LONG: Final = 800
 """At least so many steps those then take, as actions may follow what is faster."""
 
 
-def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
+def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Finding]:
     """Tell outputs that never change, and recommend longer episodes where outputs are slow.
 
     Args:
@@ -54,7 +55,8 @@ def advise_episodes(replay: Replay, steps: int) -> Iterator[Advice | Doubt]:
     ]
     if still:
         text = f"never change while an action is held: {', '.join(still)}"
-        yield Doubt(text, "leave them out of observations under [agent]", "observations")
+        cure = "leave them out of observations under [agent]"
+        yield Finding("warning", "observations", text, cure)
     seconds, name = max(((constants[one], one.name) for one in constants), default=(0.0, ""))
     time_step = replay.spec.time_step
     if seconds <= steps * time_step:

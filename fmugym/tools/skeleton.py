@@ -21,7 +21,7 @@ from fmugym.errors import ConfigError, plain
 from fmugym.systems.system_description import SystemDescription
 from fmugym.tools.overview import start_value
 
-__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark"]
+__all__ = ["Skeleton", "guessed_bounds", "literal", "needs_bounds", "remark", "rounded_down"]
 
 MOST_PARAMETERS: Final = 40
 """More parameters than this are left out; ``fmugym info`` lists them."""
@@ -268,7 +268,7 @@ class Skeleton:
             return internal or DEFAULT_STEP
         if internal:
             return internal * max(1, round(self._duration / STEPS / internal))
-        return _round_down(self._duration / STEPS)
+        return rounded_down(self._duration / STEPS)
 
 
 def _listing(key: str, lines: list[str], brackets: str = "[]") -> Iterator[str]:
@@ -329,7 +329,7 @@ def _reach(variable: Variable) -> tuple[float, float]:
     return (max(1.0, round(reach)),) * 2 if variable.kind == "integer" else (reach, reach)
 
 
-def _round_down(value: float) -> float:
+def rounded_down(value: float) -> float:
     """The next lower of 1, 2 or 5 times a power of ten; rounding errors do not count."""
     value *= 1.0 + 1e-9
     power = 10.0 ** math.floor(math.log10(value))

@@ -24,9 +24,10 @@ from fmugym.export.logic import logic_of
 from fmugym.series.choice import quantities_of
 from fmugym.task.quantity import Quantity
 from fmugym.tools.accuracy import Replay
-from fmugym.tools.advice import Advice, Doubt, advise, rounded_down
-from fmugym.tools.findings import Finding, Report
+from fmugym.tools.advice import advise
+from fmugym.tools.findings import Advice, Finding, Report
 from fmugym.tools.response import advise_episodes
+from fmugym.tools.skeleton import rounded_down
 from fmugym.trial.known import known_verdict
 from fmugym.vector import FMUVectorEnv
 
@@ -111,12 +112,15 @@ def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
     found = list(advise(replay))
     known = {one.key for one in found if isinstance(one, Advice)}
     if steps is not None:
-        found += (one for one in advise_episodes(replay, steps) if _key_of(one) not in known)
+        found += (
+            one
+            for one in advise_episodes(replay, steps)
+            if isinstance(one, Finding) or one.key not in known
+        )
     advices = (*(one for one in found if isinstance(one, Advice)), *report.advices)
-    doubts = (one for one in found if isinstance(one, Doubt))
     short = (one for one in advices if one.key == "episode_length")
     findings = [
-        *(Finding("warning", one.check, one.text, one.cure) for one in doubts),
+        *(one for one in found if isinstance(one, Finding)),
         *(Finding("warning", "length", one.why, f"give {one.line}") for one in short),
     ]
     new = {one.check for one in findings}
@@ -127,10 +131,6 @@ def _advised(report: Report, replay: Replay, steps: int | None) -> Report:
         recommended={**report.recommended, **{one.key: one.value for one in advices}},
         advices=advices,
     )
-
-
-def _key_of(found: Advice | Doubt) -> str:
-    return found.key if isinstance(found, Advice) else ""
 
 
 def _isolates(env: FMUEnv) -> bool:

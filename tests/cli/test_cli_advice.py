@@ -22,8 +22,8 @@ import fmugym
 from fmugym.declared import Task, load
 from fmugym.tools import advice as advice_tools
 from fmugym.tools.accuracy import Replay, substeps_of
-from fmugym.tools.advice import lines_of
 from fmugym.tools.cli import main
+from fmugym.tools.findings import lines_of
 from fmugym.tools.validation import validate
 
 LAG = {
