@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
 from itertools import groupby, pairwise
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlsplit
@@ -17,7 +17,7 @@ from fmugym.extras import imported
 from fmugym.plant.polling import Answer, LostError
 from fmugym.plant.tags import Plant, Tag
 
-__all__ = ["ModbusClient", "serve_modbus"]
+__all__ = ["ModbusClient", "Values", "serve_modbus"]
 
 _PORT: Final = 502
 """That of Modbus TCP, where an address has none."""
@@ -126,14 +126,19 @@ class ModbusClient:
         self._host, self._port = _host_and_port(plant.address)
         self._timeout = plant["timeout"]
         self._blocks = _neighbours(_placed(plant))
-        self._client: Any = None
+        self._client: Any
 
-    async def connect(self) -> None:
+    @asynccontextmanager
+    async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
         options = {"timeout": self._timeout, "retries": 0, "reconnect_delay": 0}
         self._client = self._client_of(self._host, port=self._port, **options)
-        if not await self._client.connect():
-            raise LostError("it refuses the connection, or does not answer")
+        try:
+            if not await self._client.connect():
+                raise LostError("it refuses the connection, or does not answer")
+            yield
+        finally:
+            self._client.close()
 
     async def read(self) -> dict[str, Answer]:
         """See ``polling.Client``."""
@@ -184,11 +189,6 @@ class ModbusClient:
             cells += told.bits[:count] if place.is_bits else told.registers
         return cells, ""
 
-    async def close(self) -> None:
-        """See ``polling.Client``."""
-        if self._client is not None:
-            self._client.close()
-
 
 def _host_and_port(address: str) -> tuple[str, int]:
     """The two parts of an address.
@@ -203,19 +203,17 @@ def _host_and_port(address: str) -> tuple[str, int]:
     raise ConfigError(f"expected an address such as '10.0.0.5:{_PORT}', got {shown(address)}")
 
 
-async def serve_modbus(
-    plant: Plant, port: int, values: Values, bound: Callable[[str], None]
-) -> Callable[[], Awaitable[None]]:
+@asynccontextmanager
+async def serve_modbus(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback.
 
     Args:
         plant: Has the tags.
         port: The port; 0 for a free one.
         values: Returns the values of now, by the names of tags.
-        bound: Is told the address.
 
-    Returns:
-        What ends it.
+    Yields:
+        The address.
     """
     server_of = imported("pymodbus.server", "plant").ModbusTcpServer
     placed = _placed(plant)
@@ -226,9 +224,10 @@ async def serve_modbus(
     devices = [_device(unit_id, [*own], values) for unit_id, own in units]
     server = server_of(devices, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
-    bound(f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}")
-    ended: Callable[[], Awaitable[None]] = server.shutdown
-    return ended
+    try:
+        yield f"127.0.0.1:{server.transport.sockets[0].getsockname()[1]}"
+    finally:
+        await server.shutdown()
 
 
 def _device(unit_id: int, placed: Sequence[_Placed], values: Values) -> Any:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +14,7 @@ from typing import Any, Final
 from fmugym.checks import check_path
 from fmugym.errors import ConfigError, shown
 from fmugym.extras import imported
+from fmugym.plant.modbus import Values
 from fmugym.plant.polling import Answer, LostError, RefusedError
 from fmugym.plant.secrets import credentials, require_secret
 from fmugym.plant.tags import Plant, Tag
@@ -39,14 +41,23 @@ class OpcUaClient:
             if self._user is not None and self._keys is None:
                 raise ConfigError("without encryption, everybody on the line reads the password")
         self._nodes = [_node_id(self._ua, tag) for tag in self._tags]
-        self._client: Any = None
+        self._client: Any
 
-    async def connect(self) -> None:
+    @asynccontextmanager
+    async def connected(self) -> AsyncIterator[None]:
         """See ``polling.Client``."""
         self._client = self._client_of.Client(self._address, timeout=self._plant["timeout"])
         if self._user is not None:
             self._client.set_user(self._user[0])
             self._client.set_password(self._user[1])
+        try:
+            await self._connect()
+            yield
+        finally:
+            with Ignoring(Exception):  # there may be nobody to say goodbye to
+                await self._client.disconnect()
+
+    async def _connect(self) -> None:
         try:
             if self._keys is not None:
                 await self._secure(*self._keys)
@@ -93,13 +104,6 @@ class OpcUaClient:
         if len(numbers) != tag.count:
             return Answer((), f"node {node}: expected {tag.count} numbers, got {len(numbers)}")
         return Answer.of(tag, f"node {node}", numbers)
-
-    async def close(self) -> None:
-        """See ``polling.Client``."""
-        if self._client is not None:
-            client, self._client = self._client, None
-            with Ignoring(Exception):  # there may be nobody to say goodbye to
-                await client.disconnect()
 
 
 def _node_id(ua: Any, tag: Tag) -> Any:
@@ -165,12 +169,8 @@ def _uri_in(certificate: Any) -> str:
 # The server.
 
 
-async def serve_opcua(
-    plant: Plant,
-    port: int,
-    values: Callable[[], Mapping[str, Sequence[float]]],
-    bound: Callable[[str], None],
-) -> Callable[[], Awaitable[None]]:
+@asynccontextmanager
+async def serve_opcua(plant: Plant, port: int, values: Values) -> AsyncIterator[str]:
     """Serve tags on the loopback; see ``modbus.serve_modbus``.
 
     Where the plant encrypts, the server makes a certificate of its own, and takes all clients.
@@ -185,10 +185,8 @@ async def serve_opcua(
         await _certify(server, ua, plant.get("certificate"))
     for tag in plant.tags.values():
         await _add(server, ua, tag, values)
-    await server.start()
-    bound(f"opc.tcp://127.0.0.1:{server.bserver.port}")
-    ended: Callable[[], Awaitable[None]] = server.stop
-    return ended
+    async with server:
+        yield f"opc.tcp://127.0.0.1:{server.bserver.port}"
 
 
 async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
@@ -209,9 +207,7 @@ async def _certify(server: Any, ua: Any, trusted: str | None) -> None:
         server.set_certificate_validator(await _only(trusted, untrusted))
 
 
-async def _add(
-    server: Any, ua: Any, tag: Tag, values: Callable[[], Mapping[str, Sequence[float]]]
-) -> None:
+async def _add(server: Any, ua: Any, tag: Tag, values: Values) -> None:
     """Add the node of a tag, whose value is found when somebody reads it."""
     node = _node_id(ua, tag)
     while node.NamespaceIndex >= len(await server.get_namespace_array()):
