@@ -25,10 +25,9 @@ from fmugym.identification.simulator import Simulator
 from fmugym.identification.statistics import (
     ROUNDING,
     Correlation,
-    information_inverse,
-    information_of,
     memory_of,
     newey_west,
+    sandwich,
 )
 from fmugym.identification.trajectory import Trajectory, common_names
 from fmugym.pool.base import FloatArray, MaskArray
@@ -317,7 +316,6 @@ class Problem:
 
         Residuals that are no white noise count as correlated (Newey and West).
         """
-        inverse, undetermined = information_inverse(solution.jac)
         freedom = max(1, len(solution.fun) - len(self.start) - self._num_states)
         correlations = self._correlations(solution)
         noise = np.mean(self._series(solution.fun) ** 2, axis=0) * len(solution.fun) / freedom
@@ -326,11 +324,7 @@ class Problem:
         scores = weighed.T @ weighed
         if not all(one.is_noise for one in correlations.values()):
             scores, freedom = self._correlated(solution, correlations)
-        covariance = inverse @ scores @ inverse
-        unknown = np.flatnonzero(undetermined)
-        covariance[unknown, unknown] = np.inf
-        information = information_of(solution.jac, scores)
-        return Uncertainty(covariance, information, freedom, correlations)
+        return Uncertainty(*sandwich(solution.jac, scores), freedom, correlations)
 
     def _correlations(self, solution: Any) -> dict[str, Correlation]:
         parts = self._by_trajectory(self._series(solution.fun))
