@@ -10,14 +10,14 @@ number of trajectories.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fmugym.archive.fmu import FMU
 from fmugym.archive.variable import Variable
-from fmugym.checks import check_number, check_text, float_or_nan
+from fmugym.checks import check_number, float_or_nan
 from fmugym.errors import ConfigError, SimulationError, shown, unknown_name
 from fmugym.extras import imported
 from fmugym.identification.comparison import Comparison
@@ -71,10 +71,10 @@ class Experiment:
     fmu: FMU
     initial_states: Mapping[str, str | float]
     fixed: Mapping[str, float | str]
-    scales: Mapping[str, float]
-    time_step: float | None
-    drop_repeats: bool
-    backend: str
+    scales: Mapping[str, float] = field(default_factory=dict)
+    time_step: float | None = None
+    drop_repeats: bool = False
+    backend: str = "auto"
     wash_in: float | None = None
     plant: PoolOpening | None = None
     advance: Callable[[float], None] = silent
@@ -466,7 +466,7 @@ def _start_between(variable: Variable, low: float, high: float) -> float:
 def _counted(trajectory: Trajectory, wash_in: float | None) -> MaskArray:
     """Which samples of a trajectory count: those after the wash-in."""
     since = trajectory.time - trajectory.time[0]
-    counted = since > (-1.0 if wash_in is None else wash_in)
+    counted = since > (-1.0 if wash_in is None else check_number("wash_in", wash_in, 0.0))
     if not counted.any():
         raise ConfigError(
             f"a log of {since[-1]:g} s has no samples after a wash-in of {wash_in:g} s"
@@ -481,7 +481,6 @@ def _measured_states(
     states = np.empty((len(initial_states), len(trajectories)))
     for k, (name, source) in enumerate(initial_states.items()):
         if isinstance(source, str):
-            source = check_text("initial_states", source)
             if source not in trajectories[0].outputs:
                 raise unknown_name("measured output", source, trajectories[0].outputs)
             states[k] = [trajectory.outputs[source][0] for trajectory in trajectories]
@@ -495,7 +494,7 @@ def _scales(
 ) -> FloatArray:
     """Return the scale of each output, shape (outputs,)."""
     for name, scale in given.items():
-        if check_text("scales", name) not in outputs:
+        if name not in outputs:
             raise unknown_name("measured output", name, outputs)
         check_number(f"the scale of {name!r}", scale, positive=True)
     spread = {
