@@ -182,15 +182,14 @@ class Problem:
         self._last = np.empty(0), self._states
 
     def _set_limits(self, variables: Sequence[Variable], parameters: Mapping[str, Limits]) -> None:
-        fitted, states = variables[: len(parameters)], variables[len(parameters) :]
-        limits = [_limits(v, parameters[v.name]) for v in fitted]
-        self.bounds = {v.name: x[1:] for v, x in zip(fitted, limits, strict=True)}
-        self.start = np.array([x[0] for x in limits])
-        self._high = np.array([x[2] for x in limits] + [v.maximum for v in states])
-        self._low = np.array([x[1] for x in limits] + [v.minimum for v in states])
-        sizes = [max(abs(x[0]), v.nominal or 0.0) for v, x in zip(fitted, limits, strict=True)]
-        sizes += [v.nominal or 0.0 for v in states]
-        self._differences = DIFFERENCE * np.array([size or 1.0 for size in sizes])
+        count = len(parameters)
+        limits = [_limits(v, parameters[v.name]) for v in variables[:count]]
+        self.bounds = {name: one[1:] for name, one in zip(parameters, limits, strict=True)}
+        limits += [(0.0, v.minimum, v.maximum) for v in variables[count:]]
+        starts, self._low, self._high = np.reshape(limits, (-1, 3)).T
+        self.start = starts[:count]
+        sizes = np.maximum(np.abs(starts), [v.nominal or 0.0 for v in variables])
+        self._differences = DIFFERENCE * np.where(sizes > 0.0, sizes, 1.0)
 
     def close(self) -> None:
         """Free the simulator."""
@@ -265,8 +264,7 @@ class Problem:
         for first in range(0, points.shape[1], self._simulator.num_sets):
             part = points[:, first : first + self._simulator.num_sets]
             values = np.concatenate([self._join(one, self._states) for one in part.T], axis=1)
-            errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
-            costs.append(sum((e**2).sum(axis=1) for e in errors))
+            costs.append(sum((e**2).sum(axis=1) for e in self._errors(values)))
         found = np.concatenate(costs)
         return np.where(np.isfinite(found), found, np.inf)
 
@@ -394,20 +392,25 @@ class Problem:
         values = np.repeat(base, 1 + len(rows), axis=1)
         for index, row in enumerate(rows):
             values[row, 1 + index] += steps[row]
-        errors = [self._errors(s, w) for w, s in enumerate(self._simulate(values))]
-        return [_Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w]) for w, e in enumerate(errors)]
+        return [
+            _Block(e[0], (e[1:] - e[0]).T / steps[list(rows), w])
+            for w, e in enumerate(self._errors(values))
+        ]
 
     def _join(self, parameters: FloatArray, states: FloatArray) -> FloatArray:
         """Return the values for one simulation of each trajectory, shape (names, 1, W)."""
         shared = np.tile(parameters[:, np.newaxis], len(self.trajectories))
         return np.concatenate([shared, states])[:, np.newaxis]
 
-    def _errors(self, simulated: FloatArray, index: int) -> FloatArray:
-        """Return one trajectory's scaled residuals, shape (sets, n * outputs)."""
-        outputs = self.trajectories[index].outputs
-        measured = np.stack([outputs[name] for name in self._simulator.outputs], axis=1)
-        scaled: FloatArray = ((simulated - measured) / self._scales)[:, self._counted[index]]
-        return scaled.reshape(len(scaled), -1)
+    def _errors(self, values: FloatArray) -> list[FloatArray]:
+        """Simulate, and return each trajectory's scaled residuals, shape (sets, n * outputs)."""
+        found = []
+        parts = zip(self.trajectories, self._simulate(values), self._counted, strict=True)
+        for one, simulated, counted in parts:
+            measured = np.stack([one.outputs[n] for n in self._simulator.outputs], axis=1)
+            scaled = ((simulated - measured) / self._scales)[:, counted]
+            found.append(scaled.reshape(len(scaled), -1))
+        return found
 
 
 def _levenberg_marquardt(
