@@ -36,7 +36,7 @@ class OpcUaClient:
         self._plant, self._tags = plant, list(plant.tags.values())
         self._address = plant.address if "://" in plant.address else f"opc.tcp://{plant.address}"
         with plant.entry.placing():
-            self._user = credentials(plant.get("credentials"))
+            self._user = credentials(plant["credentials"])
             self._keys = _keys_of(plant)
             if self._user is not None and self._keys is None:
                 raise ConfigError("without encryption, everybody on the line reads the password")
@@ -75,7 +75,7 @@ class OpcUaClient:
         policies = imported("asyncua.crypto.security_policies", "plant")
         own = await _certificate_in(certificate)
         self._client.application_uri = _uri_in(own) or self._client.application_uri
-        pinned = self._plant.get("server_certificate")
+        pinned = self._plant["server_certificate"]
         if pinned is not None:
             text = f"its certificate is not that of {shown(pinned)}"
             self._client.certificate_validator = await _only(pinned, partial(RefusedError, text))
@@ -120,7 +120,7 @@ def _keys_of(plant: Plant) -> tuple[Path, Path] | None:
     """The certificate and the key of the client; None if nothing is encrypted."""
     if not plant["encryption"]:
         return None
-    paths = [plant.get("certificate"), plant.get("key")]
+    paths = [plant["certificate"], plant["key"]]
     if None in paths:
         raise ConfigError(
             "OPC UA is encrypted: give this client's 'certificate' and 'key', or say "
@@ -182,7 +182,7 @@ async def serve_opcua(plant: Plant, port: int, values: Values) -> AsyncIterator[
     server.set_endpoint(f"opc.tcp://127.0.0.1:{port}")
     server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
     if plant["encryption"]:
-        await _certify(server, ua, plant.get("certificate"))
+        await _certify(server, ua, plant["certificate"])
     for tag in plant.tags.values():
         await _add(server, ua, tag, values)
     async with server:

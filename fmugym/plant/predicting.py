@@ -43,7 +43,7 @@ class Predictions:
     They differ in the parameters that the task draws. The one that fits best predicts.
 
     Args:
-        make_env: Makes an environment with the time of the plant.
+        make_env: Makes an environment with the time of the plant, which the caller closes.
         feed: Has what the plant does.
         plant: Has the tags.
         steps: How many steps ahead there are predictions.
@@ -61,12 +61,8 @@ class Predictions:
         self._written: list[Written] = []
         self._spread: dict[str, FloatArray] = {}
         self._tags: list[tuple[int, str, Conversion]] = []
-        try:
-            if steps:
-                self._make(make_env)
-        except BaseException:
-            self.close()
-            raise
+        if steps:
+            self._make(make_env)
         self.names = [alias for _, alias, _ in self._tags]
         shape = (steps, len(self.names))
         self._sums, self._squares = np.zeros(shape), np.zeros(shape)
@@ -149,8 +145,3 @@ class Predictions:
                     bias = float(self._sums[ahead, place] / count)
                     found.append(Error(name, (ahead + 1) * self._plant.step, rms, bias, count))
         return found
-
-    def close(self) -> None:
-        """Free the copies."""
-        for env in self.envs:
-            env.close()
