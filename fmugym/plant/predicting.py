@@ -137,11 +137,10 @@ class Predictions:
     def errors(self) -> list[Error]:
         """The errors until now, by variable and horizon."""
         found = []
-        for place, name in enumerate(self.names):
-            for ahead in range(self._steps):
-                count = int(self._counts[ahead, place])
-                if count:
-                    rms = float(np.sqrt(self._squares[ahead, place] / count))
-                    bias = float(self._sums[ahead, place] / count)
-                    found.append(Error(name, (ahead + 1) * self._plant.step, rms, bias, count))
+        for place, ahead in np.argwhere(self._counts.T).tolist():
+            count = int(self._counts[ahead, place])
+            rms = float(np.sqrt(self._squares[ahead, place] / count))
+            bias = float(self._sums[ahead, place] / count)
+            seconds = (ahead + 1) * self._plant.step
+            found.append(Error(self.names[place], seconds, rms, bias, count))
         return found
